@@ -1,0 +1,1 @@
+"""Typed, versioned messages and the one topic table."""

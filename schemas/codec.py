@@ -1,0 +1,176 @@
+"""Message base, array transport without copies, encode and decode.
+
+A message is MessagePack of a frozen msgspec struct. Arrays travel inside it as extension type 1: one byte dtype code,
+one byte number of dimensions, the dimensions as little-endian uint32, then the raw little-endian buffer. Decoding maps
+the array onto the received buffer: no copy, and read-only.
+
+A field declares its array with `Annotated[np.ndarray, Shape("float32", "place", 3)]`; a letter or word names a dimension,
+and equal names within one message must have equal length. Decoding checks all of it, so that a malformed message fails
+at the boundary and nowhere else.
+"""
+
+import struct
+from functools import cache
+from typing import Annotated, Any, ClassVar, TypeVar, get_args, get_origin, get_type_hints
+
+import msgspec
+import numpy as np
+
+ARRAY_EXT_CODE = 1
+DTYPES = (
+    "float16",
+    "float32",
+    "float64",
+    "int8",
+    "int16",
+    "int32",
+    "int64",
+    "uint8",
+    "uint16",
+    "uint32",
+    "uint64",
+    "bool",
+)
+MAX_DIMENSIONS = 8
+
+
+class DecodeError(ValueError):
+    """The payload is not a valid message of the expected type."""
+
+
+class Shape:
+    """What an array field must look like: dtype, dimensions (names or lengths), and whether NaN and infinity are refused."""
+
+    __slots__ = ("dims", "dtype", "finite")
+
+    def __init__(self, dtype: str, *dims: str | int, finite: bool = True) -> None:
+        self.dtype, self.dims, self.finite = dtype, dims, finite
+
+    def check(self, field: str, array: Any, lengths: dict[str, int]) -> None:
+        """Raise ValueError unless `array` fits; `lengths` collects the named dimensions of the whole message."""
+        if not isinstance(array, np.ndarray):
+            raise ValueError(f"{field}: expected an array")
+        if array.dtype.name != self.dtype:
+            raise ValueError(f"{field}: dtype {array.dtype.name}, expected {self.dtype}")
+        if array.ndim != len(self.dims):
+            raise ValueError(f"{field}: {array.ndim} dimensions, expected {len(self.dims)}")
+        for length, dim in zip(array.shape, self.dims, strict=True):
+            expected = dim if isinstance(dim, int) else lengths.setdefault(dim, length)
+            if length != expected:
+                raise ValueError(f"{field}: shape {array.shape}, expected {dim} = {expected}")
+        if self.finite and array.dtype.kind == "f" and not np.isfinite(array).all():
+            raise ValueError(f"{field}: not finite")
+
+
+class Message(msgspec.Struct, frozen=True, kw_only=True, eq=False):
+    """Base of everything that crosses the bus. New fields get defaults; fields are never renamed and never change type."""
+
+    VERSION: ClassVar[int] = 1
+
+    def __post_init__(self) -> None:
+        lengths: dict[str, int] = {}
+        for field, shape in _array_fields(type(self)):
+            shape.check(field, getattr(self, field), lengths)
+        self.check()
+
+    def check(self) -> None:
+        """Raise ValueError when the fields contradict each other; overridden where a type alone does not say enough."""
+
+    def __eq__(self, other: object) -> bool:
+        return type(self) is type(other) and encode(self) == encode(other)  # type: ignore[arg-type]
+
+    def __hash__(self) -> int:
+        return hash(encode(self))
+
+
+M = TypeVar("M", bound=Message)
+
+
+@cache
+def _array_fields(message_type: type[Message]) -> tuple[tuple[str, Shape], ...]:
+    hints = get_type_hints(message_type, include_extras=True)
+    return tuple(
+        (name, meta)
+        for name, hint in hints.items()
+        if get_origin(hint) is Annotated
+        for meta in get_args(hint)[1:]
+        if isinstance(meta, Shape)
+    )
+
+
+def schema_name(message_type: type[Message]) -> str:
+    """Name and version that travel in the sample's encoding, for example `PlaceDelta/1`."""
+    return f"{message_type.__name__}/{message_type.VERSION}"
+
+
+def _pack_array(array: np.ndarray) -> msgspec.msgpack.Ext:
+    if array.dtype.name not in DTYPES:
+        raise TypeError(f"arrays of dtype {array.dtype} do not travel; use one of {', '.join(DTYPES)}")
+    little = np.ascontiguousarray(array.astype(array.dtype.newbyteorder("<"), copy=False))
+    head = struct.pack(f"<BB{array.ndim}I", DTYPES.index(array.dtype.name), array.ndim, *array.shape)
+    return msgspec.msgpack.Ext(ARRAY_EXT_CODE, b"".join((head, memoryview(little).cast("B") if little.size else b"")))
+
+
+def _unpack_array(data: memoryview) -> np.ndarray:
+    if len(data) < 2:
+        raise ValueError("array header cut off")
+    code, ndim = data[0], data[1]
+    if code >= len(DTYPES) or ndim > MAX_DIMENSIONS or len(data) < 2 + 4 * ndim:
+        raise ValueError("array header damaged")
+    shape = struct.unpack_from(f"<{ndim}I", data, 2)
+    dtype = np.dtype(DTYPES[code]).newbyteorder("<")
+    count = 1
+    for length in shape:
+        count *= length
+    body = data[2 + 4 * ndim :]
+    if len(body) != count * dtype.itemsize:
+        raise ValueError("array length does not fit its shape")
+    array = np.frombuffer(body, dtype=dtype, count=count).reshape(shape)
+    array.flags.writeable = False
+    return array
+
+
+def _enc_hook(value: Any) -> Any:
+    if isinstance(value, np.ndarray):
+        return _pack_array(value)
+    if isinstance(value, np.generic):
+        return value.item()
+    raise TypeError(f"{type(value).__name__} cannot be sent")
+
+
+def _dec_hook(expected: type, value: Any) -> Any:
+    if expected is np.ndarray and isinstance(value, np.ndarray):
+        return value
+    raise ValueError(f"expected {expected.__name__}")
+
+
+def _ext_hook(code: int, data: memoryview) -> Any:
+    if code != ARRAY_EXT_CODE:
+        raise ValueError(f"unknown extension type {code}")
+    return _unpack_array(data)
+
+
+_encoder = msgspec.msgpack.Encoder(enc_hook=_enc_hook)
+
+
+@cache
+def _decoder(message_type: type) -> msgspec.msgpack.Decoder:
+    return msgspec.msgpack.Decoder(message_type, dec_hook=_dec_hook, ext_hook=_ext_hook)
+
+
+def encode(message: Message) -> bytes:
+    """MessagePack of one message."""
+    return _encoder.encode(message)
+
+
+def decode(message_type: type[M], payload: bytes | memoryview) -> M:
+    """The message in `payload`, validated; its arrays point into `payload`. Raises DecodeError."""
+    try:
+        return _decoder(message_type).decode(payload)
+    except (msgspec.MsgspecError, ValueError, TypeError, OverflowError, RecursionError) as error:
+        raise DecodeError(f"{schema_name(message_type)}: {error}") from error
+
+
+def copied(message: M) -> M:
+    """The same message with arrays of its own, for state that must not keep a whole received buffer alive."""
+    return decode(type(message), encode(message))

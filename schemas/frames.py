@@ -1,0 +1,104 @@
+"""What a camera delivers: keyframes with pose, colour and depth.
+
+World: metres, z up (against gravity). Camera: x right, y down, z forward (along the optical axis).
+`world_from_camera` maps homogeneous camera coordinates to world coordinates.
+"""
+
+from typing import Annotated
+
+import msgspec
+import numpy as np
+
+from schemas.codec import Message, Shape
+
+Pose = Annotated[np.ndarray, Shape("float64", 4, 4)]
+ROTATION_TOLERANCE = 1e-3
+
+
+class Intrinsics(msgspec.Struct, frozen=True):
+    """Pinhole camera, pixels; pixel (0, 0) is the centre of the upper left pixel."""
+
+    width_px: int
+    height_px: int
+    fx_px: float
+    fy_px: float
+    cx_px: float
+    cy_px: float
+
+    def __post_init__(self) -> None:
+        if not (0 < self.width_px <= 16384 and 0 < self.height_px <= 16384):
+            raise ValueError(f"image size {self.width_px} x {self.height_px} is out of range")
+        if not (self.fx_px > 0 and self.fy_px > 0):
+            raise ValueError("focal lengths must be positive")
+
+
+def check_pose(world_from_camera: np.ndarray) -> None:
+    """Raise ValueError unless the matrix is a rigid motion."""
+    rotation = world_from_camera[..., :3, :3]
+    if np.abs(rotation @ np.swapaxes(rotation, -1, -2) - np.eye(3)).max(initial=0.0) > ROTATION_TOLERANCE:
+        raise ValueError("world_from_camera: rotation is not orthonormal")
+    if (np.linalg.det(rotation) <= 0).any():
+        raise ValueError("world_from_camera: rotation mirrors")
+    if (world_from_camera[..., 3, :] != (0.0, 0.0, 0.0, 1.0)).any():
+        raise ValueError("world_from_camera: last row is not 0 0 0 1")
+
+
+class Keyframe(Message, kw_only=True):
+    """One posed RGB-D image, compressed as the source delivered it."""
+
+    robot: str
+    frame_id: int
+    stamp_ns: int
+    intrinsics: Intrinsics
+    world_from_camera: Pose
+    color: bytes  # a JPEG or PNG file, 8 bit RGB
+    depth: bytes  # a PNG file, 16 bit, 0 = no measurement; depth along the optical axis
+    depth_scale_m: float  # metres per depth unit
+
+    def check(self) -> None:
+        check_pose(self.world_from_camera)
+        if self.frame_id < 0:
+            raise ValueError("frame_id is negative")
+        if not self.depth_scale_m > 0:
+            raise ValueError("depth_scale_m must be positive")
+
+
+class CameraState(Message, kw_only=True):
+    """Where the camera is now, also between keyframes."""
+
+    robot: str
+    stamp_ns: int
+    world_from_camera: Pose
+
+    def check(self) -> None:
+        check_pose(self.world_from_camera)
+
+
+class IngestState(Message, kw_only=True):
+    """How far the source is; `finished` when every keyframe has been published and encoded."""
+
+    robot: str
+    stamp_ns: int
+    frames_read: int
+    frames_total: int  # 0 = unknown (live)
+    keyframes: int
+    encoded: int
+    rejected: int  # frames refused by the source or the keyframe selection, with the reason in the log
+    finished: bool
+
+
+class ArchiveRequest(Message, kw_only=True):
+    """Keyframes with first_frame_id <= frame_id < end_frame_id, at most `limit` of them, oldest first."""
+
+    robot: str
+    first_frame_id: int = 0
+    end_frame_id: int = 2**62
+    limit: int = 16
+
+
+class ArchiveReply(Message, kw_only=True):
+    """Archived keyframes; `oldest_frame_id` says where the ring begins (-1 = empty)."""
+
+    robot: str
+    oldest_frame_id: int
+    keyframes: list[Keyframe]

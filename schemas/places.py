@@ -1,0 +1,51 @@
+"""The place graph: free-space spheres and the clearance between them, as deltas."""
+
+from typing import Annotated
+
+import numpy as np
+
+from schemas.codec import Message, Shape
+
+
+class PlaceDelta(Message, kw_only=True):
+    """Change of the place graph since the previous revision; with `snapshot`, the whole graph.
+
+    Apply in this order: remove edges, remove places (their edges go too), merge, upsert places, upsert edges.
+    """
+
+    robot: str
+    epoch: int  # new at every start of the writer
+    revision: int  # grows by one per delta
+    stamp_ns: int  # of the keyframe that caused it
+    frame_id: int
+    snapshot: bool = False
+    place_ids: Annotated[np.ndarray, Shape("int64", "place")]
+    positions_m: Annotated[np.ndarray, Shape("float32", "place", 3)]  # world
+    radii_m: Annotated[np.ndarray, Shape("float32", "place")]  # distance to the nearest obstacle
+    basis_points: Annotated[np.ndarray, Shape("int16", "place")]  # obstacle points at that distance
+    removed_ids: Annotated[np.ndarray, Shape("int64", "removed")]
+    merged_ids: Annotated[np.ndarray, Shape("int64", "merged", 2)]  # (gone, into)
+    edges: Annotated[np.ndarray, Shape("int64", "edge", 2)]  # place ids, smaller first
+    clearances_m: Annotated[np.ndarray, Shape("float32", "edge")]  # smallest obstacle distance along the edge
+    removed_edges: Annotated[np.ndarray, Shape("int64", "removed_edge", 2)]
+
+
+class SnapshotRequest(Message, kw_only=True):
+    """The whole state of a delta's writer, as one delta with `snapshot` set."""
+
+    robot: str
+
+
+class MapRequest(Message, kw_only=True):
+    """The volumetric map as it stands."""
+
+    robot: str
+
+
+class VoxelMap(Message, kw_only=True):
+    """Observed voxels by integer index; the centre of voxel i is (i + 0.5) * voxel_m in the world."""
+
+    robot: str
+    voxel_m: float
+    free: Annotated[np.ndarray, Shape("int16", "free", 3)]
+    occupied: Annotated[np.ndarray, Shape("int16", "occupied", 3)]

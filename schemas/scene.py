@@ -1,0 +1,49 @@
+"""The stored scene graph: revisions and queries."""
+
+from typing import Annotated
+
+import numpy as np
+
+from schemas.codec import Message, Shape
+from schemas.regions import Region
+
+
+class SceneRevision(Message, kw_only=True):
+    """The store has made one more delta durable."""
+
+    robot: str
+    epoch: int
+    revision: int
+    stamp_ns: int
+    places: int
+    edges: int
+    regions: int
+
+
+class SceneRequest(Message, kw_only=True):
+    """The scene graph of one robot as stored."""
+
+    robot: str
+
+
+class Scene(Message, kw_only=True):
+    """Everything the store holds about one robot; sorted by id, so equal scenes have equal bytes."""
+
+    robot: str
+    stamp_ns: int
+    environment: str
+    task: str
+    prior_digest: str
+    space: str
+    labels: list[str]
+    regions: list[Region]
+    place_ids: Annotated[np.ndarray, Shape("int64", "place")]
+    positions_m: Annotated[np.ndarray, Shape("float32", "place", 3)]
+    radii_m: Annotated[np.ndarray, Shape("float32", "place")]
+    basis_points: Annotated[np.ndarray, Shape("int16", "place")]
+    place_regions: Annotated[np.ndarray, Shape("int64", "place")]  # -1 = not labelled yet
+    posteriors: Annotated[np.ndarray, Shape("float16", "place", "label")]
+    unknown: Annotated[np.ndarray, Shape("float16", "place")]
+    edges: Annotated[np.ndarray, Shape("int64", "edge", 2)]
+    clearances_m: Annotated[np.ndarray, Shape("float32", "edge")]
+    trajectory: Annotated[np.ndarray, Shape("float32", "frame", 3)]  # camera centres of the keyframes, world

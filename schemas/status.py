@@ -1,0 +1,83 @@
+"""What services say about themselves: consumption journal, health."""
+
+import msgspec
+
+from schemas.codec import Message
+
+
+class Consumed(Message, kw_only=True):
+    """One input a service has taken and finished with, in its order: what replay needs, and what flow control reads.
+
+    `writer` and `sequence` point at a recorded message. Inputs that no topic carries (start, ticks, replies to questions,
+    messages of unknown writers) travel whole in `inline`.
+    """
+
+    robot: str
+    service: str
+    instance: str
+    order: int  # 0, 1, 2, … per instance
+    topic: str  # topic, query or message name
+    frame_id: int = -1  # of a keyframe
+    writer: str = ""
+    sequence: int = -1
+    inline: bytes = b""
+
+
+class Started(Message, kw_only=True):
+    """Opens a journal: everything replay needs to build the same state."""
+
+    robot: str
+    service: str
+    instance: str
+    epoch: int
+    config: bytes  # the resolved config as JSON
+
+
+class Tick(Message, kw_only=True):
+    """Time, as a message."""
+
+    stamp_ns: int
+
+
+class JobDone(Message, kw_only=True):
+    """A job this process dispatched has been finished by a worker."""
+
+    topic: str
+    frame_id: int
+    worker: str
+    attempts: int  # 1 unless workers died or hung
+
+
+class TopicCount(msgspec.Struct, frozen=True, kw_only=True):
+    """What happened to one topic in one process since it started."""
+
+    topic: str
+    received: int = 0
+    consumed: int = 0
+    published: int = 0
+    malformed: int = 0  # could not be decoded; dropped
+    skipped: int = 0  # superseded by a newer sample before it was read (`latest`)
+    duplicate: int = 0  # seen before, dropped
+    missed: int = 0  # known to exist, never arrived
+    last_age_ms: float = -1.0  # age of the newest consumed sample when it was consumed
+
+
+class StatusRequest(Message, kw_only=True):
+    """Ask a process for its health."""
+
+
+class ServiceStatus(Message, kw_only=True):
+    """Health of one process."""
+
+    service: str
+    instance: str
+    robot: str
+    pid: int
+    uptime_s: float
+    backlog: int  # inputs waiting
+    busy_share: float  # share of the last seconds spent computing
+    step_ms_p50: float
+    step_ms_p99: float
+    resident_mb: float
+    waiting_for: list[str]  # questions without an answer yet
+    topics: list[TopicCount]

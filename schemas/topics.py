@@ -1,0 +1,117 @@
+"""The one table of keys: topics, queries and jobs. Nothing else in the system names a key.
+
+Delivery is one word:
+
+- `latest`: a slow reader skips to the newest sample; what it skipped is counted.
+- `every`: nothing may be lost: publisher cache, history for late readers, recovery of missed samples. A reader that finds
+  a gap in the revisions asks the writer for a snapshot.
+- `job`: each message goes to one worker of a pool, at least once; results are idempotent.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+from schemas.codec import Message
+from schemas.features import Pyramid, TextEmbeddings, TextRequest
+from schemas.frames import ArchiveReply, ArchiveRequest, CameraState, IngestState, Keyframe
+from schemas.places import MapRequest, PlaceDelta, SnapshotRequest, VoxelMap
+from schemas.priors import Prior, PriorList, PriorRequest, Task
+from schemas.regions import PosteriorReply, PosteriorRequest, RegionDelta
+from schemas.scene import Scene, SceneRequest, SceneRevision
+from schemas.status import Consumed, ServiceStatus, StatusRequest
+
+ROOT = "psg"
+Delivery = Literal["latest", "every", "job"]
+
+
+@dataclass(frozen=True)
+class Topic:
+    """One row of the table. `key` may hold {robot} or {digest}, taken from the message."""
+
+    name: str
+    type: type[Message]
+    key: str
+    delivery: Delivery
+    rate_hz: float  # typical
+    recorded: bool
+    cache: int = 0  # samples a publisher keeps for late and lossy readers (`every`)
+
+    def key_of(self, message: Message) -> str:
+        """The key this message is published on."""
+        fields = {"robot": getattr(message, "robot", "")}
+        if "{digest}" in self.key:
+            fields["digest"] = message.digest()  # type: ignore[attr-defined]
+        return self.key.format(**fields)
+
+    def pattern(self, robot: str) -> str:
+        """The key expression that matches this topic of `robot` (`*` = of all robots)."""
+        return self.key.format(robot=robot, digest="*")
+
+
+@dataclass(frozen=True)
+class Query:
+    """A question with one answer. `key` may hold fields of the request, such as {robot} or {space}."""
+
+    name: str
+    request: type[Message]
+    reply: type[Message]
+    key: str
+
+    def key_of(self, request: Message) -> str:
+        """The key this request is asked on."""
+        return self.key.format(**{name: getattr(request, name) for name in request.__struct_fields__})
+
+
+KEYFRAME = Topic("KEYFRAME", Keyframe, f"{ROOT}/{{robot}}/keyframe", "every", 2, recorded=True, cache=32)
+CAMERA_STATE = Topic("CAMERA_STATE", CameraState, f"{ROOT}/{{robot}}/camera", "latest", 30, recorded=False)
+INGEST_STATE = Topic("INGEST_STATE", IngestState, f"{ROOT}/{{robot}}/ingest", "latest", 5, recorded=False)
+PLACE_DELTA = Topic("PLACE_DELTA", PlaceDelta, f"{ROOT}/{{robot}}/places", "every", 2, recorded=True, cache=256)
+ENCODE = Topic("ENCODE", Keyframe, f"{ROOT}/jobs/encode", "job", 2, recorded=False)
+PYRAMID = Topic("PYRAMID", Pyramid, f"{ROOT}/{{robot}}/pyramid", "every", 2, recorded=True, cache=256)
+TASK = Topic("TASK", Task, f"{ROOT}/{{robot}}/task", "every", 0.01, recorded=True, cache=4)
+PRIOR = Topic("PRIOR", Prior, f"{ROOT}/fleet/prior/{{digest}}", "every", 0.01, recorded=True, cache=4)
+REGION_DELTA = Topic("REGION_DELTA", RegionDelta, f"{ROOT}/{{robot}}/regions", "every", 2, recorded=True, cache=256)
+SCENE_REVISION = Topic("SCENE_REVISION", SceneRevision, f"{ROOT}/{{robot}}/scene", "latest", 4, recorded=False)
+JOURNAL = Topic("JOURNAL", Consumed, f"{ROOT}/{{robot}}/journal", "every", 20, recorded=True, cache=1024)
+
+TOPICS = (
+    KEYFRAME,
+    CAMERA_STATE,
+    INGEST_STATE,
+    PLACE_DELTA,
+    ENCODE,
+    PYRAMID,
+    TASK,
+    PRIOR,
+    REGION_DELTA,
+    SCENE_REVISION,
+    JOURNAL,
+)
+
+ARCHIVE = Query("ARCHIVE", ArchiveRequest, ArchiveReply, f"{ROOT}/{{robot}}/ask/keyframes")
+PLACE_SNAPSHOT = Query("PLACE_SNAPSHOT", SnapshotRequest, PlaceDelta, f"{ROOT}/{{robot}}/ask/places")
+VOXEL_MAP = Query("VOXEL_MAP", MapRequest, VoxelMap, f"{ROOT}/{{robot}}/ask/voxels")
+REGION_SNAPSHOT = Query("REGION_SNAPSHOT", SnapshotRequest, RegionDelta, f"{ROOT}/{{robot}}/ask/regions")
+POSTERIOR = Query("POSTERIOR", PosteriorRequest, PosteriorReply, f"{ROOT}/{{robot}}/ask/posterior")
+SCENE = Query("SCENE", SceneRequest, Scene, f"{ROOT}/{{robot}}/ask/scene")
+TEXT = Query("TEXT", TextRequest, TextEmbeddings, f"{ROOT}/encoder/{{space}}/text")
+PRIORS = Query("PRIORS", PriorRequest, PriorList, f"{ROOT}/fleet/ask/prior")
+
+QUERIES = (ARCHIVE, PLACE_SNAPSHOT, VOXEL_MAP, REGION_SNAPSHOT, POSTERIOR, SCENE, TEXT, PRIORS)
+
+STATUS = Query("STATUS", StatusRequest, ServiceStatus, f"{ROOT}/status")
+
+
+def alive_key(service: str, instance: str) -> str:
+    """Liveliness token of one process."""
+    return f"{ROOT}/alive/{service}/{instance}"
+
+
+def status_key(service: str, instance: str) -> str:
+    """Where one process answers STATUS."""
+    return f"{STATUS.key}/{service}/{instance}"
+
+
+def worker_keys(job: Topic, worker: str) -> tuple[str, str]:
+    """The queryable and the liveliness token of one worker of a job's pool; `*` as worker gives the patterns."""
+    return f"{job.key}/run/{worker}", f"{job.key}/live/{worker}"

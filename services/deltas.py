@@ -1,0 +1,59 @@
+"""Following a stream of deltas: tell the next one from a repeat, a gap and a restarted writer (pure)."""
+
+from typing import Generic, Literal, Protocol, TypeVar
+
+Verdict = Literal["apply", "stale", "gap"]
+
+
+class Delta(Protocol):
+    """What PlaceDelta and RegionDelta share."""
+
+    epoch: int
+    revision: int
+    snapshot: bool
+
+
+D = TypeVar("D", bound=Delta)
+
+
+class Follower(Generic[D]):
+    """Puts deltas of one writer in order. Feed each arrival to `take`; apply what comes back, and ask for a snapshot
+    while `needs_snapshot` is set. Deltas that arrive during a gap wait for the snapshot.
+    """
+
+    def __init__(self, epoch: int = -1, revision: int = -1, waiting_limit: int = 4096) -> None:
+        self.epoch, self.revision = epoch, revision
+        self.needs_snapshot = False
+        self._waiting: dict[int, D] = {}
+        self._waiting_limit = waiting_limit
+
+    def verdict(self, delta: D) -> Verdict:
+        """What to do with a delta, given what was applied so far. Revisions of a new writer begin at 0."""
+        if delta.epoch < self.epoch or (delta.epoch == self.epoch and delta.revision <= self.revision):
+            return "stale"
+        if delta.snapshot or (delta.epoch == self.epoch and delta.revision == self.revision + 1):
+            return "apply"
+        return "apply" if delta.epoch > self.epoch and delta.revision == 0 else "gap"
+
+    def take(self, delta: D) -> list[D]:
+        """The deltas to apply now, in order: none for a repeat or a gap, several when a gap closes."""
+        match self.verdict(delta):
+            case "stale":
+                if delta.snapshot:
+                    self.needs_snapshot = False
+                return []
+            case "gap":
+                self.needs_snapshot = True
+                if len(self._waiting) < self._waiting_limit:
+                    self._waiting[delta.revision] = delta
+                return []
+        if delta.epoch > self.epoch and not delta.snapshot:
+            self._waiting = {r: d for r, d in self._waiting.items() if d.epoch == delta.epoch}
+        ready = [delta]
+        self.epoch, self.revision = delta.epoch, delta.revision
+        while (following := self._waiting.pop(self.revision + 1, None)) is not None and following.epoch == self.epoch:
+            ready.append(following)
+            self.revision = following.revision
+        self._waiting = {r: d for r, d in self._waiting.items() if d.epoch == self.epoch and r > self.revision}
+        self.needs_snapshot = bool(self._waiting)
+        return ready

@@ -1,0 +1,1 @@
+"""Turns keyframes into multi-scale embeddings; any number of workers."""

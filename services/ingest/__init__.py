@@ -1,0 +1,1 @@
+"""Turns a source of posed RGB-D images into keyframes."""

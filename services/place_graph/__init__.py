@@ -1,0 +1,1 @@
+"""Turns keyframes into a graph of free-space places."""

@@ -1,0 +1,1 @@
+"""Answers a task with a prior graph."""

@@ -1,0 +1,1 @@
+"""What every service process shares: bus, host loop, config, logs, record and replay."""

@@ -1,0 +1,58 @@
+"""What a service is: a declaration around a pure step function."""
+
+from collections.abc import Awaitable, Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import msgspec
+
+from schemas.codec import Message
+from schemas.topics import Query, Topic
+
+
+@dataclass(frozen=True)
+class Identity:
+    """Who a running service is. `robot` is `*` for a service of the whole fleet."""
+
+    robot: str
+    instance: str
+    epoch: int
+
+
+@dataclass(frozen=True)
+class Ask:
+    """An output of a step: a question. The reply comes back as an input of a later step; the host retries until then."""
+
+    query: Query
+    request: Message
+
+
+Output = tuple[Topic, Message] | Ask
+Step = Callable[[Any, Message, Any], Iterator[Output]]
+
+
+@dataclass(frozen=True)
+class Service:
+    """One service: what it reads, writes and answers, and the functions that do it.
+
+    `step(state, message, cfg)` takes one input and yields outputs; it may change `state` in place and does nothing else.
+    Inputs are messages of `reads`, of `job`, replies to its questions, and `Tick` every `tick_s` seconds.
+    `answers` maps a query to `f(state, request, cfg) -> reply`, which must not change the state.
+    `drive`, for sources only, is a coroutine that feeds inputs from outside (see `services.runtime.host.Port`).
+    """
+
+    name: str
+    purpose: str
+    scope: Literal["robot", "fleet"]
+    config: type[msgspec.Struct]
+    init: Callable[[Any, Identity], Any]
+    step: Step
+    reads: tuple[Topic, ...] = ()
+    writes: tuple[Topic, ...] = ()
+    answers: Mapping[Query, Callable[[Any, Any, Any], Message]] = field(default_factory=dict)
+    asks: tuple[Query, ...] = ()
+    job: Topic | None = None  # the pool this service works for
+    tick_s: float | None = None
+    drive: Callable[[Any, Any], Awaitable[None]] | None = None
+    key_fields: Callable[[Any], dict[str, str]] = lambda cfg: {}  # config values that appear in keys of `answers`
+    close: Callable[[Any], None] = lambda state: None

@@ -1,0 +1,1 @@
+"""Keeps the scene graph, durably."""

@@ -1,0 +1,1 @@
+"""Labels places with the prior's regions and keeps the regions."""
