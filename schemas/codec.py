@@ -39,7 +39,7 @@ class DecodeError(ValueError):
 
 
 class Shape:
-    """What an array field must look like: dtype, dimensions (names or lengths), and whether NaN and infinity are refused."""
+    """What an array field must look like: dtype, dimensions (names or lengths), and whether it must be finite."""
 
     __slots__ = ("dims", "dtype", "finite")
 
@@ -63,7 +63,7 @@ class Shape:
 
 
 class Message(msgspec.Struct, frozen=True, kw_only=True, eq=False):
-    """Base of everything that crosses the bus. New fields get defaults; fields are never renamed and never change type."""
+    """Base of everything that crosses the bus. New fields get defaults; fields never change name or type."""
 
     VERSION: ClassVar[int] = 1
 

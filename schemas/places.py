@@ -2,9 +2,13 @@
 
 from typing import Annotated
 
+import msgspec
 import numpy as np
 
 from schemas.codec import Message, Shape
+
+_NO_FRAMES = msgspec.field(default_factory=lambda: np.zeros(0, np.int64))
+_NO_CAMERAS = msgspec.field(default_factory=lambda: np.zeros((0, 3), np.float32))
 
 
 class PlaceDelta(Message, kw_only=True):
@@ -28,6 +32,9 @@ class PlaceDelta(Message, kw_only=True):
     edges: Annotated[np.ndarray, Shape("int64", "edge", 2)]  # place ids, smaller first
     clearances_m: Annotated[np.ndarray, Shape("float32", "edge")]  # smallest obstacle distance along the edge
     removed_edges: Annotated[np.ndarray, Shape("int64", "removed_edge", 2)]
+    camera_m: tuple[float, float, float] | None = None  # camera centre of the keyframe, world; None in snapshots
+    past_frame_ids: Annotated[np.ndarray, Shape("int64", "past")] = _NO_FRAMES  # snapshots: the keyframes so far
+    past_cameras_m: Annotated[np.ndarray, Shape("float32", "past", 3)] = _NO_CAMERAS  # and their camera centres
 
 
 class SnapshotRequest(Message, kw_only=True):

@@ -8,8 +8,8 @@ from schemas.codec import Message
 class Consumed(Message, kw_only=True):
     """One input a service has taken and finished with, in its order: what replay needs, and what flow control reads.
 
-    `writer` and `sequence` point at a recorded message. Inputs that no topic carries (start, ticks, replies to questions,
-    messages of unknown writers) travel whole in `inline`.
+    `writer` and `sequence` point at a recorded message. Inputs that no topic carries (start, ticks, replies to
+    questions, messages of unknown writers) travel whole in `inline`.
     """
 
     robot: str
@@ -31,6 +31,7 @@ class Started(Message, kw_only=True):
     instance: str
     epoch: int
     config: bytes  # the resolved config as JSON
+    reads: list[str] = []  # names of the topics it reads
 
 
 class Tick(Message, kw_only=True):
@@ -46,6 +47,7 @@ class JobDone(Message, kw_only=True):
     frame_id: int
     worker: str
     attempts: int  # 1 unless workers died or hung
+    error: str = ""  # why it was given up, when it was
 
 
 class TopicCount(msgspec.Struct, frozen=True, kw_only=True):

@@ -3,8 +3,8 @@
 Delivery is one word:
 
 - `latest`: a slow reader skips to the newest sample; what it skipped is counted.
-- `every`: nothing may be lost: publisher cache, history for late readers, recovery of missed samples. A reader that finds
-  a gap in the revisions asks the writer for a snapshot.
+- `every`: nothing may be lost: publisher cache, history for late readers, recovery of missed samples. A reader that
+  finds a gap in the revisions asks the writer for a snapshot.
 - `job`: each message goes to one worker of a pool, at least once; results are idempotent.
 """
 

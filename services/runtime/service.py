@@ -21,7 +21,7 @@ class Identity:
 
 @dataclass(frozen=True)
 class Ask:
-    """An output of a step: a question. The reply comes back as an input of a later step; the host retries until then."""
+    """An output of a step: a question. The reply is an input of a later step; the host retries until then."""
 
     query: Query
     request: Message
@@ -35,7 +35,7 @@ Step = Callable[[Any, Message, Any], Iterator[Output]]
 class Service:
     """One service: what it reads, writes and answers, and the functions that do it.
 
-    `step(state, message, cfg)` takes one input and yields outputs; it may change `state` in place and does nothing else.
+    `step(state, message, cfg)` takes one input and yields outputs; it may change `state` and does nothing else.
     Inputs are messages of `reads`, of `job`, replies to its questions, and `Tick` every `tick_s` seconds.
     `answers` maps a query to `f(state, request, cfg) -> reply`, which must not change the state.
     `drive`, for sources only, is a coroutine that feeds inputs from outside (see `services.runtime.host.Port`).

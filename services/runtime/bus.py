@@ -1,0 +1,211 @@
+"""The bus every service talks through, and the same bus inside one process.
+
+Callbacks are called on a foreign thread: they must only enqueue and return.
+"""
+
+import itertools
+import struct
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from fnmatch import fnmatchcase
+from typing import Protocol
+
+from schemas.topics import Topic
+
+HEADER = struct.Struct("<Qq")
+
+
+class BusError(Exception):
+    """The bus cannot do what was asked; the message says what to do."""
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One received sample, not decoded yet. `writer` is empty when the sender did not say who it is."""
+
+    topic: Topic
+    key: str
+    payload: bytes
+    writer: str
+    sequence: int
+    sent_ns: int
+
+
+class Request(Protocol):
+    """A question received by a server; it must be answered exactly once, from any thread."""
+
+    payload: bytes
+
+    def reply(self, payload: bytes) -> None:
+        """Answer."""
+
+    def refuse(self, reason: str) -> None:
+        """Decline; the caller gets the reason."""
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What came back from a call: a payload, or why there is none (`nobody`, `timeout`, or the server's reason)."""
+
+    payload: bytes | None
+    reason: str = ""
+
+
+OnSample = Callable[[Sample], None]
+OnRequest = Callable[[Request], None]
+OnAnswer = Callable[[Answer], None]
+OnMissed = Callable[[Topic, int], None]
+OnAlive = Callable[[str, bool], None]
+
+
+class Bus(Protocol):
+    """Publish, subscribe, call, serve, and tell who is alive."""
+
+    def put(self, topic: Topic, key: str, payload: bytes, header: bytes) -> None:
+        """Publish one sample with the topic's delivery."""
+
+    def subscribe(self, topic: Topic, pattern: str, on_sample: OnSample, on_missed: OnMissed) -> None:
+        """Receive samples; for `every`, also those published shortly before."""
+
+    def serve(self, key: str, on_request: OnRequest) -> None:
+        """Answer calls on a key."""
+
+    def call(self, key: str, payload: bytes, timeout_s: float, on_answer: OnAnswer) -> None:
+        """Ask whoever serves the key; the answer arrives in the callback, always exactly once."""
+
+    def announce(self, key: str) -> None:
+        """Be seen under this key until closed or dead."""
+
+    def watch(self, pattern: str, on_alive: OnAlive) -> None:
+        """See announced keys come and go, beginning with those already there."""
+
+    def close(self) -> None:
+        """Leave the bus."""
+
+
+def pack_header(writer: str, sequence: int, sent_ns: int) -> bytes:
+    """Who sent a sample and as which of its samples on that key."""
+    return HEADER.pack(sequence, sent_ns) + writer.encode()
+
+
+def unpack_header(header: bytes | None) -> tuple[str, int, int]:
+    """Writer, sequence and time of sending; an absent or damaged header gives an unknown writer."""
+    if header is None or len(header) <= HEADER.size:
+        return "", -1, 0
+    sequence, sent_ns = HEADER.unpack_from(header)
+    try:
+        return header[HEADER.size :].decode(), sequence, sent_ns
+    except UnicodeDecodeError:
+        return "", -1, 0
+
+
+def key_matches(pattern: str, key: str) -> bool:
+    """Whether a key matches an expression in which `*` stands for one chunk and a final `**` for any rest."""
+    parts, chunks = pattern.split("/"), key.split("/")
+    if parts[-1] == "**":
+        parts, chunks = parts[:-1], chunks[: len(parts) - 1]
+    return len(parts) == len(chunks) and all(map(fnmatchcase, chunks, parts))
+
+
+@dataclass
+class LocalRequest:
+    """A request on the local bus."""
+
+    payload: bytes
+    on_answer: OnAnswer
+
+    def reply(self, payload: bytes) -> None:
+        """Answer."""
+        self.on_answer(Answer(payload))
+
+    def refuse(self, reason: str) -> None:
+        """Decline."""
+        self.on_answer(Answer(None, reason))
+
+
+@dataclass
+class Hub:
+    """What the local buses of one process share."""
+
+    lock: threading.RLock = field(default_factory=threading.RLock)
+    ids: itertools.count = field(default_factory=itertools.count)
+    subscribers: list[tuple[int, Topic, str, OnSample]] = field(default_factory=list)
+    history: dict[str, list[Sample]] = field(default_factory=dict)
+    servers: dict[str, tuple[int, OnRequest]] = field(default_factory=dict)
+    tokens: dict[str, int] = field(default_factory=dict)
+    watchers: list[tuple[int, str, OnAlive]] = field(default_factory=list)
+
+
+class LocalBus:
+    """The bus inside one process, for tests, replay and debugging: one instance per service, joined by a hub."""
+
+    def __init__(self, hub: Hub) -> None:
+        self._hub = hub
+        self._id = next(hub.ids)
+
+    def put(self, topic: Topic, key: str, payload: bytes, header: bytes) -> None:
+        """Deliver to every matching subscriber at once; keep the newest for later ones."""
+        sample = Sample(topic, key, payload, *unpack_header(header))
+        with self._hub.lock:
+            if topic.cache:
+                kept = self._hub.history.setdefault(key, [])
+                kept.append(sample)
+                del kept[: -topic.cache]
+            for _, wanted, pattern, on_sample in list(self._hub.subscribers):
+                if wanted is topic and key_matches(pattern, key):
+                    on_sample(sample)
+
+    def subscribe(self, topic: Topic, pattern: str, on_sample: OnSample, on_missed: OnMissed) -> None:
+        """Receive samples and the kept history."""
+        with self._hub.lock:
+            for key, kept in self._hub.history.items():
+                for sample in kept:
+                    if sample.topic is topic and key_matches(pattern, key):
+                        on_sample(sample)
+            self._hub.subscribers.append((self._id, topic, pattern, on_sample))
+
+    def serve(self, key: str, on_request: OnRequest) -> None:
+        """Answer calls on a key expression."""
+        with self._hub.lock:
+            self._hub.servers[key] = (self._id, on_request)
+
+    def call(self, key: str, payload: bytes, timeout_s: float, on_answer: OnAnswer) -> None:
+        """Ask the first server whose expression matches."""
+        with self._hub.lock:
+            server = next((s for pattern, (_, s) in self._hub.servers.items() if key_matches(pattern, key)), None)
+        if server is None:
+            on_answer(Answer(None, "nobody"))
+        else:
+            server(LocalRequest(payload, on_answer))
+
+    def announce(self, key: str) -> None:
+        """Be seen."""
+        with self._hub.lock:
+            self._hub.tokens[key] = self._id
+            self._tell(key, True)
+
+    def watch(self, pattern: str, on_alive: OnAlive) -> None:
+        """See who comes and goes."""
+        with self._hub.lock:
+            self._hub.watchers.append((self._id, pattern, on_alive))
+            for key in self._hub.tokens:
+                if key_matches(pattern, key):
+                    on_alive(key, True)
+
+    def close(self) -> None:
+        """Leave the hub."""
+        hub = self._hub
+        with hub.lock:
+            hub.subscribers = [entry for entry in hub.subscribers if entry[0] != self._id]
+            hub.watchers = [entry for entry in hub.watchers if entry[0] != self._id]
+            hub.servers = {key: entry for key, entry in hub.servers.items() if entry[0] != self._id}
+            gone = [key for key, owner in hub.tokens.items() if owner == self._id]
+            for key in gone:
+                del hub.tokens[key]
+                self._tell(key, False)
+
+    def _tell(self, key: str, alive: bool) -> None:
+        for _, pattern, on_alive in self._hub.watchers:
+            if key_matches(pattern, key):
+                on_alive(key, alive)

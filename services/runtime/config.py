@@ -1,0 +1,83 @@
+"""Configuration in layers: defaults in the code, then a TOML file, then the environment, then the command line."""
+
+import tomllib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+import msgspec
+
+ENVIRONMENT_PREFIX = "PSG_"
+C = TypeVar("C", bound=msgspec.Struct)
+
+
+class ConfigError(Exception):
+    """A setting is wrong; the message names it and says what is allowed."""
+
+
+def read_file(path: str | Path | None) -> dict[str, dict[str, Any]]:
+    """Sections of a TOML file: `[segmenter]` then `beta = 2.0`. No path gives no settings."""
+    if not path:
+        return {}
+    try:
+        return tomllib.loads(Path(path).read_text())
+    except (OSError, tomllib.TOMLDecodeError) as error:
+        raise ConfigError(f"cannot read the configuration {path}: {error}") from error
+
+
+def from_environment(environment: Mapping[str, str]) -> dict[str, dict[str, str]]:
+    """Settings such as PSG_SEGMENTER__BETA=2.0."""
+    sections: dict[str, dict[str, str]] = {}
+    for name, value in environment.items():
+        if name.startswith(ENVIRONMENT_PREFIX) and "__" in name:
+            section, field = name[len(ENVIRONMENT_PREFIX) :].lower().split("__", 1)
+            sections.setdefault(section, {})[field] = value
+    return sections
+
+
+def from_arguments(arguments: Sequence[str]) -> dict[str, dict[str, str]]:
+    """Settings such as `segmenter.beta=2.0`."""
+    sections: dict[str, dict[str, str]] = {}
+    for argument in arguments:
+        name, equals, value = argument.partition("=")
+        section, dot, field = name.partition(".")
+        if not (equals and dot and section and field):
+            raise ConfigError(f"--set takes SERVICE.FIELD=VALUE, for example segmenter.beta=2.0; got {argument!r}")
+        sections.setdefault(section, {})[field] = value
+    return sections
+
+
+def merge(*layers: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
+    """Later layers win, field by field."""
+    merged: dict[str, dict[str, Any]] = {}
+    for layer in layers:
+        for section, fields in layer.items():
+            if not isinstance(fields, Mapping):
+                raise ConfigError(f"{section} stands outside any section; write [{section}] and its fields below")
+            merged.setdefault(section, {}).update(fields)
+    return merged
+
+
+def check_sections(layers: Mapping[str, Any], known: Sequence[str]) -> None:
+    """Raise ConfigError when a section names no service."""
+    for section in layers:
+        if section not in known:
+            raise ConfigError(f"there is no service {section!r}; known: {', '.join(known)}")
+
+
+def resolve(config_type: type[C], section: str, layers: Mapping[str, Mapping[str, Any]]) -> C:
+    """The config of one service. Text values are read as the field's type; lists as JSON."""
+    values = dict(layers.get(section, {}))
+    fields = {field.name: field for field in msgspec.structs.fields(config_type)}
+    for name, value in values.items():
+        if name not in fields:
+            raise ConfigError(f"{section} has no setting {name!r}; it has: {', '.join(sorted(fields))}")
+        if isinstance(value, str) and value[:1] in "[{":
+            try:
+                values[name] = msgspec.json.decode(value)
+            except msgspec.DecodeError as error:
+                raise ConfigError(f"{section}.{name}: {value!r} is not valid JSON: {error}") from error
+    try:
+        return msgspec.convert(values, config_type, strict=False)
+    except (msgspec.ValidationError, ValueError) as error:
+        raise ConfigError(f"{section}: {error}") from error

@@ -1,0 +1,242 @@
+"""The bus over Zenoh: the only file that imports zenoh.
+
+Every process is a client of a router on its own host (peers do not relay). `every` uses advanced publishers with a
+cache, history for late readers and recovery of missed samples; what these cannot recover is caught by the revisions of
+deltas.
+"""
+
+import contextlib
+import json
+import logging
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+import zenoh
+from zenoh import CongestionControl, ConsolidationMode, Priority, QueryTarget, SampleKind
+from zenoh import ext as zx
+
+from schemas.codec import schema_name
+from schemas.topics import Topic
+from services.runtime.bus import (
+    Answer,
+    BusError,
+    OnAlive,
+    OnAnswer,
+    OnMissed,
+    OnRequest,
+    OnSample,
+    Sample,
+    unpack_header,
+)
+
+log = logging.getLogger(__name__)
+HEARTBEAT_S = 0.3
+CLOSE_TIMEOUT_S = 3.0
+LEASE_MS = 2000
+
+
+def client_config(endpoint: str) -> zenoh.Config:
+    """Client of one router; dead neighbours are noticed within two seconds."""
+    return zenoh.Config.from_json5(
+        json.dumps(
+            {
+                "mode": "client",
+                "connect": {
+                    "endpoints": [endpoint],
+                    "timeout_ms": 3000,
+                    "retry": {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 1.5},
+                },
+                "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
+                "timestamping": {"enabled": True},
+                "transport": {
+                    "link": {"tx": {"lease": LEASE_MS, "keep_alive": 4}, "rx": {"buffer_size": 4194304}},
+                    "shared_memory": {"enabled": False},
+                },
+            }
+        )
+    )
+
+
+def router_config(endpoint: str) -> zenoh.Config:
+    """A router on one endpoint of this host, reachable from nowhere else when the endpoint is on loopback."""
+    return zenoh.Config.from_json5(
+        json.dumps(
+            {
+                "mode": "router",
+                "listen": {"endpoints": [endpoint]},
+                "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
+                "timestamping": {"enabled": True},
+                "transport": {"link": {"tx": {"lease": LEASE_MS, "keep_alive": 4}, "rx": {"buffer_size": 4194304}}},
+            }
+        )
+    )
+
+
+def open_router(endpoint: str) -> Callable[[], None]:
+    """Start a router in this process; returns the function that stops it. Raises BusError."""
+    zenoh.init_log_from_env_or("error")
+    try:
+        session = zenoh.open(router_config(endpoint))
+    except zenoh.ZError as error:
+        raise BusError(f"no router can listen on {endpoint} ({error}); choose another with --connect") from error
+    return lambda: _close_within(session, CLOSE_TIMEOUT_S)
+
+
+def _close_within(session: zenoh.Session, timeout_s: float) -> None:
+    """Close, but not for longer than the timeout: closing over a broken link can take very long."""
+    closer = threading.Thread(target=lambda: _quietly(session.close), daemon=True)
+    closer.start()
+    closer.join(timeout_s)
+
+
+def _quietly(action: Callable[[], Any]) -> None:
+    with contextlib.suppress(zenoh.ZError):
+        action()
+
+
+class ZenohRequest:
+    """A request held open until it is answered."""
+
+    def __init__(self, query: zenoh.Query) -> None:
+        self._query = query
+        self.payload = query.payload.to_bytes() if query.payload is not None else b""
+
+    def reply(self, payload: bytes) -> None:
+        """Answer; a caller that has gone away is no error."""
+        with self._query:
+            _quietly(lambda: self._query.reply(str(self._query.key_expr), payload))
+
+    def refuse(self, reason: str) -> None:
+        """Decline."""
+        with self._query:
+            _quietly(lambda: self._query.reply_err(reason.encode()))
+
+
+class ZenohBus:
+    """One session. Raises BusError when no router answers within `wait_s`."""
+
+    def __init__(self, endpoint: str, wait_s: float = 10.0) -> None:
+        zenoh.init_log_from_env_or("error")
+        self._session = self._open(endpoint, wait_s)
+        self._publishers: dict[str, Any] = {}
+        self._lock = threading.Lock()
+        self._entities: list[Any] = []
+
+    @staticmethod
+    def _open(endpoint: str, wait_s: float) -> zenoh.Session:
+        deadline = time.monotonic() + wait_s
+        while True:
+            try:
+                return zenoh.open(client_config(endpoint))
+            except zenoh.ZError as error:
+                if time.monotonic() > deadline:
+                    raise BusError(
+                        f"no router answers on {endpoint}; start one with `prior-sg up`, or name another with --connect"
+                    ) from error
+                time.sleep(0.2)
+
+    def put(self, topic: Topic, key: str, payload: bytes, header: bytes) -> None:
+        """Publish one sample."""
+        with self._lock:
+            publisher = self._publishers.get(key)
+            if publisher is None:
+                publisher = self._publishers[key] = self._declare_publisher(topic, key)
+        publisher.put(payload, attachment=header)
+
+    def _declare_publisher(self, topic: Topic, key: str) -> Any:
+        encoding = zenoh.Encoding("application/msgpack").with_schema(schema_name(topic.type))
+        if topic.delivery == "latest":
+            return self._session.declare_publisher(
+                key, encoding=encoding, congestion_control=CongestionControl.DROP, priority=Priority.INTERACTIVE_HIGH
+            )
+        return zx.declare_advanced_publisher(
+            self._session,
+            key,
+            encoding=encoding,
+            congestion_control=CongestionControl.BLOCK,
+            cache=zx.CacheConfig(
+                topic.cache, replies_config=zx.RepliesConfig(congestion_control=CongestionControl.BLOCK)
+            ),
+            sample_miss_detection=zx.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=HEARTBEAT_S),
+            publisher_detection=True,
+        )
+
+    def subscribe(self, topic: Topic, pattern: str, on_sample: OnSample, on_missed: OnMissed) -> None:
+        """Receive samples of a topic."""
+
+        def receive(sample: zenoh.Sample) -> None:
+            if sample.kind == SampleKind.PUT:
+                header = sample.attachment.to_bytes() if sample.attachment is not None else None
+                on_sample(Sample(topic, str(sample.key_expr), sample.payload.to_bytes(), *unpack_header(header)))
+
+        if topic.delivery == "latest":
+            self._entities.append(self._session.declare_subscriber(pattern, receive))
+            return
+        subscriber = zx.declare_advanced_subscriber(
+            self._session,
+            pattern,
+            receive,
+            history=zx.HistoryConfig(detect_late_publishers=True, max_samples=topic.cache),
+            recovery=zx.RecoveryConfig(periodic_queries=None, heartbeat=True),
+            subscriber_detection=True,
+        )
+        self._entities.append(subscriber)
+        self._entities.append(subscriber.sample_miss_listener(lambda miss: on_missed(topic, miss.nb)))
+
+    def serve(self, key: str, on_request: OnRequest) -> None:
+        """Answer calls on a key expression."""
+        self._entities.append(
+            self._session.declare_queryable(key, lambda query: on_request(ZenohRequest(query)), complete=True)
+        )
+
+    def call(self, key: str, payload: bytes, timeout_s: float, on_answer: OnAnswer) -> None:
+        """Ask the nearest server of the key."""
+        self._session.get(
+            key,
+            _answer_once(on_answer),
+            target=QueryTarget.BEST_MATCHING,
+            consolidation=ConsolidationMode.NONE,
+            congestion_control=CongestionControl.BLOCK,
+            timeout=timeout_s,
+            payload=payload,
+        )
+
+    def announce(self, key: str) -> None:
+        """Be seen."""
+        self._entities.append(self._session.liveliness().declare_token(key))
+
+    def watch(self, pattern: str, on_alive: OnAlive) -> None:
+        """See who comes and goes."""
+        self._entities.append(
+            self._session.liveliness().declare_subscriber(
+                pattern, lambda sample: on_alive(str(sample.key_expr), sample.kind == SampleKind.PUT), history=True
+            )
+        )
+
+    def close(self) -> None:
+        """Leave the bus, within a bound."""
+        _close_within(self._session, CLOSE_TIMEOUT_S)
+
+
+def _answer_once(on_answer: OnAnswer) -> Any:
+    """A reply handler that calls back exactly once: with the first reply, or at the end with the reason for none."""
+    answered = threading.Event()
+
+    def receive(reply: zenoh.Reply) -> None:
+        if answered.is_set():
+            return
+        answered.set()
+        if reply.ok is not None:
+            on_answer(Answer(reply.ok.payload.to_bytes()))
+        else:
+            reason = reply.err.payload.to_string() if reply.err is not None else "nobody"
+            on_answer(Answer(None, "timeout" if reason == "Timeout" else reason))
+
+    def finish() -> None:
+        if not answered.is_set():
+            answered.set()
+            on_answer(Answer(None, "nobody"))
+
+    return zenoh.handlers.Callback(receive, finish)
