@@ -1,0 +1,140 @@
+"""Keeps every robot's scene graph durably: reads deltas, writes revisions, answers with the scene."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from schemas.codec import Message
+from schemas.places import PlaceDelta, SnapshotRequest
+from schemas.priors import Prior, Task
+from schemas.regions import RegionDelta
+from schemas.scene import Scene, SceneRequest
+from schemas.status import Tick
+from schemas.topics import (
+    PLACE_DELTA,
+    PLACE_SNAPSHOT,
+    PRIOR,
+    REGION_DELTA,
+    REGION_SNAPSHOT,
+    SCENE,
+    SCENE_REVISION,
+    TASK,
+)
+from services.deltas import Follower
+from services.runtime.service import Ask, Identity, Output, Service
+from services.scene_store import core
+from services.scene_store.database import Database
+
+CHECKPOINT_S = 1.0  # the write-ahead log is folded into the file between deltas, not within a commit
+
+
+@dataclass
+class Robot:
+    """One robot's graph and where its two writers stand."""
+
+    graph: core.Graph
+    places: Follower[PlaceDelta]
+    regions: Follower[RegionDelta]
+
+
+@dataclass
+class State:
+    """The open database and what it holds, by robot; `resumed` names robots whose writers have moved on meanwhile."""
+
+    epoch: int
+    database: Database
+    robots: dict[str, Robot]
+    resumed: list[str]
+
+
+def init(cfg: core.Config, identity: Identity) -> State:
+    """Open or create the database and resume from its cursors. Raises StoreError."""
+    database = Database(cfg)
+    robots = {name: _robot(graph) for name, graph in database.graphs().items()}
+    return State(identity.epoch, database, robots, sorted(robots))
+
+
+def step(state: State, message: Message, cfg: core.Config) -> Iterator[Output]:
+    """Make one input durable; every delta is committed before its revision is announced."""
+    yield from _resume(state)
+    match message:
+        case PlaceDelta():
+            yield from _take_places(state, message)
+        case RegionDelta():
+            yield from _take_regions(state, message)
+        case Task():
+            if core.set_task(_known(state, message.robot).graph, message):
+                state.database.put_task(message)
+        case Prior():
+            state.database.put_prior(message)
+        case Tick():
+            state.database.checkpoint()
+
+
+def _resume(state: State) -> Iterator[Output]:
+    """After a restart the writers may be quiet already, so that no gap would show what was missed: ask at once."""
+    while state.resumed:
+        request = SnapshotRequest(robot=state.resumed.pop(0))
+        yield Ask(PLACE_SNAPSHOT, request)
+        yield Ask(REGION_SNAPSHOT, request)
+
+
+def _take_places(state: State, delta: PlaceDelta) -> Iterator[Output]:
+    robot = _known(state, delta.robot)
+    ready = robot.places.take(delta)
+    cameras = core.note_cameras(robot.graph, delta)
+    if cameras and not ready:
+        state.database.put_cameras(delta.robot, cameras)
+    for due in ready:
+        changes = core.apply_places(robot.graph, due)
+        state.database.put_places(robot.graph, changes, cameras)
+        yield SCENE_REVISION, core.revision_of(robot.graph, state.epoch)
+    if robot.places.needs_snapshot:
+        yield Ask(PLACE_SNAPSHOT, SnapshotRequest(robot=delta.robot))
+
+
+def _take_regions(state: State, delta: RegionDelta) -> Iterator[Output]:
+    robot = _known(state, delta.robot)
+    for due in robot.regions.take(delta):
+        changes = core.apply_regions(robot.graph, due)
+        state.database.put_regions(robot.graph, changes)
+        yield SCENE_REVISION, core.revision_of(robot.graph, state.epoch)
+    if robot.regions.needs_snapshot:
+        yield Ask(REGION_SNAPSHOT, SnapshotRequest(robot=delta.robot))
+
+
+def _known(state: State, robot: str) -> Robot:
+    if robot not in state.robots:
+        state.robots[robot] = _robot(core.Graph(robot))
+    return state.robots[robot]
+
+
+def _robot(graph: core.Graph) -> Robot:
+    places, regions = graph.place_cursor, graph.region_cursor
+    return Robot(graph, Follower(places.epoch, places.revision), Follower(regions.epoch, regions.revision))
+
+
+def answer_scene(state: State, request: SceneRequest, cfg: core.Config) -> Scene:
+    """The scene of one robot; empty when the store has never heard of it."""
+    robot = state.robots.get(request.robot)
+    return core.scene(robot.graph if robot else core.Graph(request.robot))
+
+
+def close(state: State) -> None:
+    """Close the database."""
+    state.database.close()
+
+
+SERVICE = Service(
+    name="scene_store",
+    purpose="keeps every robot's scene graph durably and answers with it",
+    scope="fleet",
+    config=core.Config,
+    init=init,
+    step=step,
+    reads=(PLACE_DELTA, REGION_DELTA, TASK, PRIOR),
+    writes=(SCENE_REVISION,),
+    answers={SCENE: answer_scene},
+    asks=(PLACE_SNAPSHOT, REGION_SNAPSHOT),
+    tick_s=CHECKPOINT_S,
+    close=close,
+)
