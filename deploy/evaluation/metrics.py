@@ -1,10 +1,11 @@
 """How well regions fit the ground truth (paper, Evaluation Metrics; after Hughes et al., Hydra).
 
-Places are compared by the free space they fill. A free voxel whose centre lies in the spheres of several places belongs
-to the one with the smallest power distance d^2 - r^2 (then the smallest id), which cuts two overlapping spheres along
-the plane of their common circle. A place belongs to the ground-truth region whose polygon and floor hold its centre; places
-in no polygon are left out before anything else. An estimated region is all places that carry its id, and places without
-a region take part on the ground-truth side only. Regions that own no voxel do not count on either side.
+Places are compared by the free space they fill. A free voxel whose centre lies in the spheres of several places
+belongs to the one with the smallest power distance d^2 - r^2 (then the smallest id), which cuts two overlapping
+spheres along the plane of their common circle. A place belongs to the ground-truth region whose polygon and floor
+hold its centre; places in no polygon are left out before anything else. An estimated region is all places that carry
+its id, and places without a region take part on the ground-truth side only. Regions that own no voxel do not count on
+either side.
 """
 
 from dataclasses import dataclass
