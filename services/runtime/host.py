@@ -119,6 +119,7 @@ class Host:
     async def _leave(self) -> None:
         for pool in self._pools.values():
             pool.close()
+        await self._on_thread(self._journal, "STOP")
         await self._on_thread(self.service.close, self._state)
         await self._on_thread(self.bus.close)
         self._thread.shutdown(wait=False)

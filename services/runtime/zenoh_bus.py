@@ -8,6 +8,7 @@ deltas.
 import contextlib
 import json
 import logging
+import socket
 import threading
 import time
 from collections.abc import Callable
@@ -82,6 +83,21 @@ def open_router(endpoint: str) -> Callable[[], None]:
     except zenoh.ZError as error:
         raise BusError(f"no router can listen on {endpoint} ({error}); choose another with --connect") from error
     return lambda: _close_within(session, CLOSE_TIMEOUT_S)
+
+
+def free_endpoint(wanted: str) -> str:
+    """The endpoint wanted, or one on a free port of the same host when its port is 0 or taken."""
+    protocol, address = wanted.split("/", 1)
+    host, port = address.rsplit(":", 1)
+    for candidate in (int(port), 0):
+        with socket.socket() as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            try:
+                probe.bind((host, candidate))
+            except OSError:
+                continue
+            return f"{protocol}/{host}:{probe.getsockname()[1]}"
+    raise BusError(f"no port is free on {host}")
 
 
 def _close_within(session: zenoh.Session, timeout_s: float) -> None:

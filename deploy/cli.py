@@ -1,0 +1,420 @@
+"""The command line: `prior-sg`."""
+
+import argparse
+import json
+import os
+import sys
+import time
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+from deploy import serve
+
+DEFAULT_CONNECT = "tcp/127.0.0.1:7447"
+DEMO_ENVIRONMENT = "residential home"
+DEMO_TASK = "real-estate listing"
+SAMPLE = Path(__file__).parent / "sample" / "home.mcap"
+console = Console(highlight=False)
+
+
+class UserError(Exception):
+    """What the user asked cannot be done; the message says what to do instead."""
+
+
+def _example(text: str) -> dict:
+    return {"epilog": f"example: {text}", "formatter_class": argparse.RawDescriptionHelpFormatter}
+
+
+def _add_bus(parser: argparse.ArgumentParser, robot: bool = True) -> None:
+    default = os.environ.get("PSG_CONNECT", DEFAULT_CONNECT)
+    parser.add_argument("--connect", default=default, help="Zenoh router (default: %(default)s)")
+    if robot:
+        parser.add_argument("--robot", default="robot1", help="name of the robot (default: %(default)s)")
+
+
+def _add_run_options(parser: argparse.ArgumentParser) -> None:
+    _add_bus(parser)
+    parser.add_argument("--workers", type=int, default=1, help="feature workers (default: %(default)s)")
+    parser.add_argument(
+        "--speed", type=float, default=0.0, help="replay speed; 0 = as fast as the pipeline drains (default)"
+    )
+    parser.add_argument("--config", default="", help="TOML file with a section per service")
+    parser.add_argument("--set", action="append", default=[], metavar="SERVICE.FIELD=VALUE", help="one setting")
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """All commands with their options."""
+    parser = argparse.ArgumentParser(
+        prog="prior-sg",
+        description="Task-driven hierarchical scene graphs from posed RGB-D streams.",
+        **_example("prior-sg demo"),
+    )
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+
+    def command(name: str, summary: str, example: str) -> argparse.ArgumentParser:
+        return commands.add_parser(name, help=summary, description=summary, **_example(example))
+
+    demo = command("demo", "run everything on the sample home and score the result", "prior-sg demo --workers 2")
+    demo.add_argument("--out", type=Path, default=Path("out/demo"), help="folder for the results")
+    demo.add_argument("--task", default=DEMO_TASK, help="what the robot is to do (default: %(default)s)")
+    demo.add_argument("--regions", default="", help="fixed region names, separated by commas")
+    _add_run_options(demo)
+
+    run = command(
+        "run",
+        "turn a recording into a scene graph",
+        'prior-sg run recordings/home --environment "residential home" --task "serve drinks to guests" --out out/home',
+    )
+    run.add_argument("source", help="a dataset folder, a 7-Scenes folder, or an MCAP log")
+    run.add_argument("--environment", required=True, help="what kind of place it is, in plain words")
+    run.add_argument("--task", required=True, help="what the robot is to do, in plain words")
+    run.add_argument("--regions", default="", help="fixed region names, separated by commas; default: the prior's")
+    run.add_argument("--out", type=Path, default=Path("out/run"), help="folder for the results")
+    _add_run_options(run)
+
+    up = command("up", "start services and a router, until Ctrl-C", "prior-sg up segmenter scene_store")
+    up.add_argument("services", nargs="*", help="services to start; default: all")
+    up.add_argument("--source", default="", help="what ingest reads; default: nothing")
+    up.add_argument("--out", type=Path, default=Path("out/up"), help="folder for the database and logs")
+    up.add_argument("--no-router", action="store_true", help="use the router at --connect instead of starting one")
+    _add_run_options(up)
+
+    one = command("serve", "run one service in this process (what containers do)", "prior-sg serve segmenter")
+    serve.add_arguments(one)
+
+    task = command("task", "give a robot another task, live", 'prior-sg task "serve drinks to guests"')
+    task.add_argument("task", help="the task in plain words")
+    task.add_argument("--environment", default="", help="the environment; default: the one in force")
+    task.add_argument("--regions", default="", help="fixed region names, separated by commas")
+    task.add_argument("--timeout", type=float, default=60.0, help="seconds to wait for the new regions")
+    _add_bus(task)
+
+    export = command("export", "write the scene graph as a file", "prior-sg export --format spark-dsg --out dsg.json")
+    export.add_argument("--format", choices=("json", "spark-dsg", "png"), default="json")
+    export.add_argument("--out", type=Path, required=True, help="the file to write")
+    export.add_argument("--database", type=Path, help="read this scene.sqlite instead of the running store")
+    _add_bus(export)
+
+    record = command("record", "record all topics into a log, until Ctrl-C", "prior-sg record out/log.mcap")
+    record.add_argument("log", type=Path)
+    record.add_argument("--seconds", type=float, default=0.0, help="stop after this long; 0 = at Ctrl-C")
+    _add_bus(record, robot=False)
+
+    replay = command(
+        "replay", "feed a log to one service again and compare", "prior-sg replay out/demo/log.mcap segmenter --diff"
+    )
+    replay.add_argument("log", type=Path)
+    replay.add_argument("service")
+    replay.add_argument("--diff", action="store_true", help="compare with what was recorded; exit 1 on differences")
+
+    topics = command("topics", "show topics and queries, or check that all documents agree", "prior-sg topics --check")
+    topics.add_argument("--check", action="store_true", help="exit 1 when anything disagrees")
+    topics.add_argument("--write", action="store_true", help="renew README, docs and docker-compose.yml")
+
+    health = command("health", "show every running process and its topics", "prior-sg health --json")
+    health.add_argument("--json", action="store_true", help="print JSON")
+    _add_bus(health, robot=False)
+
+    priors = command("priors", "list the curated priors", "prior-sg priors list")
+    priors.add_argument("action", choices=("list",))
+    return parser
+
+
+def _client(connect: str) -> "Client":  # noqa: F821
+    from deploy.client import Client
+    from services.runtime.zenoh_bus import ZenohBus
+
+    return Client(ZenohBus(connect, wait_s=2.0))
+
+
+def _names(text: str) -> list[str]:
+    return [name.strip() for name in text.split(",") if name.strip()]
+
+
+def cmd_demo(arguments: argparse.Namespace) -> int:
+    """The main job on the embedded sample."""
+    arguments.source, arguments.environment = str(SAMPLE), DEMO_ENVIRONMENT
+    return cmd_run(arguments)
+
+
+def cmd_run(arguments: argparse.Namespace) -> int:
+    """The main job on a source of the user's."""
+    from deploy import report
+    from deploy.run import Job, run
+
+    if not Path(arguments.source).exists():
+        raise UserError(f"{arguments.source} does not exist")
+    job = Job(
+        source=arguments.source,
+        out=arguments.out,
+        environment=arguments.environment,
+        task=arguments.task,
+        regions=_names(arguments.regions),
+        robot=arguments.robot,
+        connect=arguments.connect,
+        workers=arguments.workers,
+        speed=arguments.speed,
+        settings=arguments.set,
+        config=arguments.config,
+        on_pids=lambda pids: console.print(
+            f"{len(pids)} service processes: " + ", ".join(f"{name} {pid}" for name, pid in sorted(pids.items()))
+        ),
+    )
+    result = run(job, console)
+    report.write(result, job.out, report.truth_of(arguments.source), console)
+    return 0
+
+
+def cmd_up(arguments: argparse.Namespace) -> int:
+    """Services and a router until Ctrl-C."""
+    from deploy.supervisor import Supervisor
+    from services.registry import BY_NAME, SERVICES
+    from services.runtime.zenoh_bus import open_router
+
+    names = arguments.services or [service.name for service in SERVICES]
+    for name in names:
+        if name not in BY_NAME:
+            raise UserError(f"there is no service {name!r}; known: {', '.join(BY_NAME)}")
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    settings = [*arguments.set, f"scene_store.path={arguments.out / 'scene.sqlite'}", f"ingest.speed={arguments.speed}"]
+    settings += [f"ingest.source={arguments.source}"] if arguments.source else []
+    stop_router = (lambda: None) if arguments.no_router else open_router(arguments.connect)
+    supervisor = Supervisor(arguments.connect, arguments.robot, arguments.out / "logs", settings, arguments.config)
+    try:
+        for name in sorted(names, key=lambda name: name == "ingest"):
+            supervisor.start(name, arguments.workers if BY_NAME[name].job is not None else 1)
+        console.print(f"router {arguments.connect}; logs in {supervisor.log_folder}; Ctrl-C stops")
+        while True:
+            for event in supervisor.check():
+                console.print(event)
+            time.sleep(0.2)
+    except KeyboardInterrupt:
+        console.print("stopping")
+        return 0
+    finally:
+        supervisor.stop()
+        stop_router()
+
+
+def cmd_task(arguments: argparse.Namespace) -> int:
+    """Switch the task and wait for the new regions."""
+    import threading
+
+    from deploy import report
+    from schemas.codec import decode
+    from schemas.priors import PriorRequest, Task
+    from schemas.regions import RegionDelta
+    from schemas.scene import SceneRequest
+    from schemas.topics import PRIORS, REGION_DELTA, SCENE, TASK
+
+    with _client(arguments.connect) as client:
+        environment = arguments.environment or client.ask(SCENE, SceneRequest(robot=arguments.robot)).environment
+        if not environment:
+            raise UserError(f"{arguments.robot} has no environment yet; name one with --environment")
+        task = Task(
+            robot=arguments.robot,
+            stamp_ns=time.time_ns(),
+            environment=environment,
+            task=arguments.task,
+            regions=_names(arguments.regions),
+        )
+        reply = client.ask(
+            PRIORS, PriorRequest(environment=environment, task=arguments.task, regions=task.regions), arguments.timeout
+        )
+        if not reply.priors:
+            raise UserError(reply.reason)
+        digest = reply.priors[0].digest()
+        changed = threading.Event()
+        started_s = time.monotonic()
+
+        def see(sample: object) -> None:
+            delta = decode(RegionDelta, sample.payload)
+            if delta.prior_digest == digest and delta.task == arguments.task:
+                changed.set()
+
+        client.listen(REGION_DELTA, arguments.robot, see)
+        client.publish(TASK, task)
+        if not changed.wait(arguments.timeout):
+            raise UserError(f"no regions for the new task within {arguments.timeout:.0f} s; see `prior-sg health`")
+        seconds = time.monotonic() - started_s
+        time.sleep(0.5)
+        console.print(report.region_table(client.ask(SCENE, SceneRequest(robot=arguments.robot))))
+        console.print(f"regions for {arguments.task!r} after {seconds:.2f} s")
+    return 0
+
+
+def cmd_export(arguments: argparse.Namespace) -> int:
+    """Write the scene graph from the running store or a database file."""
+    from deploy import report
+    from schemas.places import MapRequest
+    from schemas.scene import SceneRequest
+    from schemas.topics import SCENE, VOXEL_MAP
+    from services.runtime.bus import BusError
+
+    voxels = None
+    if arguments.database is not None:
+        scene = report.scene_in(arguments.database, arguments.robot)
+    else:
+        with _client(arguments.connect) as client:
+            scene = client.ask(SCENE, SceneRequest(robot=arguments.robot))
+            if arguments.format == "png":
+                try:
+                    voxels = client.ask(VOXEL_MAP, MapRequest(robot=arguments.robot))
+                except BusError as error:
+                    console.print(f"without the map of walls: {error}")
+    if not len(scene.place_ids):
+        raise UserError(f"the store holds no places of {arguments.robot}; name another with --robot")
+    report.export(scene, voxels, arguments.format, arguments.out)
+    console.print(f"{len(scene.place_ids)} places, {len(scene.regions)} regions: {arguments.out}")
+    return 0
+
+
+def cmd_record(arguments: argparse.Namespace) -> int:
+    """Record until Ctrl-C or the given time."""
+    from deploy.recorder import Recorder
+
+    with _client(arguments.connect) as client:
+        recorder = Recorder(client, arguments.log)
+        end_s = time.monotonic() + (arguments.seconds or float("inf"))
+        try:
+            with console.status("recording; Ctrl-C stops") as status:
+                while time.monotonic() < end_s:
+                    time.sleep(0.2)
+                    total = sum(recorder.counts.values())
+                    status.update(f"recording: {total} messages; Ctrl-C stops")
+        except KeyboardInterrupt:
+            pass
+        finally:
+            recorder.close()
+    console.print(f"{sum(recorder.counts.values())} messages: {arguments.log}")
+    return 0
+
+
+def cmd_replay(arguments: argparse.Namespace) -> int:
+    """Replay a service and report differences."""
+    from deploy import replay, report
+    from services.registry import BY_NAME
+
+    if arguments.service not in BY_NAME:
+        raise UserError(f"there is no service {arguments.service!r}; known: {', '.join(BY_NAME)}")
+    log = replay.open_log(arguments.log, arguments.service)
+    differences = 0
+    for life in log.lives:
+        found = replay.compare(log, life)
+        console.print(
+            f"{found.instance}: {found.inputs} inputs, {found.recorded} outputs recorded, {found.outputs} made"
+        )
+        for text in found.differences[:20] if arguments.diff else []:
+            console.print(f"  {text}")
+        differences += len(found.differences)
+    if arguments.service == "scene_store":
+        text = report.final_scene_difference(log, arguments.log)
+        console.print(f"  {text}" if text else "final scene: equal to that of an undisturbed replay")
+        differences += bool(text)
+    console.print(f"{differences} differences")
+    return 1 if arguments.diff and differences else 0
+
+
+def cmd_topics(arguments: argparse.Namespace) -> int:
+    """Show, check or renew what is generated from the registry."""
+    from deploy import topics
+
+    if arguments.write:
+        console.print("renewed " + ", ".join(topics.write()))
+    elif arguments.check:
+        found = topics.faults()
+        for text in found:
+            console.print(text)
+        console.print(f"{len(found)} faults")
+        return 1 if found else 0
+    else:
+        print(topics.table())
+    return 0
+
+
+def cmd_health(arguments: argparse.Namespace) -> int:
+    """Every process: alive, busy, what it dropped."""
+    import msgspec
+
+    from services.runtime.bus import BusError
+
+    with _client(arguments.connect) as client:
+        statuses, silent = [], []
+        for instance, service in sorted(client.alive().items()):
+            try:
+                statuses.append(client.status(service, instance))
+            except BusError as error:
+                silent.append({"service": service, "instance": instance, "error": str(error)})
+    if arguments.json:
+        print(json.dumps({"processes": msgspec.to_builtins(statuses), "silent": silent}))
+    else:
+        _print_health(statuses, silent)
+    return 1 if silent or not statuses else 0
+
+
+def _print_health(statuses: list, silent: list) -> None:
+    table = Table("process", "pid", "up s", "backlog", "busy", "step ms p50/p99", "MB", "waits for", "topics")
+    for status in statuses:
+        lines = []
+        for count in status.topics:
+            parts = [
+                f"{count.consumed} in" if count.consumed else "",
+                f"{count.published} out" if count.published else "",
+            ]
+            parts += [
+                f"[red]{n} {word}[/]" for n, word in ((count.malformed, "malformed"), (count.missed, "missed")) if n
+            ]
+            parts += [f"{n} {word}" for n, word in ((count.skipped, "skipped"), (count.duplicate, "repeated")) if n]
+            lines.append(f"{count.topic}: {', '.join(filter(None, parts))}")
+        table.add_row(
+            status.instance,
+            str(status.pid),
+            f"{status.uptime_s:.0f}",
+            str(status.backlog),
+            f"{status.busy_share:.0%}",
+            f"{status.step_ms_p50:.1f} / {status.step_ms_p99:.1f}",
+            f"{status.resident_mb:.0f}",
+            ", ".join(status.waiting_for),
+            "\n".join(lines),
+        )
+    console.print(table)
+    for entry in silent:
+        console.print(f"[red]{entry['error']}[/]")
+    if not statuses and not silent:
+        console.print("no service is running; start them with `prior-sg up`")
+
+
+def cmd_priors(arguments: argparse.Namespace) -> int:
+    """List the curated library."""
+    from deploy import report
+
+    console.print(report.prior_table())
+    return 0
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Exit status of the command; faults of the user or the system are one sentence on standard error."""
+    arguments = build_parser().parse_args(argv)
+    if arguments.command == "serve":
+        return serve.run(arguments)
+    from deploy.run import RunError
+    from deploy.supervisor import ChildFailed
+    from services.ingest.sources import SourceError
+    from services.runtime.bus import BusError
+    from services.runtime.config import ConfigError
+    from services.runtime.record import LogError
+
+    try:
+        return globals()[f"cmd_{arguments.command}"](arguments)
+    except (UserError, RunError, ChildFailed, BusError, ConfigError, LogError, SourceError) as error:
+        print(f"prior-sg: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print("prior-sg: interrupted", file=sys.stderr)
+        return 130
+
+
+if __name__ == "__main__":
+    sys.exit(main())

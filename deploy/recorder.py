@@ -1,0 +1,105 @@
+"""Records every recorded topic of all robots into one log, and knows how far its readers are."""
+
+import queue
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+
+from schemas.codec import DecodeError, decode
+from schemas.status import Consumed
+from schemas.topics import JOURNAL, TOPICS, Topic
+from services.registry import SERVICES
+from services.runtime.bus import Sample
+from services.runtime.record import LogWriter
+
+from deploy.client import Client
+
+FLUSH_S = 1.0
+
+
+class Recorder:
+    """Subscribes at once; writes on a thread of its own until `close`. `taps` see every sample on that thread."""
+
+    def __init__(self, client: Client, path: Path) -> None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self.log = LogWriter(path)
+        self.taps: list[Callable[[Sample], None]] = []
+        self.counts: Counter[str] = Counter()
+        self._queue: queue.SimpleQueue[Sample | None] = queue.SimpleQueue()
+        self._thread = threading.Thread(target=self._write, name="recorder")
+        self._thread.start()
+        for topic in TOPICS:
+            if topic.recorded:
+                client.listen(topic, "*", self._queue.put)
+
+    def close(self) -> None:
+        """Write what has arrived, then finish the file."""
+        self._queue.put(None)
+        self._thread.join()
+        self.log.close()
+
+    def _write(self) -> None:
+        flushed_s = time.monotonic()
+        while True:
+            try:
+                sample = self._queue.get(timeout=FLUSH_S)
+            except queue.Empty:
+                self.log.flush()
+                continue
+            if sample is None:
+                return
+            self._add(sample)
+            if time.monotonic() - flushed_s > FLUSH_S:
+                self.log.flush()
+                flushed_s = time.monotonic()
+
+    def _add(self, sample: Sample) -> None:
+        self.counts[sample.topic.name] += 1
+        if sample.writer:
+            self.log.add(
+                sample.topic, sample.key, sample.payload, sample.writer, sample.sequence, sample.sent_ns, time.time_ns()
+            )
+        for tap in self.taps:
+            tap(sample)
+
+
+class Settling:
+    """A tap: whether every reader has finished with everything published on the topics a run consists of."""
+
+    def __init__(self, topics: tuple[Topic, ...]) -> None:
+        self._topics = {topic.name for topic in topics}
+        self._readers = [
+            (service.name, topic.name) for service in SERVICES for topic in service.reads if topic.name in self._topics
+        ]
+        self._published: dict[tuple[str, str], int] = {}
+        self._consumed: dict[tuple[str, str, str], int] = {}
+        self.changed_s = time.monotonic()
+
+    def __call__(self, sample: Sample) -> None:
+        """See one recorded sample."""
+        if sample.topic is JOURNAL:
+            self._saw_journal(sample)
+        elif sample.topic.name in self._topics and sample.writer:
+            self._published[sample.topic.name, sample.writer] = sample.sequence
+            self.changed_s = time.monotonic()
+
+    def _saw_journal(self, sample: Sample) -> None:
+        try:
+            entry = decode(Consumed, sample.payload)
+        except DecodeError:
+            return
+        if entry.writer:
+            name = (entry.service, entry.topic, entry.writer)
+            self._consumed[name] = max(entry.sequence, self._consumed.get(name, -1))
+
+    def settled(self, quiet_s: float) -> bool:
+        """Nothing waits anywhere, and nothing new has been published for a while."""
+        behind = any(
+            self._consumed.get((service, topic, writer), -1) < newest
+            for (topic, writer), newest in list(self._published.items())
+            for service, read in self._readers
+            if read == topic
+        )
+        return not behind and time.monotonic() - self.changed_s > quiet_s

@@ -1,0 +1,17 @@
+"""The only list of services."""
+
+from schemas.topics import TASK, Topic
+from services.feature_pyramid.service import SERVICE as FEATURE_PYRAMID
+from services.ingest.service import SERVICE as INGEST
+from services.place_graph.service import SERVICE as PLACE_GRAPH
+from services.prior_gateway.service import SERVICE as PRIOR_GATEWAY
+from services.runtime.service import Service
+from services.scene_store.service import SERVICE as SCENE_STORE
+from services.segmenter.service import SERVICE as SEGMENTER
+
+SERVICES: tuple[Service, ...] = (INGEST, PLACE_GRAPH, FEATURE_PYRAMID, PRIOR_GATEWAY, SEGMENTER, SCENE_STORE)
+
+# Topics that people and their programs write or read, through the command line.
+OPERATOR_WRITES: tuple[Topic, ...] = (TASK,)
+
+BY_NAME: dict[str, Service] = {service.name: service for service in SERVICES}

@@ -1,0 +1,294 @@
+"""Logs: one MCAP file per recording, written crash-safe and readable by any MCAP tool.
+
+One channel per key and writer; the channel's metadata names our topic and the writer, its schema is the message type.
+An MCAP message carries the writer's sequence number and two times: `publish_time` is when the writer sent it,
+`log_time` when we received it. Messages lie in the file, and are read back, in the order in which they were added.
+
+A log whose process was killed has no index at its end. It is read up to its last complete chunk.
+"""
+
+import json
+import logging
+import struct
+from collections import Counter
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any, BinaryIO
+
+import msgspec
+import numpy as np
+import zstandard
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.reader import SeekingReader
+from mcap.records import Attachment, Channel, Chunk, ChunkIndex, Message, Metadata
+from mcap.stream_reader import breakup_chunk
+from mcap.summary import Summary
+from mcap.writer import MCAP0_MAGIC, Writer
+
+from schemas.codec import schema_name
+from schemas.topics import TOPICS, Topic
+
+CHUNK_BYTES = 1 << 20
+FLUSH_NS = 1_000_000_000  # of received time: what a killed process can lose
+SEQUENCE_MASK = 0xFFFFFFFF  # MCAP sequences are 32 bit
+DAMAGE = (McapError, ValueError, struct.error, zstandard.ZstdError, RuntimeError, MemoryError, OverflowError)
+
+logger = logging.getLogger(__name__)
+
+
+class LogError(RuntimeError):
+    """A log cannot be written or read; the text is one sentence for the user."""
+
+
+@dataclass(frozen=True, slots=True)
+class Logged:
+    """One message of a log, still encoded."""
+
+    topic: Topic
+    key: str
+    writer: str
+    sequence: int
+    sent_ns: int
+    received_ns: int
+    payload: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Content:
+    """How many messages one writer left on one key. `topic` is a name, which this version may not know."""
+
+    topic: str
+    key: str
+    writer: str
+    messages: int
+
+
+class LogWriter:
+    """Writes one log; use it from one thread. An existing file is replaced. Raises LogError."""
+
+    def __init__(self, path: str | Path) -> None:
+        self._path = path
+        with self._disk_errors():
+            self._file: BinaryIO = Path(path).open("wb")  # noqa: SIM115
+            self._writer = Writer(self._file, chunk_size=CHUNK_BYTES)
+            self._writer.start(profile="", library="prior-sg")
+        self._schemas: dict[str, int] = {}
+        self._channels: dict[tuple[str, str, str], int] = {}
+        self._end = self._file.tell()
+        self._flushed_ns: int | None = None
+        self.flush()
+
+    def add(
+        self, topic: Topic, key: str, payload: bytes, writer: str, sequence: int, *, sent_ns: int, received_ns: int
+    ) -> None:
+        """Append one encoded message; times are wall times in nanoseconds, `received_ns` is given by the caller."""
+        with self._disk_errors():
+            self._writer.add_message(
+                channel_id=self._channel(topic, key, writer),
+                log_time=received_ns,
+                data=payload,
+                publish_time=max(sent_ns, 0),  # MCAP times are unsigned; a damaged header must not end the log
+                sequence=sequence & SEQUENCE_MASK,
+            )
+            chunk_written = self._file.tell() != self._end
+        if self._flushed_ns is None:
+            self._flushed_ns = received_ns
+        if chunk_written or received_ns - self._flushed_ns >= FLUSH_NS:
+            self._flushed_ns = received_ns
+            self.flush()
+
+    def attach(self, name: str, media_type: str, data: bytes) -> None:
+        """Append a file, such as ground truth."""
+        with self._disk_errors():
+            self._writer.add_attachment(create_time=0, log_time=0, name=name, media_type=media_type, data=data)
+        self.flush()
+
+    def metadata(self, name: str, fields: dict[str, str]) -> None:
+        """Append named text fields, such as where the data came from."""
+        with self._disk_errors():
+            self._writer.add_metadata(name, fields)
+        self.flush()
+
+    def flush(self) -> None:
+        """Hand all messages so far to the operating system: they survive the end of this process."""
+        with self._disk_errors():
+            self._writer.flush()
+            self._end = self._file.tell()
+
+    def close(self) -> None:
+        """Write the index and close the file; closing twice does nothing."""
+        if not self._file.closed:
+            with self._disk_errors(), self._file:
+                self._writer.finish()
+
+    def __enter__(self) -> "LogWriter":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    @contextmanager
+    def _disk_errors(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise LogError(f"the log {self._path} cannot be written: {error.strerror}") from error
+
+    def _channel(self, topic: Topic, key: str, writer: str) -> int:
+        identity = (topic.name, key, writer)
+        if identity not in self._channels:
+            self._channels[identity] = self._writer.register_channel(
+                topic=key,
+                message_encoding="msgpack",
+                schema_id=self._schema(topic),
+                metadata={"topic": topic.name, "writer": writer},
+            )
+        return self._channels[identity]
+
+    def _schema(self, topic: Topic) -> int:
+        name = schema_name(topic.type)
+        if name not in self._schemas:
+            described = json.dumps(msgspec.json.schema(topic.type, schema_hook=_array_schema)).encode()
+            self._schemas[name] = self._writer.register_schema(name, "jsonschema", described)
+        return self._schemas[name]
+
+
+def _array_schema(kind: type) -> dict[str, Any]:
+    if kind is np.ndarray:
+        return {"description": "MessagePack extension type 1: an array, see schemas/codec.py"}
+    raise NotImplementedError
+
+
+def read_log(path: str | Path, topics: Collection[Topic] | None = None) -> Iterator[Logged]:
+    """Messages of a log in the order they were added, of all topics or the given ones. Raises LogError."""
+    wanted = {topic.name: topic for topic in (TOPICS if topics is None else topics)}
+    with _opened(path) as file:
+        for channel, message in _messages(file, path, set(wanted)):
+            yield Logged(
+                topic=wanted[channel.metadata["topic"]],
+                key=channel.topic,
+                writer=channel.metadata.get("writer", ""),
+                sequence=message.sequence,
+                sent_ns=message.publish_time,
+                received_ns=message.log_time,
+                payload=message.data,
+            )
+
+
+def contents(path: str | Path) -> list[Content]:
+    """What a log holds, by key and writer in order of first appearance. Raises LogError."""
+    with _opened(path) as file:
+        index = _index(file)
+        if index is not None and index.statistics is not None:
+            channels, counts = index.channels, Counter(index.statistics.channel_message_counts)
+        else:
+            channels, counts = {}, Counter()
+            for channel, _ in _messages(file, path, None):
+                channels[channel.id] = channel
+                counts[channel.id] += 1
+    ours = ((channels[i], counts[i]) for i in sorted(channels) if "topic" in channels[i].metadata)
+    return [Content(c.metadata["topic"], c.topic, c.metadata.get("writer", ""), count) for c, count in ours]
+
+
+def summary(path: str | Path) -> dict[str, int]:
+    """Number of messages per topic name. Raises LogError."""
+    counts: dict[str, int] = {}
+    for content in contents(path):
+        counts[content.topic] = counts.get(content.topic, 0) + content.messages
+    return counts
+
+
+def attachments(path: str | Path) -> dict[str, bytes]:
+    """Attached files by name. Raises LogError."""
+    with _opened(path) as file:
+        return {record.name: record.data for record in _records(file, Opcode.ATTACHMENT)}
+
+
+def metadata(path: str | Path) -> dict[str, dict[str, str]]:
+    """Named text fields. Raises LogError."""
+    with _opened(path) as file:
+        return {record.name: record.metadata for record in _records(file, Opcode.METADATA)}
+
+
+@contextmanager
+def _opened(path: str | Path) -> Iterator[BinaryIO]:
+    try:
+        with Path(path).open("rb") as file:
+            if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
+                raise LogError(f"{path} is not a log: it does not begin as an MCAP file")
+            yield file
+    except OSError as error:
+        raise LogError(f"the log {path} cannot be read: {error.strerror}") from error
+
+
+def _messages(file: BinaryIO, path: str | Path, wanted: set[str] | None) -> Iterator[tuple[Channel, Message]]:
+    """Messages with their channels, in file order; `wanted` names topics, None = all messages of any program."""
+    index = _index(file)
+    channels: dict[int, Channel] = {} if index is None else dict(index.channels)
+    if index is None:
+        logger.warning("the log %s was cut off: reading the part that is complete", path)
+    for chunk in _records(file, Opcode.CHUNK) if index is None else _indexed_chunks(file, index, wanted):
+        try:
+            records = breakup_chunk(chunk, validate_crc=True)
+        except DAMAGE as error:
+            if index is None:
+                return
+            raise LogError(f"the log {path} is damaged: a chunk cannot be read ({error})") from error
+        for record in records:
+            if isinstance(record, Channel):
+                channels[record.id] = record
+            elif isinstance(record, Message):
+                channel = channels[record.channel_id]
+                if wanted is None or channel.metadata.get("topic") in wanted:
+                    yield channel, record
+
+
+def _index(file: BinaryIO) -> Summary | None:
+    """The index at the end of the file; None when the file was cut off."""
+    size = file.seek(0, 2)
+    if size < 3 * len(MCAP0_MAGIC):
+        return None
+    file.seek(-len(MCAP0_MAGIC), 2)
+    if file.read() != MCAP0_MAGIC:
+        return None
+    file.seek(0)
+    try:
+        return SeekingReader(file, record_size_limit=size).get_summary()
+    except DAMAGE:
+        return None
+
+
+def _indexed_chunks(file: BinaryIO, index: Summary, wanted: set[str] | None) -> Iterator[Chunk]:
+    ids = {i for i, channel in index.channels.items() if wanted is None or channel.metadata.get("topic") in wanted}
+
+    def holds(chunk: ChunkIndex) -> bool:
+        return not ids.isdisjoint(chunk.message_index_offsets)
+
+    for chunk in sorted(filter(holds, index.chunk_indexes), key=lambda chunk: chunk.chunk_start_offset):
+        file.seek(chunk.chunk_start_offset + struct.calcsize("<BQ"))
+        yield Chunk.read(ReadDataStream(file))
+
+
+def _records(file: BinaryIO, wanted: Opcode) -> Iterator[Any]:
+    """Complete records of one kind, in file order, without the help of an index."""
+    readers: dict[Opcode, Any] = {Opcode.CHUNK: Chunk, Opcode.ATTACHMENT: Attachment, Opcode.METADATA: Metadata}
+    size = file.seek(0, 2)
+    start = len(MCAP0_MAGIC)
+    while True:
+        file.seek(start)
+        head = file.read(struct.calcsize("<BQ"))
+        if len(head) < struct.calcsize("<BQ"):
+            return
+        opcode, length = struct.unpack("<BQ", head)
+        start += len(head) + length
+        if start > size or opcode in (0, Opcode.DATA_END):
+            return
+        if opcode == wanted:
+            yield readers[wanted].read(ReadDataStream(file))

@@ -1,0 +1,25 @@
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+os.environ.setdefault("HF_HUB_OFFLINE", "1")
+os.environ.setdefault("OMP_NUM_THREADS", "2")
+SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(7)
+
+
+@pytest.fixture(scope="session")
+def endpoint():
+    """A router of this test session, on loopback."""
+    from services.runtime.zenoh_bus import free_endpoint, open_router
+
+    address = free_endpoint("tcp/127.0.0.1:0")
+    stop = open_router(address)
+    yield address
+    stop()
