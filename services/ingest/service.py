@@ -1,0 +1,120 @@
+"""Reads a source of posed RGB-D frames; writes keyframes, encoder jobs, the camera's pose and its own progress."""
+
+import asyncio
+import logging
+from collections.abc import Awaitable, Iterator
+from typing import Protocol
+
+from schemas.codec import Message
+from schemas.status import JobDone
+from schemas.topics import ARCHIVE, CAMERA_STATE, ENCODE, INGEST_STATE, KEYFRAME
+from services.ingest import core
+from services.ingest.sources import Source, SourceError, open_source
+from services.runtime.service import Identity, Output, Service
+
+log = logging.getLogger(__name__)
+
+
+class Port(Protocol):
+    """What `drive` needs of its host."""
+
+    stopping: asyncio.Event
+
+    async def consume(self, message: Message) -> None:
+        """Run `step` on a message; returns when its outputs are out."""
+
+    async def room(self, window: int) -> None:
+        """Return when fewer than `window` keyframes are under way at every reader."""
+
+
+def init(cfg: core.Config, identity: Identity) -> core.State:
+    """An empty state."""
+    return core.State(robot=identity.robot)
+
+
+def step(state: core.State, message: Message, cfg: core.Config) -> Iterator[Output]:
+    """Take one frame, one finished job, or the end of the source."""
+    match message:
+        case core.RawFrame():
+            reason = core.refusal(state, message, cfg)
+            if reason is None:
+                yield from core.accept(state, message, cfg)
+            else:
+                log.warning("frame refused", extra={"frame": message.frame_id, "reason": reason})
+                yield from core.refuse(state, message)
+        case core.BadFrame():
+            log.warning("frame unreadable", extra={"frame": message.frame_id, "reason": message.reason})
+            yield from core.lose(state, message)
+        case JobDone():
+            yield from core.encoded(state, message)
+        case core.EndOfSource():
+            yield from core.end(state)
+
+
+async def drive(port: Port, cfg: core.Config) -> None:
+    """Feed the source's frames, paced by their stamps or by the pipeline's room. Raises SourceError."""
+    if not cfg.source:
+        log.info("no source is configured: set ingest.source to a dataset folder or an MCAP log")
+        return
+    source = await asyncio.to_thread(_open, cfg)
+    log.info("reading", extra={"source": cfg.source, "layout": source.layout, "frames": source.total})
+    frames = iter(source)
+    pace = Pace(cfg.speed)
+    while (frame := await asyncio.to_thread(next, frames, None)) is not None:
+        waiting = pace.until_due(frame) if cfg.speed > 0 else port.room(cfg.window)
+        if await _stopped_while(port, waiting):
+            return
+        await port.consume(frame)
+    await port.consume(core.EndOfSource())
+
+
+class Pace:
+    """Real time from stamps: the first frame is due at once, others as far behind it as their stamps say."""
+
+    def __init__(self, speed: float) -> None:
+        self.speed = speed
+        self._origin: tuple[float, int] | None = None  # loop time in seconds, stamp in nanoseconds
+
+    async def until_due(self, frame: core.RawFrame | core.BadFrame) -> None:
+        """Return when the frame is due; frames that could not be read, or come late, are due at once."""
+        if not isinstance(frame, core.RawFrame):
+            return
+        now_s = asyncio.get_running_loop().time()
+        if self._origin is None:
+            self._origin = (now_s, frame.stamp_ns)
+        due_s = self._origin[0] + (frame.stamp_ns - self._origin[1]) / 1e9 / self.speed
+        await asyncio.sleep(max(0.0, due_s - now_s))
+
+
+def _open(cfg: core.Config) -> Source:
+    source = open_source(cfg.source, world_up=cfg.world_up, floor_m=cfg.floor_m, robot=cfg.source_robot)
+    if source.total == 0:
+        raise SourceError(f"{cfg.source} holds no frames")
+    return source
+
+
+async def _stopped_while(port: Port, waiting: Awaitable[None]) -> bool:
+    """Wait, but not beyond the host's wish to stop; True when it wishes to."""
+    tasks = (asyncio.ensure_future(waiting), asyncio.ensure_future(port.stopping.wait()))
+    try:
+        await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        if tasks[0].done():
+            tasks[0].result()
+        return port.stopping.is_set()
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+
+SERVICE = Service(
+    name="ingest",
+    purpose="reads a posed RGB-D source and selects keyframes",
+    scope="robot",
+    config=core.Config,
+    init=init,
+    step=step,
+    writes=(KEYFRAME, CAMERA_STATE, INGEST_STATE, ENCODE),
+    answers={ARCHIVE: core.archived},
+    drive=drive,
+)

@@ -1,0 +1,93 @@
+"""Dataset folders.
+
+camera.json       width height fx fy cx cy (pixels), depth_scale_m (metres per unit)
+trajectory.csv    frame, stamp_ns, x_m y_m z_m qx qy qz qw: world_from_camera, world z up
+color/NNNNNN.jpg  or .png; depth/NNNNNN.png with 16 bits, 0 = no measurement
+regions.json      ground truth, where it exists
+"""
+
+import csv
+import json
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from schemas.frames import Intrinsics
+from services.geometry import pose_from_quaternion
+from services.ingest.core import BadFrame, RawFrame
+from services.ingest.sources.base import UP, FrameError, Rig, Source, SourceError, levelling, read_bytes
+
+CAMERA, TRAJECTORY, REGIONS = "camera.json", "trajectory.csv", "regions.json"
+COLUMNS = ("frame", "stamp_ns", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
+
+
+def fits(path: Path) -> bool:
+    """Whether a folder has this layout."""
+    return (path / CAMERA).is_file() and (path / TRAJECTORY).is_file()
+
+
+def load(path: Path, world_up: Sequence[float] = (), floor_m: float = 0.0) -> Source:
+    """A dataset folder as a source. Raises SourceError."""
+    camera = _json(path / CAMERA)
+    rows = _rows(path / TRAJECTORY)
+    try:
+        intrinsics = Intrinsics(
+            int(camera["width"]), int(camera["height"]), *(float(camera[name]) for name in ("fx", "fy", "cx", "cy"))
+        )
+        depth_scale_m = float(camera["depth_scale_m"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise SourceError(f"{path / CAMERA} is not a camera: {error!r}") from error
+    rig = Rig(intrinsics, depth_scale_m, len(rows), levelling(world_up or UP, floor_m))
+    ground_truth = _json(path / REGIONS) if (path / REGIONS).is_file() else None
+    return Source("dataset", path, intrinsics, len(rows), lambda: _frames(path, rig, rows), ground_truth)
+
+
+def _frames(path: Path, rig: Rig, rows: list[dict[str, str]]) -> Iterator[RawFrame | BadFrame]:
+    for index, row in enumerate(rows):
+        frame_id = -1
+        try:
+            frame_id, stamp_ns, pose = _posed(row)
+            color, depth = _images(path, frame_id)
+            yield rig.frame(index, frame_id, stamp_ns, pose, color=color, depth=depth)
+        except FrameError as error:
+            yield BadFrame(frame_id=frame_id, reason=str(error), index=index, total=rig.total)
+
+
+def _posed(row: dict[str, str]) -> tuple[int, int, np.ndarray]:
+    try:
+        frame_id, stamp_ns = int(row["frame"]), int(row["stamp_ns"])
+        position_m = np.array([float(row[name]) for name in COLUMNS[2:5]])
+        quaternion_xyzw = np.array([float(row[name]) for name in COLUMNS[5:]])
+    except (TypeError, ValueError) as error:
+        raise FrameError(f"its row of {TRAJECTORY} is malformed: {error}") from error
+    if not np.isfinite(position_m).all() or not 0 < np.linalg.norm(quaternion_xyzw) < np.inf:
+        raise FrameError("its pose is not finite")
+    return frame_id, stamp_ns, pose_from_quaternion(position_m, quaternion_xyzw)
+
+
+def _images(path: Path, frame_id: int) -> tuple[bytes, bytes]:
+    color = path / "color" / f"{frame_id:06d}.jpg"
+    if not color.exists() and color.with_suffix(".png").exists():
+        color = color.with_suffix(".png")
+    return read_bytes(color), read_bytes(path / "depth" / f"{frame_id:06d}.png")
+
+
+def _rows(path: Path) -> list[dict[str, str]]:
+    try:
+        with path.open(newline="") as file:
+            reader = csv.DictReader(file, skipinitialspace=True)
+            missing = [name for name in COLUMNS if name not in (reader.fieldnames or ())]
+            if missing:
+                raise SourceError(f"{path} lacks the columns {', '.join(missing)}")
+            return list(reader)
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise SourceError(f"{path} cannot be read: {error}") from error
+
+
+def _json(path: Path) -> Any:
+    try:
+        return json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise SourceError(f"{path} cannot be read: {error}") from error
