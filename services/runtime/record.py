@@ -83,8 +83,8 @@ class LogWriter:
         self._flushed_ns: int | None = None
         self.flush()
 
-    def add(
-        self, topic: Topic, key: str, payload: bytes, writer: str, sequence: int, *, sent_ns: int, received_ns: int
+    def add(  # noqa: PLR0917
+        self, topic: Topic, key: str, payload: bytes, writer: str, sequence: int, sent_ns: int, received_ns: int
     ) -> None:
         """Append one encoded message; times are wall times in nanoseconds, `received_ns` is given by the caller."""
         with self._disk_errors():
