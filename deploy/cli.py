@@ -6,11 +6,15 @@ import os
 import sys
 import time
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.table import Table
 
 from deploy import serve
+
+if TYPE_CHECKING:
+    from deploy.client import Client
 
 DEFAULT_CONNECT = "tcp/127.0.0.1:7447"
 DEMO_ENVIRONMENT = "residential home"
@@ -122,7 +126,7 @@ def build_parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _client(connect: str) -> "Client":  # noqa: F821
+def _client(connect: str) -> "Client":
     from deploy.client import Client
     from services.runtime.zenoh_bus import ZenohBus
 
@@ -229,7 +233,7 @@ def cmd_task(arguments: argparse.Namespace) -> int:
         changed = threading.Event()
         started_s = time.monotonic()
 
-        def see(sample: object) -> None:
+        def see(sample: Any) -> None:
             delta = decode(RegionDelta, sample.payload)
             if delta.prior_digest == digest and delta.task == arguments.task:
                 changed.set()

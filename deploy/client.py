@@ -5,7 +5,7 @@ import time
 import uuid
 from collections.abc import Callable
 from types import TracebackType
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from schemas.codec import DecodeError, Message, decode, encode
 from schemas.status import ServiceStatus, StatusRequest
@@ -44,7 +44,7 @@ class Client:
         """Receive samples on a foreign thread."""
         self.bus.subscribe(topic, topic.pattern(robot), on_sample, lambda topic, number: None)
 
-    def ask(self, query: Query, request: Message, timeout_s: float = 10.0) -> Message:
+    def ask(self, query: Query, request: Message, timeout_s: float = 10.0) -> Any:
         """The reply, decoded. Raises BusError when nobody answers in time."""
         return self._ask(query.key_of(request), query.reply, request, query.name, timeout_s)
 

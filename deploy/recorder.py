@@ -7,14 +7,13 @@ from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
+from deploy.client import Client
 from schemas.codec import DecodeError, decode
 from schemas.status import Consumed
 from schemas.topics import JOURNAL, TOPICS, Topic
 from services.registry import SERVICES
 from services.runtime.bus import Sample
 from services.runtime.record import LogWriter
-
-from deploy.client import Client
 
 FLUSH_S = 1.0
 
@@ -24,9 +23,10 @@ class Recorder:
 
     def __init__(self, client: Client, path: Path) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
-        self.log = LogWriter(path)
+        self._log = LogWriter(path)
         self.taps: list[Callable[[Sample], None]] = []
         self.counts: Counter[str] = Counter()
+        self.attachments: dict[str, tuple[str, bytes]] = {}  # name: media type and content, written at the end
         self._queue: queue.SimpleQueue[Sample | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._write, name="recorder")
         self._thread.start()
@@ -38,7 +38,9 @@ class Recorder:
         """Write what has arrived, then finish the file."""
         self._queue.put(None)
         self._thread.join()
-        self.log.close()
+        for name, (media_type, data) in self.attachments.items():
+            self._log.attach(name, media_type, data)
+        self._log.close()
 
     def _write(self) -> None:
         flushed_s = time.monotonic()
@@ -46,19 +48,19 @@ class Recorder:
             try:
                 sample = self._queue.get(timeout=FLUSH_S)
             except queue.Empty:
-                self.log.flush()
+                self._log.flush()
                 continue
             if sample is None:
                 return
             self._add(sample)
             if time.monotonic() - flushed_s > FLUSH_S:
-                self.log.flush()
+                self._log.flush()
                 flushed_s = time.monotonic()
 
     def _add(self, sample: Sample) -> None:
         self.counts[sample.topic.name] += 1
         if sample.writer:
-            self.log.add(
+            self._log.add(
                 sample.topic, sample.key, sample.payload, sample.writer, sample.sequence, sample.sent_ns, time.time_ns()
             )
         for tap in self.taps:

@@ -10,10 +10,11 @@ import msgspec
 import numpy as np
 
 from schemas.codec import Message, copied, decode, encode
+from schemas.frames import Keyframe
 from schemas.status import Consumed, Started, Tick
 from schemas.topics import JOURNAL, KEYFRAME, QUERIES, TOPICS, Topic
 from services.registry import BY_NAME
-from services.runtime.record import Logged, LogError, read_log
+from services.runtime.record import LogError, Logged, read_log
 from services.runtime.service import Ask, Identity, Service
 
 TOPIC_BY_NAME = {topic.name: topic for topic in TOPICS}
@@ -73,7 +74,7 @@ class Log:
             self.messages[logged.topic.name, logged.writer, logged.sequence] = logged
             self.order.append(logged)
             if logged.topic is KEYFRAME:
-                self.frames[decode(KEYFRAME.type, logged.payload).frame_id] = logged
+                self.frames[decode(Keyframe, logged.payload).frame_id] = logged
         self.lives = lives(journal, service.name)
 
     def input(self, entry: Consumed) -> Message:

@@ -8,21 +8,23 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import msgspec
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TaskID, TextColumn, TimeElapsedColumn
 
-from schemas.codec import DecodeError, Message, decode, encode
-from schemas.frames import IngestState
+from deploy.client import Client
+from deploy.recorder import Recorder, Settling
+from deploy.supervisor import Supervisor
+from schemas.codec import DecodeError, decode, encode
+from schemas.features import Pyramid
+from schemas.frames import IngestState, Keyframe
 from schemas.places import MapRequest, VoxelMap
-from schemas.priors import Prior, PriorList, PriorRequest, Task
+from schemas.priors import Prior, PriorRequest, Task
 from schemas.regions import RegionDelta
 from schemas.scene import Scene, SceneRequest
 from schemas.topics import (
     INGEST_STATE,
     KEYFRAME,
     PLACE_DELTA,
-    PRIOR,
     PRIORS,
     PYRAMID,
     REGION_DELTA,
@@ -31,12 +33,8 @@ from schemas.topics import (
     VOXEL_MAP,
 )
 from services.registry import SERVICES
-from services.runtime.bus import BusError, Sample
+from services.runtime.bus import Sample
 from services.runtime.zenoh_bus import ZenohBus, free_endpoint, open_router
-
-from deploy.client import Client
-from deploy.recorder import Recorder, Settling
-from deploy.supervisor import Supervisor
 
 QUIET_S = 1.5
 START_TIMEOUT_S = 180.0
@@ -73,7 +71,6 @@ class Result:
 
     scene: Scene
     voxels: VoxelMap
-    prior: Prior
     log_path: Path
     counts: "Counts"
     seconds: float
@@ -87,12 +84,8 @@ class Counts:
     pyramids: dict[int, int] = field(default_factory=dict)
     crops: int = 0
     crops_total: int = 0
-    tasks: int = 0
-    task: Task | None = None
     ingest: IngestState | None = None
     regions: RegionDelta | None = None
-    priors: dict[str, Prior] = field(default_factory=dict)
-    places: int = 0
 
     def __call__(self, sample: Sample) -> None:
         """See one sample."""
@@ -100,20 +93,17 @@ class Counts:
             message = decode(sample.topic.type, sample.payload)
         except DecodeError:
             return
-        if sample.topic is KEYFRAME:
-            self.keyframes.add(message.frame_id)
-        elif sample.topic is PYRAMID:
-            self.pyramids[message.frame_id] = self.pyramids.get(message.frame_id, 0) + 1
-            self.crops += len(message.embeddings)
-            self.crops_total += message.crops_total
-        elif sample.topic is INGEST_STATE:
-            self.ingest = message
-        elif sample.topic is REGION_DELTA:
-            self.regions = message
-        elif sample.topic is TASK:
-            self.tasks, self.task = self.tasks + 1, message
-        elif sample.topic is PRIOR:
-            self.priors[message.digest()] = message
+        match message:
+            case Keyframe():
+                self.keyframes.add(message.frame_id)
+            case Pyramid():
+                self.pyramids[message.frame_id] = self.pyramids.get(message.frame_id, 0) + 1
+                self.crops += len(message.embeddings)
+                self.crops_total += message.crops_total
+            case IngestState():
+                self.ingest = message
+            case RegionDelta():
+                self.regions = message
 
     def encoded_summary(self) -> str:
         """One line about exactly-once encoding."""
@@ -141,10 +131,10 @@ def run(job: Job, console: Console) -> Result:
     ]
     supervisor = Supervisor(endpoint, job.robot, job.out / "logs", settings, job.config)
     try:
-        with Client(ZenohBus(endpoint)) as client, _interruptible() as interrupted:
+        with Client(ZenohBus(endpoint)) as client:
             recorder = Recorder(client, job.out / "log.mcap")
             try:
-                return _stream(job, console, client, recorder, supervisor, interrupted, started_s)
+                return Run(job, console, client, recorder, supervisor).stream(started_s)
             finally:
                 supervisor.stop()
                 recorder.close()
@@ -152,22 +142,62 @@ def run(job: Job, console: Console) -> Result:
         stop_router()
 
 
-def _stream(
-    job: Job,
-    console: Console,
-    client: Client,
-    recorder: Recorder,
-    supervisor: Supervisor,
-    interrupted: threading.Event,
-    started_s: float,
-) -> Result:
-    counts, settling = Counts(), Settling((KEYFRAME, PLACE_DELTA, PYRAMID, REGION_DELTA))
-    recorder.taps += [counts, settling]
-    client.listen(INGEST_STATE, job.robot, counts)
-    with _progress(console) as progress:
-        bar = progress.add_task("starting services", total=None)
-        _start_services(job, client, supervisor, interrupted)
-        progress.update(bar, description="asking for the prior")
+class Run:
+    """One run under way: its services, its bus, and what it has seen."""
+
+    def __init__(self, job: Job, console: Console, client: Client, recorder: Recorder, supervisor: Supervisor) -> None:
+        self.job, self.console, self.client, self.recorder, self.supervisor = job, console, client, recorder, supervisor
+        self.counts = Counts()
+        self.settling = Settling((KEYFRAME, PLACE_DELTA, PYRAMID, REGION_DELTA))
+        self.interrupted = threading.Event()
+        recorder.taps += [self.counts, self.settling]
+        client.listen(INGEST_STATE, job.robot, self.counts)
+
+    def stream(self, started_s: float) -> Result:
+        """Start everything, follow the stream to its end, read the result."""
+        with _progress(self.console) as progress, _interrupt_sets(self.interrupted):
+            bar = progress.add_task("starting services", total=None)
+            names = [service.name for service in SERVICES if service.name != "ingest"]
+            self._start(names)
+            progress.update(bar, description="asking for the prior")
+            prior = self._task()
+            progress.console.print(f"prior: {prior.provenance.source}, {prior.provenance.note}")
+            self._start(["ingest"])  # last: the stream must not begin before its readers stand
+            self.job.on_pids(self.supervisor.pids())
+            self._follow(progress, bar)
+            progress.update(bar, description="reading the scene")
+            scene = self.client.ask(SCENE, SceneRequest(robot=self.job.robot), 30.0)
+            voxels = self.client.ask(VOXEL_MAP, MapRequest(robot=self.job.robot), 30.0)
+        self.recorder.attachments["scene.msgpack"] = ("application/msgpack", encode(scene))
+        self.recorder.attachments["voxels.msgpack"] = ("application/msgpack", encode(voxels))
+        return Result(scene, voxels, self.job.out / "log.mcap", self.counts, time.monotonic() - started_s)
+
+    def _start(self, names: list[str]) -> None:
+        """Start services and wait until they are seen."""
+        wanted = {name: self.job.workers if name == "feature_pyramid" else 1 for name in names}
+        for name, copies in wanted.items():
+            self.supervisor.start(name, copies)
+        deadline_s = time.monotonic() + START_TIMEOUT_S
+        while True:
+            alive = list(self.client.alive().values())
+            missing = [name for name, copies in wanted.items() if alive.count(name) < copies]
+            if not missing:
+                return
+            if self.interrupted.is_set():
+                raise KeyboardInterrupt
+            self.supervisor.check()
+            if time.monotonic() > deadline_s:
+                where = self.supervisor.log_folder
+                raise RunError(f"not started within {START_TIMEOUT_S:.0f} s: {', '.join(missing)}; see {where}")
+            time.sleep(POLL_S)
+
+    def _task(self) -> Prior:
+        """Give the task; returns the prior it gets. Raises RunError with the gateway's reason when there is none."""
+        job = self.job
+        request = PriorRequest(environment=job.environment, task=job.task, regions=job.regions)
+        reply = self.client.ask(PRIORS, request, PRIOR_TIMEOUT_S)
+        if not reply.priors:
+            raise RunError(reply.reason)
         task = Task(
             robot=job.robot,
             stamp_ns=time.time_ns(),
@@ -175,87 +205,28 @@ def _stream(
             task=job.task,
             regions=job.regions,
         )
-        client.publish(TASK, task)
-        prior = _prior_for(client, task)
-        if prior.provenance.note:
-            progress.console.print(f"prior: {prior.provenance.note}")
-        supervisor.start("ingest")
-        _wait_alive(client, supervisor, {"ingest"}, interrupted)
-        job.on_pids(supervisor.pids())
-        _follow(job, progress, bar, counts, settling, supervisor, interrupted)
-        progress.update(bar, description="reading the scene")
-        scene = client.ask(SCENE, SceneRequest(robot=job.robot), 30.0)
-        voxels = client.ask(VOXEL_MAP, MapRequest(robot=job.robot), 30.0)
-    recorder.log.attach("scene.msgpack", "application/msgpack", encode(scene))
-    prior = counts.priors.get(scene.prior_digest, prior)
-    return Result(scene, voxels, prior, job.out / "log.mcap", counts, time.monotonic() - started_s)
+        self.client.publish(TASK, task)
+        return reply.priors[0]
 
-
-def _start_services(job: Job, client: Client, supervisor: Supervisor, interrupted: threading.Event) -> None:
-    """Everything but the source, which must not begin before its readers stand."""
-    for service in SERVICES:
-        if service.name != "ingest":
-            supervisor.start(service.name, job.workers if service.job is not None else 1)
-    _wait_alive(client, supervisor, {s.name for s in SERVICES if s.name != "ingest"}, interrupted, job.workers)
-
-
-def _wait_alive(
-    client: Client, supervisor: Supervisor, services: set[str], interrupted: threading.Event, workers: int = 1
-) -> None:
-    deadline_s = time.monotonic() + START_TIMEOUT_S
-    while True:
-        alive = list(client.alive().values())
-        missing = [name for name in sorted(services) if name not in alive]
-        if not missing and alive.count("feature_pyramid") >= workers:
-            return
-        if interrupted.is_set():
-            raise KeyboardInterrupt
-        supervisor.check()
-        if time.monotonic() > deadline_s:
-            raise RunError(
-                f"not started within {START_TIMEOUT_S:.0f} s: {', '.join(missing)}; see {supervisor.log_folder}"
-            )
-        time.sleep(POLL_S)
-
-
-def _prior_for(client: Client, task: Task) -> Prior:
-    """The gateway's answer to the task. Raises RunError with its reason when it has none."""
-    request = PriorRequest(environment=task.environment, task=task.task, regions=task.regions)
-    reply = client.ask(PRIORS, request, PRIOR_TIMEOUT_S)
-    assert isinstance(reply, PriorList)
-    if not reply.priors:
-        raise RunError(reply.reason)
-    return reply.priors[0]
-
-
-def _follow(
-    job: Job,
-    progress: Progress,
-    bar: int,
-    counts: Counts,
-    settling: Settling,
-    supervisor: Supervisor,
-    interrupted: threading.Event,
-) -> None:
-    """Show progress until the source has ended and everything has settled, or the user interrupts."""
-    finished, said_interrupt, changed_s, last = False, False, time.monotonic(), (0, 0)
-    while not (finished and settling.settled(QUIET_S)):
-        for event in supervisor.check():
-            progress.console.print(event)
-        state = counts.ingest
-        if state is not None:
-            finished = state.finished
-            progress.update(bar, total=state.frames_total or None, completed=state.frames_read)
-            if (state.frames_read, state.encoded) != last:
-                last, changed_s = (state.frames_read, state.encoded), time.monotonic()
-        progress.update(bar, description=_description(counts, finished))
-        if interrupted.is_set() and not said_interrupt:
-            said_interrupt = finished = True
-            progress.console.print("interrupted: writing what there is")
-            return
-        if time.monotonic() - max(changed_s, settling.changed_s) > STALL_AFTER_S:
-            raise RunError(f"nothing has moved for {STALL_AFTER_S:.0f} s; see the logs in {supervisor.log_folder}")
-        time.sleep(POLL_S)
+    def _follow(self, progress: Progress, bar: TaskID) -> None:
+        """Show progress until the source has ended and everything has settled, or the user interrupts."""
+        finished, moved_s, last = False, time.monotonic(), (0, 0)
+        while not (finished and self.settling.settled(QUIET_S)):
+            for event in self.supervisor.check():
+                progress.console.print(event)
+            if (state := self.counts.ingest) is not None:
+                finished = state.finished
+                progress.update(bar, total=state.frames_total or None, completed=state.frames_read)
+                if (state.frames_read, state.encoded) != last:
+                    last, moved_s = (state.frames_read, state.encoded), time.monotonic()
+            progress.update(bar, description=_description(self.counts, finished))
+            if self.interrupted.is_set():
+                progress.console.print("interrupted: writing what there is")
+                return
+            if time.monotonic() - max(moved_s, self.settling.changed_s) > STALL_AFTER_S:
+                where = self.supervisor.log_folder
+                raise RunError(f"nothing has moved for {STALL_AFTER_S:.0f} s; see the logs in {where}")
+            time.sleep(POLL_S)
 
 
 def _description(counts: Counts, finished: bool) -> str:
@@ -276,21 +247,19 @@ def _progress(console: Console) -> Progress:
 
 
 @contextmanager
-def _interruptible() -> Iterator[threading.Event]:
+def _interrupt_sets(event: threading.Event) -> Iterator[None]:
     """Ctrl-C sets the event the first time and raises KeyboardInterrupt the second."""
-    event = threading.Event()
 
     def handle(number: int, frame: object) -> None:
         if event.is_set():
             raise KeyboardInterrupt
         event.set()
 
-    try:
-        previous = signal.signal(signal.SIGINT, handle)
-    except ValueError:  # not in the main thread: the caller handles signals
-        yield event
+    if threading.current_thread() is not threading.main_thread():  # only the main thread may handle signals
+        yield
         return
+    previous = signal.signal(signal.SIGINT, handle)
     try:
-        yield event
+        yield
     finally:
         signal.signal(signal.SIGINT, previous)

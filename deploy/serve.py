@@ -9,8 +9,8 @@ import signal
 import sys
 import time
 import uuid
+from typing import Any
 
-from schemas.codec import Message
 from services.registry import BY_NAME
 from services.runtime.bus import BusError
 from services.runtime.config import (
@@ -43,7 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--parent", type=int, default=0, help="end when this process is gone")
 
 
-def resolved_config(service: Service, arguments: argparse.Namespace) -> Message:
+def resolved_config(service: Service, arguments: argparse.Namespace) -> Any:
     """The service's config from all layers. Raises ConfigError."""
     file = read_file(arguments.config)
     check_sections(file, list(BY_NAME))

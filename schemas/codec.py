@@ -4,9 +4,9 @@ A message is MessagePack of a frozen msgspec struct. Arrays travel inside it as 
 one byte number of dimensions, the dimensions as little-endian uint32, then the raw little-endian buffer. Decoding maps
 the array onto the received buffer: no copy, and read-only.
 
-A field declares its array with `Annotated[np.ndarray, Shape("float32", "place", 3)]`; a letter or word names a dimension,
-and equal names within one message must have equal length. Decoding checks all of it, so that a malformed message fails
-at the boundary and nowhere else.
+A field declares its array with `Annotated[np.ndarray, Shape("float32", "place", 3)]`; a word names a dimension, and
+equal names within one message must have equal length. Decoding checks all of it, so that a malformed message fails at
+the boundary and nowhere else.
 """
 
 import struct
@@ -108,7 +108,7 @@ def _pack_array(array: np.ndarray) -> msgspec.msgpack.Ext:
         raise TypeError(f"arrays of dtype {array.dtype} do not travel; use one of {', '.join(DTYPES)}")
     little = np.ascontiguousarray(array.astype(array.dtype.newbyteorder("<"), copy=False))
     head = struct.pack(f"<BB{array.ndim}I", DTYPES.index(array.dtype.name), array.ndim, *array.shape)
-    return msgspec.msgpack.Ext(ARRAY_EXT_CODE, b"".join((head, memoryview(little).cast("B") if little.size else b"")))
+    return msgspec.msgpack.Ext(ARRAY_EXT_CODE, b"".join((head, little.data.cast("B") if little.size else b"")))
 
 
 def _unpack_array(data: memoryview) -> np.ndarray:

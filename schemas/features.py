@@ -8,7 +8,7 @@ from schemas.codec import Message, Shape
 from schemas.frames import Intrinsics, Pose, check_pose
 
 
-class Pyramid(Message, kw_only=True):
+class Pyramid(Message, frozen=True, kw_only=True):
     """The encoded crops of one keyframe, with all that integration needs: camera, pose and a coarse depth surface."""
 
     robot: str
@@ -30,14 +30,14 @@ class Pyramid(Message, kw_only=True):
         check_pose(self.world_from_camera)
 
 
-class TextRequest(Message, kw_only=True):
+class TextRequest(Message, frozen=True, kw_only=True):
     """Embed concepts; each concept is a list of phrases whose embeddings are averaged."""
 
     space: str
     concepts: list[list[str]]
 
 
-class TextEmbeddings(Message, kw_only=True):
+class TextEmbeddings(Message, frozen=True, kw_only=True):
     """Concept descriptors of one space and how similarities in it are to be read.
 
     `background_mean` and `background_std` are the mean and spread of each concept's similarity over the space's

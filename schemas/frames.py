@@ -43,7 +43,7 @@ def check_pose(world_from_camera: np.ndarray) -> None:
         raise ValueError("world_from_camera: last row is not 0 0 0 1")
 
 
-class Keyframe(Message, kw_only=True):
+class Keyframe(Message, frozen=True, kw_only=True):
     """One posed RGB-D image, compressed as the source delivered it."""
 
     robot: str
@@ -63,7 +63,7 @@ class Keyframe(Message, kw_only=True):
             raise ValueError("depth_scale_m must be positive")
 
 
-class CameraState(Message, kw_only=True):
+class CameraState(Message, frozen=True, kw_only=True):
     """Where the camera is now, also between keyframes."""
 
     robot: str
@@ -74,7 +74,7 @@ class CameraState(Message, kw_only=True):
         check_pose(self.world_from_camera)
 
 
-class IngestState(Message, kw_only=True):
+class IngestState(Message, frozen=True, kw_only=True):
     """How far the source is; `finished` when every keyframe has been published and encoded."""
 
     robot: str
@@ -87,7 +87,7 @@ class IngestState(Message, kw_only=True):
     finished: bool
 
 
-class ArchiveRequest(Message, kw_only=True):
+class ArchiveRequest(Message, frozen=True, kw_only=True):
     """Keyframes with first_frame_id <= frame_id < end_frame_id, at most `limit` of them, oldest first."""
 
     robot: str
@@ -96,7 +96,7 @@ class ArchiveRequest(Message, kw_only=True):
     limit: int = 16
 
 
-class ArchiveReply(Message, kw_only=True):
+class ArchiveReply(Message, frozen=True, kw_only=True):
     """Archived keyframes; `oldest_frame_id` says where the ring begins (-1 = empty)."""
 
     robot: str

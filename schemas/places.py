@@ -11,7 +11,7 @@ _NO_FRAMES = msgspec.field(default_factory=lambda: np.zeros(0, np.int64))
 _NO_CAMERAS = msgspec.field(default_factory=lambda: np.zeros((0, 3), np.float32))
 
 
-class PlaceDelta(Message, kw_only=True):
+class PlaceDelta(Message, frozen=True, kw_only=True):
     """Change of the place graph since the previous revision; with `snapshot`, the whole graph.
 
     Apply in this order: remove edges, remove places (their edges go too), merge, upsert places, upsert edges.
@@ -37,19 +37,19 @@ class PlaceDelta(Message, kw_only=True):
     past_cameras_m: Annotated[np.ndarray, Shape("float32", "past", 3)] = _NO_CAMERAS  # and their camera centres
 
 
-class SnapshotRequest(Message, kw_only=True):
+class SnapshotRequest(Message, frozen=True, kw_only=True):
     """The whole state of a delta's writer, as one delta with `snapshot` set."""
 
     robot: str
 
 
-class MapRequest(Message, kw_only=True):
+class MapRequest(Message, frozen=True, kw_only=True):
     """The volumetric map as it stands."""
 
     robot: str
 
 
-class VoxelMap(Message, kw_only=True):
+class VoxelMap(Message, frozen=True, kw_only=True):
     """Observed voxels by integer index; the centre of voxel i is (i + 0.5) * voxel_m in the world."""
 
     robot: str

@@ -11,7 +11,7 @@ from schemas.codec import Message, Shape, encode
 SUM_TOLERANCE = 1e-3
 
 
-class Task(Message, kw_only=True):
+class Task(Message, frozen=True, kw_only=True):
     """What a robot is to do, and where. `regions` fixes the vocabulary; empty lets the prior choose it."""
 
     robot: str
@@ -49,7 +49,7 @@ class Provenance(msgspec.Struct, frozen=True, kw_only=True):
     note: str = ""  # for example: fell back to the library, and why
 
 
-class Prior(Message, kw_only=True):
+class Prior(Message, frozen=True, kw_only=True):
     """Prior graph for one environment and task: complete and validated."""
 
     environment: str
@@ -81,9 +81,10 @@ class Prior(Message, kw_only=True):
         existence = [region.existence for region in self.regions]
         if min(existence) <= 0 or abs(sum(existence) - 1) > SUM_TOLERANCE:
             raise ValueError("existence must be positive and sum to one")
-        for item in (*self.regions, *self.objects):
-            if not item.name or not item.phrases:
-                raise ValueError(f"{item.name or 'an unnamed entry'} has no phrases")
+        described = [(r.name, r.phrases) for r in self.regions] + [(o.name, o.phrases) for o in self.objects]
+        for name, phrases in described:
+            if not name or not phrases:
+                raise ValueError(f"{name or 'an unnamed entry'} has no phrases")
 
     def digest(self) -> str:
         """Content address, 128 bit in hexadecimal."""
@@ -94,7 +95,7 @@ class Prior(Message, kw_only=True):
         return (self.environment, self.task, self.vocabulary) == (task.environment, task.task, task.regions)
 
 
-class PriorRequest(Message, kw_only=True):
+class PriorRequest(Message, frozen=True, kw_only=True):
     """Ask for a prior by digest, or (digest empty) for an environment and task."""
 
     digest: str = ""
@@ -103,7 +104,7 @@ class PriorRequest(Message, kw_only=True):
     regions: list[str] = []
 
 
-class PriorList(Message, kw_only=True):
+class PriorList(Message, frozen=True, kw_only=True):
     """Priors that answer a request, best first; `reason` says why there is none."""
 
     priors: list[Prior]

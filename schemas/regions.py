@@ -19,7 +19,7 @@ class Region(msgspec.Struct, frozen=True, kw_only=True):
     area_m2: float  # footprint of its places' spheres, seen from above
 
 
-class RegionDelta(Message, kw_only=True):
+class RegionDelta(Message, frozen=True, kw_only=True):
     """Change of regions and beliefs since the previous revision; with `snapshot`, all of them.
 
     Apply in this order: remove places, remove regions, upsert regions, upsert beliefs.
@@ -49,7 +49,7 @@ class RegionDelta(Message, kw_only=True):
             raise ValueError("posteriors do not fit the labels")
 
 
-class PosteriorRequest(Message, kw_only=True):
+class PosteriorRequest(Message, frozen=True, kw_only=True):
     """Why does a place carry its label?"""
 
     robot: str
@@ -65,7 +65,7 @@ class ExpertVote(msgspec.Struct, frozen=True, kw_only=True):
     log_probabilities: list[float]  # one per label
 
 
-class PosteriorReply(Message, kw_only=True):
+class PosteriorReply(Message, frozen=True, kw_only=True):
     """Each expert's vote on a place; `found` is false when there is no such place."""
 
     robot: str

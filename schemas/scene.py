@@ -8,7 +8,7 @@ from schemas.codec import Message, Shape
 from schemas.regions import Region
 
 
-class SceneRevision(Message, kw_only=True):
+class SceneRevision(Message, frozen=True, kw_only=True):
     """The store has made one more delta durable."""
 
     robot: str
@@ -20,13 +20,13 @@ class SceneRevision(Message, kw_only=True):
     regions: int
 
 
-class SceneRequest(Message, kw_only=True):
+class SceneRequest(Message, frozen=True, kw_only=True):
     """The scene graph of one robot as stored."""
 
     robot: str
 
 
-class Scene(Message, kw_only=True):
+class Scene(Message, frozen=True, kw_only=True):
     """Everything the store holds about one robot; sorted by id, so equal scenes have equal bytes."""
 
     robot: str

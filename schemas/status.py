@@ -5,7 +5,7 @@ import msgspec
 from schemas.codec import Message
 
 
-class Consumed(Message, kw_only=True):
+class Consumed(Message, frozen=True, kw_only=True):
     """One input a service has taken and finished with, in its order: what replay needs, and what flow control reads.
 
     `writer` and `sequence` point at a recorded message. Inputs that no topic carries (start, ticks, replies to
@@ -23,7 +23,7 @@ class Consumed(Message, kw_only=True):
     inline: bytes = b""
 
 
-class Started(Message, kw_only=True):
+class Started(Message, frozen=True, kw_only=True):
     """Opens a journal: everything replay needs to build the same state."""
 
     robot: str
@@ -34,13 +34,13 @@ class Started(Message, kw_only=True):
     reads: list[str] = []  # names of the topics it reads
 
 
-class Tick(Message, kw_only=True):
+class Tick(Message, frozen=True, kw_only=True):
     """Time, as a message."""
 
     stamp_ns: int
 
 
-class JobDone(Message, kw_only=True):
+class JobDone(Message, frozen=True, kw_only=True):
     """A job this process dispatched has been finished by a worker."""
 
     topic: str
@@ -64,11 +64,11 @@ class TopicCount(msgspec.Struct, frozen=True, kw_only=True):
     last_age_ms: float = -1.0  # age of the newest consumed sample when it was consumed
 
 
-class StatusRequest(Message, kw_only=True):
+class StatusRequest(Message, frozen=True, kw_only=True):
     """Ask a process for its health."""
 
 
-class ServiceStatus(Message, kw_only=True):
+class ServiceStatus(Message, frozen=True, kw_only=True):
     """Health of one process."""
 
     service: str

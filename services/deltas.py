@@ -8,9 +8,17 @@ Verdict = Literal["apply", "stale", "gap"]
 class Delta(Protocol):
     """What PlaceDelta and RegionDelta share."""
 
-    epoch: int
-    revision: int
-    snapshot: bool
+    @property
+    def epoch(self) -> int:
+        """New at every start of the writer."""
+
+    @property
+    def revision(self) -> int:
+        """Grows by one per delta, from 0."""
+
+    @property
+    def snapshot(self) -> bool:
+        """Whether it holds the whole state."""
 
 
 D = TypeVar("D", bound=Delta)

@@ -12,6 +12,7 @@ from collections import deque
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from statistics import quantiles
 from typing import Any
 
@@ -141,7 +142,7 @@ class Host:
         for query in service.answers:
             fields = {name: robot if name == "robot" else "*" for name in query.request.__struct_fields__}
             key = query.key.format(**(fields | service.key_fields(self.cfg)))
-            self.bus.serve(key, lambda request, q=query: self.inbox.put(Question(q, request)))
+            self.bus.serve(key, partial(self._queue_question, query))
         self.bus.serve(status_key(service.name, self.identity.instance), self._answer_status)
         for topic in service.writes:
             if topic.delivery == "job":
@@ -238,6 +239,9 @@ class Host:
         self._step(message)
         self._journal(job.name, frame_id=getattr(message, "frame_id", -1), inline=b"")
         work.request.reply(b"done")
+
+    def _queue_question(self, query: Query, request: Request) -> None:
+        self.inbox.put(Question(query, request))
 
     def _offer_work(self, request: Request) -> None:
         if self._slots.acquire(blocking=False):

@@ -10,6 +10,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field
+from functools import partial
 
 from schemas.topics import Topic, worker_keys
 from services.runtime.bus import Answer, Bus
@@ -184,9 +185,7 @@ class JobPool:
             self._set_timer()
         for name, job in assignments:
             key = worker_keys(self._topic, name)[0]
-            self._bus.call(
-                key, job.payload, self._timeout_s, lambda answer, n=name, j=job: self._answered(n, j, answer)
-            )
+            self._bus.call(key, job.payload, self._timeout_s, partial(self._answered, name, job))
 
     def _answered(self, name: str, job: Job, answer: Answer) -> None:
         attempts = job.attempts

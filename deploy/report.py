@@ -1,0 +1,120 @@
+"""What a run leaves for people: tables on the terminal, files in the output folder."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from deploy.evaluation.metrics import GroundTruth, evaluate
+from deploy.export import map_png, scene_json, spark_dsg_graph
+from deploy.replay import Log, message_differences, undisturbed
+from deploy.run import Result
+from schemas.codec import decode, encode
+from schemas.places import VoxelMap
+from schemas.scene import Scene, SceneRequest
+from schemas.topics import SCENE
+from services.ingest.sources import open_source
+from services.prior_gateway.library import environments
+from services.registry import BY_NAME
+from services.runtime.record import attachments
+
+MAIN_METRICS = ("f1_s", "f1_g", "miou_s", "miou_g", "miou_s_penalised", "accuracy")
+
+
+def truth_of(source: str) -> dict[str, Any] | None:
+    """The content of the source's regions.json, or None when it has no ground truth."""
+    return open_source(source).ground_truth
+
+
+def region_table(scene: Scene) -> Table:
+    """One row per region, largest first."""
+    table = Table("id", "label", "places", "area m²", "probability", title=f"{scene.task} ({scene.environment})")
+    for column in table.columns[2:]:
+        column.justify = "right"
+    for region in sorted(scene.regions, key=lambda region: -region.area_m2):
+        table.add_row(
+            str(region.id),
+            region.label,
+            str(region.place_count),
+            f"{region.area_m2:.1f}",
+            f"{region.probability:.2f}",
+        )
+    return table
+
+
+def write(result: Result, out: Path, truth: dict[str, Any] | None, console: Console) -> None:
+    """Print the regions and the scores, and write scene.json, dsg.json, map.png and metrics.json."""
+    scene = result.scene
+    console.print(region_table(scene))
+    labelled = int((scene.place_regions >= 0).sum())
+    console.print(
+        f"{len(scene.place_ids)} places ({labelled} labelled), {len(scene.edges)} edges, "
+        f"{len(scene.regions)} regions; {result.counts.encoded_summary()}; "
+        f"{result.counts.crops} of {result.counts.crops_total} crops encoded"
+    )
+    if truth is not None:
+        metrics = evaluate(scene, result.voxels, GroundTruth.from_json(truth))
+        console.print("against the ground truth: " + ", ".join(f"{name} {metrics[name]:.3f}" for name in MAIN_METRICS))
+        (out / "metrics.json").write_text(json.dumps(metrics, indent=1))
+    for kind, name in (("json", "scene.json"), ("spark-dsg", "dsg.json"), ("png", "map.png")):
+        export(scene, result.voxels, kind, out / name, truth)
+    names = ", ".join(("scene.json", "dsg.json", "map.png", result.log_path.name))
+    console.print(f"written to {out}: {names} ({result.seconds:.0f} s)")
+
+
+def export(scene: Scene, voxels: VoxelMap | None, kind: str, path: Path, truth: dict[str, Any] | None = None) -> None:
+    """Write one file: `json`, `spark-dsg` or `png`."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if kind == "json":
+        path.write_text(json.dumps(scene_json(scene), indent=1))
+    elif kind == "spark-dsg":
+        spark_dsg_graph(scene).save(str(path))
+    else:
+        map_png(scene, voxels, path, GroundTruth.from_json(truth) if truth else None)
+
+
+def scene_in(database: Path, robot: str) -> Scene:
+    """The scene of one robot in a database file of the store, which may be in use."""
+    store = BY_NAME["scene_store"]
+    cfg = store.config(path=str(database))
+    return _scene_of(cfg, robot)
+
+
+def _scene_of(cfg: Any, robot: str) -> Scene:
+    from services.runtime.service import Identity
+
+    store = BY_NAME["scene_store"]
+    state = store.init(cfg, Identity("*", "reader", 0))
+    try:
+        scene = store.answers[SCENE](state, SceneRequest(robot=robot), cfg)
+        assert isinstance(scene, Scene)
+        return scene
+    finally:
+        store.close(state)
+
+
+def final_scene_difference(log: Log, path: Path) -> str:
+    """How the scene at the end of a run differs from that of a store that read the same log without interruption."""
+    saved = attachments(path).get("scene.msgpack")
+    if saved is None:
+        return "the log holds no final scene (it was not written by `run` or `demo`)"
+    recorded = decode(Scene, saved)
+    state = undisturbed(log)
+    try:
+        again = log.service.answers[SCENE](state, SceneRequest(robot=recorded.robot), None)
+    finally:
+        log.service.close(state)
+    if encode(again) == encode(recorded):
+        return ""
+    return "final scene: " + "; ".join(message_differences(recorded, again) or ["bytes differ below the tolerance"])
+
+
+def prior_table() -> Table:
+    """The curated library: environments, tasks and the regions each task asks for."""
+    table = Table("environment", "task", "regions", show_lines=True)
+    for listing in environments():
+        for task, regions in listing.tasks.items():
+            table.add_row(listing.name, task, ", ".join(regions))
+    return table
