@@ -1,0 +1,61 @@
+"""Reads places, pyramids, tasks and priors; writes regions and beliefs."""
+
+from collections.abc import Iterator
+
+from schemas.codec import Message
+from schemas.features import TextRequest
+from schemas.places import SnapshotRequest
+from schemas.priors import PriorRequest
+from schemas.regions import PosteriorReply, PosteriorRequest, RegionDelta
+from schemas.topics import (
+    PLACE_DELTA,
+    PLACE_SNAPSHOT,
+    POSTERIOR,
+    PRIOR,
+    PRIORS,
+    PYRAMID,
+    REGION_DELTA,
+    REGION_SNAPSHOT,
+    TASK,
+    TEXT,
+)
+from services.runtime.service import Ask, Identity, Output, Service
+from services.segmenter import core
+
+QUESTIONS = {SnapshotRequest: PLACE_SNAPSHOT, TextRequest: TEXT, PriorRequest: PRIORS}
+
+
+def init(cfg: core.Config, identity: Identity) -> core.State:
+    """Nothing is known yet."""
+    return core.empty(cfg, identity.robot, identity.epoch)
+
+
+def step(state: core.State, message: Message, cfg: core.Config) -> Iterator[Output]:
+    """One input; regions go to their topic, requests become questions."""
+    for output in core.update(state, message, cfg):
+        yield (REGION_DELTA, output) if isinstance(output, RegionDelta) else Ask(QUESTIONS[type(output)], output)
+
+
+def answer_snapshot(state: core.State, request: SnapshotRequest, cfg: core.Config) -> RegionDelta:
+    """Everything published so far."""
+    return core.snapshot(state)
+
+
+def answer_posterior(state: core.State, request: PosteriorRequest, cfg: core.Config) -> PosteriorReply:
+    """Why a place carries its label."""
+    return core.explain(state, request, cfg)
+
+
+SERVICE = Service(
+    "segmenter",
+    purpose="Aligns places with the prior: a label and a belief for each place, and regions with lasting ids.",
+    scope="robot",
+    config=core.Config,
+    init=init,
+    step=step,
+    reads=(PLACE_DELTA, PYRAMID, TASK, PRIOR),
+    writes=(REGION_DELTA,),
+    asks=(PLACE_SNAPSHOT, TEXT, PRIORS),
+    answers={REGION_SNAPSHOT: answer_snapshot, POSTERIOR: answer_posterior},
+    tick_s=0.5,
+)

@@ -1,0 +1,343 @@
+"""The whole segmenter on a small world: right regions, lasting ids, task switch, deltas, questions, replay."""
+
+import numpy as np
+import pytest
+from segmenter_world import (
+    FRAMES_PER_ROOM,
+    ROBOT,
+    SPACE,
+    Reader,
+    look,
+    no_places,
+    place_delta,
+    place_grid,
+    prior,
+    pyramid,
+    task,
+    text,
+    walk,
+)
+
+from schemas.codec import decode, encode
+from schemas.features import TextRequest
+from schemas.places import SnapshotRequest
+from schemas.priors import PriorList, PriorRequest, RegionPrior
+from schemas.regions import PosteriorRequest, RegionDelta
+from schemas.status import Tick
+from schemas.topics import PLACE_SNAPSHOT, POSTERIOR, PRIORS, REGION_DELTA, REGION_SNAPSHOT, TEXT
+from services.runtime.service import Ask, Identity
+from services.segmenter import core
+from services.segmenter.service import SERVICE
+
+CFG = core.Config()
+ROOMS = ["kitchen", "hall", "bedroom"]
+TICK = Tick(stamp_ns=10**18)
+
+
+class Run:
+    """One segmenter, its outputs, and a reader of its deltas. Text requests are answered like rooms' basis vectors."""
+
+    def __init__(self, cfg=CFG, concepts=None):
+        self.cfg, self.state = cfg, SERVICE.init(cfg, Identity(ROBOT, "i", 1))
+        self.concepts = np.eye(3) if concepts is None else concepts
+        self.deltas, self.asked, self.reader = [], [], Reader()
+
+    def feed(self, *messages, answer_text=True):
+        for message in messages:
+            for output in list(SERVICE.step(self.state, decode(type(message), encode(message)), self.cfg)):
+                if isinstance(output, Ask):
+                    self.asked.append(output)
+                    if output.query is TEXT and answer_text:
+                        self.feed(text(self.concepts[: len(output.request.concepts)]))
+                else:
+                    assert output[0] is REGION_DELTA
+                    self.deltas.append(output[1])
+                    self.reader.apply(output[1])
+        return self
+
+    def labels(self):
+        return {place: self.reader.label(place) for place in self.reader.beliefs}
+
+
+def world(rooms=3):
+    positions, edges = place_grid(rooms)
+    return positions, edges, walk(rooms)
+
+
+def near_a_doorway(position):
+    """Within half a metre of a shared wall, where crops see both rooms and either label is right."""
+    return abs(position[0] - 4.0) <= 0.5 or abs(position[0] - 8.0) <= 0.5
+
+
+def finished(rooms=3, **kwargs):
+    positions, edges, frames = world(rooms)
+    run = Run(**kwargs).feed(place_delta(positions, edges), task(), prior(ROOMS[:rooms]), *frames, TICK)
+    return run, positions
+
+
+def test_each_room_becomes_one_region_with_its_name():
+    run, positions = finished()
+    assert sorted(region.label for region in run.reader.regions.values()) == sorted(ROOMS)
+    for place, label in run.labels().items():
+        if not near_a_doorway(positions[place]):
+            assert label == ROOMS[int(positions[place, 0] // 4)]
+    for region in run.reader.regions.values():
+        members = [place for place, belief in run.reader.beliefs.items() if belief[0] == region.id]
+        assert region.place_count == len(members)
+        np.testing.assert_allclose(region.position_m, positions[members].mean(axis=0), atol=0.006)
+        mean = np.mean([run.reader.beliefs[place][1][ROOMS.index(region.label)] for place in members])
+        assert region.probability == pytest.approx(mean, abs=0.02)
+
+
+def test_posteriors_are_distributions_and_unseen_places_are_unknown():
+    positions, edges, frames = world()
+    lonely = np.vstack((positions, [(30.0, 30.0, 1.0)])).astype(np.float32)
+    run = Run().feed(place_delta(lonely, edges), task(), prior(ROOMS), *frames, TICK)
+    for place, (_, posterior, unknown) in run.reader.beliefs.items():
+        assert sum(posterior) == pytest.approx(1.0, abs=2e-3)
+        assert unknown == 1.0 if place == len(positions) else 0.0 <= unknown < 0.7
+
+
+def test_unobserved_places_take_the_label_of_their_neighbours():
+    positions, edges, frames = world(2)
+    chain = np.vstack((positions, [(8.5, 2.0, 1.0), (9.5, 2.0, 1.0)])).astype(np.float32)
+    last = len(positions)
+    corner = int(np.argmin(np.linalg.norm(positions - (7.5, 1.5, 1.0), axis=1)))
+    joined = np.vstack((edges, [(corner, last), (last, last + 1)]))
+    run = Run().feed(place_delta(chain, joined), task(), prior(ROOMS[:2]), *frames, TICK)
+    assert run.reader.beliefs[last + 1][2] == 1.0
+    assert run.reader.label(last) == run.reader.label(last + 1) == "hall"
+
+
+def test_region_ids_last_while_the_map_grows():
+    positions, edges, frames = world()
+    run = Run().feed(task(), prior(ROOMS))
+    seen = {}
+    for rooms in (1, 2, 3):
+        part = np.flatnonzero(positions[:, 0] < 4 * rooms)
+        inside = np.isin(edges, part).all(axis=1)
+        run.feed(
+            place_delta(
+                positions[part],
+                edges[inside],
+                place_ids=part,
+                revision=rooms - 1,
+            )
+        )
+        run.feed(*frames[FRAMES_PER_ROOM * (rooms - 1) : FRAMES_PER_ROOM * rooms], TICK)
+        for region in run.reader.regions.values():
+            assert seen.setdefault(region.label, region.id) == region.id
+    assert len(seen) == 3
+
+
+def test_a_task_switch_relabels_everything_at_once_without_new_pyramids():
+    run, positions = finished()
+    before = dict(run.labels())
+    asked = len(run.asked)
+    run.concepts = np.array([(1.0, 1.0, 0.0), (0.0, 0.0, 1.0)])
+    run.feed(task("find a bed"), TICK)
+    assert run.labels() == before and run.deltas[-1].task == "tidy up"
+    run.feed(prior(["day zone", "night zone"], "find a bed"))
+    last = run.deltas[-1]
+    assert last.snapshot and last.labels == ["day zone", "night zone"] and last.task == "find a bed"
+    assert len(last.place_ids) == len(positions)
+    for place, label in run.labels().items():
+        if not near_a_doorway(positions[place]):
+            assert label == ("day zone" if positions[place, 0] < 8 else "night zone")
+    assert [ask.query for ask in run.asked[asked:]] == [TEXT]
+
+
+def test_a_prior_may_come_before_its_task_and_others_are_left_alone():
+    positions, edges, frames = world()
+    run = Run().feed(place_delta(positions, edges), prior(ROOMS), prior(["a", "b"], "other"), *frames, TICK)
+    assert not run.deltas and not run.asked
+    run.feed(task())
+    assert run.deltas[-1].labels == ROOMS
+    run.feed(*(prior(["x", "y"], f"foreign {n}") for n in range(9)), TICK)
+    assert run.deltas[-1].labels == ROOMS
+    assert core.wanted_prior(run.state) is not None
+
+
+def test_switching_back_and_forth_ends_in_the_same_labels():
+    run, _ = finished()
+    before = run.labels()
+    run.feed(task("x"), prior(["all"], "x"), TICK)
+    assert set(run.labels().values()) == {"all"}
+    run.feed(task(), TICK)
+    assert run.labels() == before
+
+
+def test_a_text_reply_for_a_superseded_prior_is_not_taken_for_the_new_one():
+    positions, edges, frames = world()
+    run = Run().feed(place_delta(positions, edges), *frames)
+    run.feed(task("x"), prior(["p", "q", "r"], "x"), task(), prior(ROOMS), answer_text=False)
+    assert [ask.query for ask in run.asked] == [TEXT]
+    run.feed(text(np.eye(3)[::-1]), answer_text=False)  # the reply for p, q, r
+    assert not run.deltas
+    assert [ask.request.concepts[0] for ask in run.asked] == [["a p"], ["a kitchen"]]
+    run.feed(text(np.eye(3)))
+    assert run.reader.label(0) == "kitchen"
+
+
+def test_a_missing_prior_is_asked_for_and_an_empty_answer_repeated():
+    positions, edges, _ = world()
+    run = Run().feed(place_delta(positions, edges), task(regions=ROOMS))
+    run.feed(*[TICK] * (CFG.prior_wait_ticks - 1))
+    assert not run.asked
+    run.feed(TICK, TICK)
+    assert [ask.query for ask in run.asked] == [PRIORS]
+    assert run.asked[0].request == PriorRequest(environment="home", task="tidy up", regions=ROOMS)
+    run.feed(PriorList(priors=[], reason="none yet"), *[TICK] * CFG.prior_wait_ticks)
+    assert [ask.query for ask in run.asked] == [PRIORS, PRIORS]
+    run.feed(PriorList(priors=[prior(ROOMS, vocabulary=ROOMS), prior(ROOMS[::-1], vocabulary=ROOMS)]), TICK)
+    assert run.deltas[-1].labels == ROOMS  # the best comes first
+
+
+def test_a_gap_asks_for_a_snapshot_once_and_recovers():
+    positions, edges, frames = world()
+    run = Run().feed(task(), prior(ROOMS))
+    run.feed(no_places(revision=4), no_places(revision=5))
+    assert [ask.request for ask in run.asked if ask.query is PLACE_SNAPSHOT] == [SnapshotRequest(robot=ROBOT)]
+    run.feed(place_delta(positions, edges, revision=4, snapshot=True), *frames, TICK)
+    assert len(run.reader.beliefs) == len(positions)
+    assert run.reader.label(0) == "kitchen"
+    run.feed(no_places(revision=9))
+    assert len([ask for ask in run.asked if ask.query is PLACE_SNAPSHOT]) == 2
+
+
+def test_a_restarted_place_graph_replaces_all_places():
+    run, positions = finished()
+    run.feed(place_delta(positions[:3], np.zeros((0, 2)), epoch=2, place_ids=np.array([100, 101, 102])), TICK)
+    assert sorted(run.reader.beliefs) == [100, 101, 102]
+    assert run.reader.label(100) == "kitchen"  # from the stored pyramids
+
+
+def test_late_and_moved_places_get_the_evidence_of_all_frames():
+    positions, edges, frames = world()
+    early = Run().feed(place_delta(positions, edges), task(), prior(ROOMS), *frames, TICK)
+    displaced = positions.copy()
+    displaced[5] = (9.5, 3.5, 1.0)
+    late = Run().feed(place_delta(displaced[:20], np.zeros((0, 2))), task(), prior(ROOMS), *frames, TICK)
+    late.feed(place_delta(positions, edges, revision=1), TICK)
+    slots = [run.state.evidence.of(list(range(len(positions)))) for run in (early, late)]
+    np.testing.assert_allclose(
+        early.state.evidence.descriptors(slots[0]), late.state.evidence.descriptors(slots[1]), atol=1e-5
+    )
+    assert early.labels() == late.labels()
+
+
+def test_another_query_radius_integrates_everything_again():
+    positions, edges, frames = world()
+    wide = [RegionPrior(name=name, phrases=[f"a {name}"], existence=1 / 3, query_radius_m=1.5) for name in ROOMS]
+    before = Run().feed(task(), prior(ROOMS, regions=wide), place_delta(positions, edges), *frames, TICK)
+    after = Run().feed(place_delta(positions, edges), *frames, task(), prior(ROOMS, regions=wide), TICK)
+    assert before.state.query_radius_m == after.state.query_radius_m == 1.5
+    slots = [run.state.evidence.of(list(range(len(positions)))) for run in (before, after)]
+    sums = [run.state.evidence.trust[slot] for run, slot in zip((before, after), slots, strict=True)]
+    np.testing.assert_allclose(*sums, rtol=1e-5)
+    narrow, _ = finished()
+    assert not np.allclose(narrow.state.evidence.trust[: len(positions)], sums[0], rtol=0.05)
+
+
+def test_repeated_and_foreign_pyramids_change_nothing():
+    run, _ = finished()
+    deltas, trust = len(run.deltas), run.state.evidence.trust.copy()
+    run.feed(walk(3)[2], pyramid(99, look(2, 2, 0), 3, space="other/space"), TICK, TICK)
+    assert len(run.deltas) == deltas
+    np.testing.assert_array_equal(run.state.evidence.trust, trust)
+    assert run.state.ignored_pyramids == 2
+
+
+def test_deltas_hold_only_what_changed():
+    run, positions = finished()
+    new = np.array([(2.2, 2.2, 1.3)], dtype=np.float32)
+    run.feed(place_delta(new, np.array([[5, 200]]), place_ids=np.array([200]), revision=1), TICK)
+    last = run.deltas[-1]
+    assert not last.snapshot and 200 in last.place_ids.tolist()
+    assert len(last.place_ids) < len(positions) / 2
+    run.feed(TICK, TICK)
+    assert run.deltas[-1] is last
+
+
+def test_removed_places_and_regions_leave_the_followers_too():
+    run, positions = finished()
+    gone = np.flatnonzero(positions[:, 0] >= 8.0)
+    run.feed(no_places(revision=1, removed_ids=gone), TICK)
+    assert set(run.reader.beliefs) == set(np.flatnonzero(positions[:, 0] < 8.0).tolist())
+    assert sorted(region.label for region in run.reader.regions.values()) == ["hall", "kitchen"]
+
+
+def test_following_the_deltas_equals_the_snapshot():
+    rng = np.random.default_rng(0)
+    positions, edges, frames = world()
+    run = Run().feed(place_delta(positions, edges), task(), prior(ROOMS))
+    for revision, frame in enumerate(frames, start=1):
+        removed = rng.integers(0, len(positions), 1) if revision % 3 == 0 else np.zeros(0, dtype=np.int64)
+        back = np.arange(len(positions)) if revision % 7 == 0 else np.zeros(0, dtype=np.int64)
+        again = edges if revision % 7 == 0 else edges[:0]
+        run.feed(place_delta(positions[back], again, place_ids=back, revision=revision, removed_ids=removed), frame)
+        whole = SERVICE.answers[REGION_SNAPSHOT](run.state, SnapshotRequest(robot=ROBOT), CFG)
+        fresh = Reader()
+        fresh.apply(decode(RegionDelta, encode(whole)))
+        assert fresh.beliefs == run.reader.beliefs
+        assert fresh.regions == run.reader.regions
+        assert fresh.revision == run.reader.revision
+    assert len(run.deltas) > 10
+
+
+def test_snapshot_before_anything_is_empty_and_the_first_delta_follows_it():
+    whole = SERVICE.answers[REGION_SNAPSHOT](Run().state, SnapshotRequest(robot=ROBOT), CFG)
+    assert whole.snapshot and whole.revision == -1 and not whole.regions
+    run = Run().feed(task(), prior(ROOMS))  # no places yet
+    assert run.deltas[0].revision == 0 and run.deltas[0].labels == ROOMS and len(run.deltas[0].place_ids) == 0
+
+
+def test_same_inputs_give_the_same_bytes():
+    first, second = finished()[0], finished()[0]
+    assert [encode(delta) for delta in first.deltas] == [encode(delta) for delta in second.deltas]
+
+
+def test_posterior_explains_the_label():
+    run, _ = finished()
+    reply = SERVICE.answers[POSTERIOR](run.state, PosteriorRequest(robot=ROBOT, place_id=5), CFG)
+    assert reply.found and reply.label == "kitchen" and reply.labels == ROOMS and reply.frames > 0
+    weighted = [np.array(vote.log_probabilities) * vote.weight for vote in reply.votes]
+    np.testing.assert_allclose(reply.unary, -sum(weighted), atol=1e-9)
+    assert [vote.expert for vote in reply.votes] == ["visual", "environment"]
+    assert reply.votes[0].weight == pytest.approx(4.0 * reply.votes[0].confidence)
+    np.testing.assert_allclose(reply.posterior, run.reader.beliefs[5][1], atol=0.02)
+    assert not SERVICE.answers[POSTERIOR](run.state, PosteriorRequest(robot=ROBOT, place_id=777), CFG).found
+
+
+def test_beta_zero_labels_each_place_by_its_own_evidence():
+    run, _ = finished(cfg=core.Config(beta=0.0))
+    np.testing.assert_array_equal(run.state.places.labels, run.state.places.unary.argmin(axis=1))
+
+
+def test_pairwise_costs_by_hand():
+    """Two places 1 m apart with clearance 0.4: beta exp(-1 / 2) (-log 0.3) = 2 x 0.60653 x 1.20397 = 1.46049."""
+    positions = np.array([(0.0, 0.0, 1.0), (1.0, 0.0, 1.0)])
+    for cfg, factor in ((CFG, 1.0), (core.Config(edge_clearance_m=0.8), 0.5), (core.Config(edge_clearance_m=0.2), 1.0)):
+        run = Run(cfg=cfg).feed(place_delta(positions, np.array([(0, 1)])), task(), prior(ROOMS[:2]))
+        mrf = core.field_of(run.state, cfg)
+        assert mrf.weights[0] * mrf.pairwise[0, 1] == pytest.approx(1.46049 * factor, abs=1e-4)
+        assert mrf.pairwise[0, 0] == 0
+
+
+def test_object_phrases_are_the_most_discriminative():
+    containment = np.array([(0.9, 0.1), (0.1, 0.1)], dtype=np.float32)
+    found = core.region_concepts(prior(["kitchen", "hall"], containment=containment), object_phrases=1)
+    assert found == [["a kitchen", "an oven"], ["a hall"]]
+
+
+def test_text_is_asked_in_the_configured_space():
+    run = Run().feed(task(), prior(ROOMS), answer_text=False)
+    assert run.asked[0].request == TextRequest(space=SPACE, concepts=[[f"a {name}"] for name in ROOMS])
+
+
+@pytest.mark.parametrize(
+    "fields", [{"experts": {"smell": 1.0}}, {"edge_decay_m": 0.0}, {"probability_floor": 0.0}, {"beta": -1.0}]
+)
+def test_impossible_settings_are_refused(fields):
+    with pytest.raises(ValueError):
+        core.Config(**fields)
