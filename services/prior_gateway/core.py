@@ -1,0 +1,295 @@
+"""From a task in plain words to a prior graph (paper, Prior Graph Extraction), by knowledge that is already written down.
+
+A *provider* answers a task with a prior; the curated library is the first. Tasks divide an environment by merging its
+base regions. With w_i = P(r_i | E0) of the members i of a merged region m:
+
+    P(m | E0)     = sum_i w_i
+    P(o | m)      = sum_i w_i P(o | r_i) / sum_i w_i            a place of m is a place of r_i with probability w_i / sum w
+    P(m <-> n)    = max_ij P(r_i <-> r_j)                       they touch where any of their members touch
+    mean, std     = of the mixture of the members' inclinations (law of total variance)
+    r_Q           = sum_i w_i r_Q,i / sum_i w_i
+    phrases       = union of the members' phrases
+
+The maximum and not a noisy-or: that one grows with the number of members, so a coarse task would get cheap boundaries
+everywhere.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import Protocol
+
+import msgspec
+import numpy as np
+
+from schemas.priors import ObjectPrior, Prior, Provenance, RegionPrior, Task
+from services.prior_gateway.knowledge import Chosen, Environment, RegionEntry, TaskEntry
+from services.prior_gateway.matching import choose_regions, match_environment, match_task, words
+
+# Nouns that take no article.
+MASS_NOUNS = frozenset(
+    {"artwork", "bread", "clothing", "fruit", "furniture", "grass", "gravel", "laundry", "luggage", "machinery"}
+    | {"medicine", "equipment", "scaffolding", "seating", "shelving", "signage", "tableware", "water"}
+)
+
+
+class Config(msgspec.Struct, frozen=True, kw_only=True):
+    """How priors are composed."""
+
+    # P(o | r) of an object that a region's entry does not list.
+    unlisted_containment: float = 0.02
+    # P(ri <-> rj) of two regions of one environment whose entries say nothing about each other.
+    unlisted_adjacency: float = 0.08
+    # P(ri <-> rj) where nothing is known: a region known by name alone, or two of different environments.
+    unknown_adjacency: float = 0.3
+    # r_Q of every region in metres; 0 takes the library's (0.75; the paper takes 1.5 in simulations without texture).
+    query_radius_m: float = 0.0
+    # Observation phrases of a name; {} is the name with its article.
+    templates: list[str] = msgspec.field(default_factory=lambda: ["{}", "a picture of {}"])
+    # Priors remembered for questions by digest; the oldest is forgotten first.
+    remembered_priors: int = 256
+
+
+class NoPrior(Exception):
+    """A provider has no prior for a task; the message is one sentence for the user."""
+
+
+class Provider(Protocol):
+    """Something that answers a task with a prior."""
+
+    @property
+    def name(self) -> str:
+        """What `Provenance.source` says."""
+
+    def answer(self, task: Task, cfg: Config) -> Prior:
+        """A complete prior for `task`; raises NoPrior."""
+
+
+class Library(msgspec.Struct, frozen=True, kw_only=True):
+    """The provider that knows by heart."""
+
+    environments: tuple[Environment, ...]
+    version: str  # content address of the files
+    name: str = "library"
+
+    def answer(self, task: Task, cfg: Config) -> Prior:
+        """The prior of a curated task, or of the regions that the task fixes; raises NoPrior."""
+        environment = match_environment(task.environment, self.environments)
+        if task.regions:
+            return self._of_vocabulary(task, environment, cfg)
+        if environment is None:
+            known = ", ".join(sorted(environment.name for environment in self.environments))
+            raise NoPrior(f"The library knows no environment like {task.environment!r}; it knows {known}.")
+        match = match_task(task.task, environment)
+        note = f"{_environment_note(task, environment)}; {match.note}"
+        detail = f"{environment.name}/{match.task.name}@{self.version}"
+        chosen = task_regions(match.task, environment)
+        return compose(task, chosen, match.task, Provenance(source=self.name, detail=detail, note=note), cfg)
+
+    def _of_vocabulary(self, task: Task, environment: Environment | None, cfg: Config) -> Prior:
+        if len(set(task.regions)) != len(task.regions) or not all(words(name) for name in task.regions):
+            raise NoPrior("The task's region names must be words, and each may be given only once.")
+        chosen = choose_regions(task.regions, environment, self.environments)
+        note = "; ".join([_environment_note(task, environment), *(entry.how for entry in chosen)])
+        detail = f"{environment.name if environment else '-'}/fixed vocabulary@{self.version}"
+        fitting = match_task(task.task, environment).task if environment else None
+        return compose(task, chosen, fitting, Provenance(source=self.name, detail=detail, note=note), cfg)
+
+
+def first_answer(providers: Sequence[Provider], task: Task, cfg: Config) -> Prior:
+    """The prior of the first provider that has one; its note tells who had none, and why. Raises NoPrior with all
+    reasons when nobody has one."""
+    reasons: list[str] = []
+    for provider in providers:
+        try:
+            prior = provider.answer(task, cfg)
+        except NoPrior as reason:
+            reasons.append(str(reason))
+            continue
+        if not reasons:
+            return prior
+        note = " ".join([*reasons, prior.provenance.note])
+        return msgspec.structs.replace(prior, provenance=msgspec.structs.replace(prior.provenance, note=note))
+    raise NoPrior(" ".join(reasons) or "No provider of priors is configured.")
+
+
+def task_regions(task: TaskEntry, environment: Environment) -> list[Chosen]:
+    """The regions into which a curated task divides its environment."""
+    return [
+        Chosen(name, environment, tuple(environment.region(member) for member in members))
+        for name, members in task.regions.items()
+    ]
+
+
+def compose(
+    task: Task, chosen: Sequence[Chosen], entry: TaskEntry | None, provenance: Provenance, cfg: Config
+) -> Prior:
+    """The prior graph over the chosen regions; `entry` adds the objects that matter to its task."""
+    extra = entry.objects if entry else {}
+    objects = _object_names(chosen, extra)
+    existence = _existence(chosen)
+    return Prior(
+        environment=task.environment,
+        task=task.task,
+        vocabulary=task.regions,
+        regions=[_region(one, share, bool(task.regions), cfg) for one, share in zip(chosen, existence, strict=True)],
+        objects=[ObjectPrior(name=name, phrases=_object_phrases(name, chosen, cfg)) for name in objects],
+        containment=_containment(chosen, objects, extra, cfg).astype(np.float32),
+        adjacency=_adjacency(chosen, cfg).astype(np.float32),
+        provenance=provenance,
+    )
+
+
+def adjacency_of(environment: Environment, one: RegionEntry, other: RegionEntry, cfg: Config) -> float:
+    """P(ri <-> rj) of two base regions of one environment: the pair as listed, else the larger `connects` of the two,
+    else the default; 1 for a region with itself."""
+    if one is other:
+        return 1.0
+    listed = one.adjacent.get(other.name, other.adjacent.get(one.name))
+    if listed is not None:
+        return listed
+    connects = [entry.connects for entry in (one, other) if entry.connects is not None]
+    return max(connects, default=cfg.unlisted_adjacency)
+
+
+def with_article(name: str) -> str:
+    """`name` as it stands in a phrase: "a stove", "an oven", "stairs"."""
+    last = name.rsplit(maxsplit=1)[-1].casefold()
+    plural = last.endswith("s") and not last.endswith(("ss", "us", "is", "'s"))
+    if plural or last in MASS_NOUNS:
+        return name
+    first = name.casefold()
+    vowel = first.startswith(("a", "e", "i", "o", "u", "x-ray")) and not first.startswith(("uni", "use", "eu", "one"))
+    return f"{'an' if vowel else 'a'} {name}"
+
+
+def _environment_note(task: Task, environment: Environment | None) -> str:
+    if environment is None:
+        return f"the library knows no environment like {task.environment!r}: adjacency across environments is a default"
+    same = words(task.environment) == words(environment.name)
+    return f"environment {environment.name!r}" if same else f"{task.environment!r} as environment {environment.name!r}"
+
+
+def _weights(one: Chosen) -> list[float]:
+    assert one.environment is not None
+    return [one.environment.share(member) for member in one.members]
+
+
+def _existence(chosen: Sequence[Chosen]) -> list[float]:
+    """P(r | E0), summing to one; a region known by name alone counts as the mean of the others."""
+    known = [sum(_weights(one)) for one in chosen if one.environment]
+    mean = sum(known) / len(known) if known else 1.0
+    raw = [sum(_weights(one)) if one.environment else mean for one in chosen]
+    return [value / sum(raw) for value in raw]
+
+
+def _region(one: Chosen, existence: float, named: bool, cfg: Config) -> RegionPrior:
+    """`named`: the given name describes the region itself, as in a fixed vocabulary; the abstract names of tasks
+    ("service zone") say nothing about appearance."""
+    phrases = _phrases_of(one.name, cfg) if named or not one.members else []
+    for member in one.members:
+        phrases += [*_phrases_of(member.name, cfg), *member.phrases]
+    if not one.members:
+        return RegionPrior(
+            name=one.name, phrases=phrases, existence=existence, query_radius_m=cfg.query_radius_m or 0.75
+        )
+    weights = _weights(one)
+    mean, std = _mixture([(e.inclination_deg, e.inclination_std_deg) for e in one.members], weights)
+    radius = _mean([member.query_radius_m for member in one.members], weights)
+    parents = {member.parent for member in one.members}
+    return RegionPrior(
+        name=one.name,
+        phrases=list(dict.fromkeys(phrases)),
+        existence=existence,
+        inclination_mean_rad=math.radians(mean),
+        inclination_std_rad=math.radians(std),
+        query_radius_m=cfg.query_radius_m or radius,
+        parent=one.members[0].parent if len(parents) == 1 else "",
+    )
+
+
+def _mixture(parts: Sequence[tuple[float, float]], weights: Sequence[float]) -> tuple[float, float]:
+    """Mean and standard deviation of a mixture of (mean, std)."""
+    mean = _mean([part[0] for part in parts], weights)
+    variance = _mean([std**2 + (part - mean) ** 2 for part, std in parts], weights)
+    return mean, math.sqrt(variance)
+
+
+def _mean(values: Sequence[float], weights: Sequence[float]) -> float:
+    return sum(value * weight for value, weight in zip(values, weights, strict=True)) / sum(weights)
+
+
+def _phrases_of(name: str, cfg: Config) -> list[str]:
+    return [template.format(with_article(name)) for template in cfg.templates]
+
+
+def _object_names(chosen: Sequence[Chosen], extra: dict[str, dict[str, float]]) -> list[str]:
+    """Objects listed by any member, and those of the task that a member may hold, in order of first mention."""
+    members = [member for one in chosen for member in one.members]
+    listed = [name for member in members for name in member.objects]
+    of_task = [name for name, held in extra.items() if any(member.name in held for member in members)]
+    return list(dict.fromkeys([*listed, *of_task]))
+
+
+def _object_phrases(name: str, chosen: Sequence[Chosen], cfg: Config) -> list[str]:
+    further = [phrase for one in chosen if one.environment for phrase in one.environment.objects.get(name, [])]
+    return list(dict.fromkeys([*_phrases_of(name, cfg), *further]))
+
+
+def _containment(
+    chosen: Sequence[Chosen], objects: Sequence[str], extra: dict[str, dict[str, float]], cfg: Config
+) -> np.ndarray:
+    """P(o | r), (region, object). A region known by name alone gets the mean over all others: uniform, and as likely to
+    hold any object as the rest, so that objects speak neither for nor against it on average."""
+    matrix = np.full((len(chosen), len(objects)), np.nan)
+    for row, one in enumerate(chosen):
+        if one.members:
+            weights = _weights(one)
+            for column, name in enumerate(objects):
+                held = [_held(member, name, extra, cfg) for member in one.members]
+                matrix[row, column] = _mean(held, weights)
+    alone = np.array([not one.members for one in chosen])
+    if alone.any() and not alone.all():
+        matrix[alone] = matrix[~alone].mean()
+    return matrix
+
+
+def _held(member: RegionEntry, name: str, extra: dict[str, dict[str, float]], cfg: Config) -> float:
+    return extra.get(name, {}).get(member.name, member.objects.get(name, cfg.unlisted_containment))
+
+
+def _adjacency(chosen: Sequence[Chosen], cfg: Config) -> np.ndarray:
+    matrix = np.eye(len(chosen))
+    for i, one in enumerate(chosen):
+        for j, other in enumerate(chosen[:i]):
+            matrix[i, j] = matrix[j, i] = _touch(one, other, cfg)
+    return matrix
+
+
+def _touch(one: Chosen, other: Chosen, cfg: Config) -> float:
+    """P(m <-> n) of two different chosen regions: the largest over their members."""
+    if one.environment is None or other.environment is None:
+        return cfg.unknown_adjacency
+    return max(
+        _touch_members(one.environment, member, other.environment, neighbour, cfg)
+        for member in one.members
+        for neighbour in other.members
+    )
+
+
+def _touch_members(
+    environment: Environment, entry: RegionEntry, other_environment: Environment, other: RegionEntry, cfg: Config
+) -> float:
+    """As `adjacency_of`; two regions of different environments touch as their counterparts in either one do."""
+    if environment is other_environment:
+        # Two names that share an entry are two regions of that kind: nothing is known about how they touch.
+        return cfg.unknown_adjacency if entry is other else adjacency_of(environment, entry, other, cfg)
+    for home, resident, guest in ((environment, entry, other), (other_environment, other, entry)):
+        counterpart = next((known for known in home.regions if _same_kind(known, guest)), None)
+        if counterpart is not None and counterpart is not resident:
+            return adjacency_of(home, resident, counterpart, cfg)
+    connects = [value for value in (entry.connects, other.connects) if value is not None]
+    return max(connects, default=cfg.unknown_adjacency)
+
+
+def _same_kind(known: RegionEntry, guest: RegionEntry) -> bool:
+    return words(guest.name) in {words(name) for name in (known.name, *known.synonyms)}
