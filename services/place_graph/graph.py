@@ -1,0 +1,229 @@
+"""Places with lasting ids and the edges between them, updated inside a region of the map (pure)."""
+
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from services.place_graph.grid import UNKNOWN_D2, Box, VoxelGrid
+from services.place_graph.links import clear_lines, line_d2, thinned
+from services.place_graph.places import Extraction
+
+Voxel = tuple[int, int, int]
+
+
+class Place(NamedTuple):
+    """One place: the voxel at its centre, squared distance (voxels) to the nearest obstacle, basis points."""
+
+    voxel: Voxel
+    d2: int
+    basis: int
+
+
+@dataclass(frozen=True)
+class Rules:
+    """What makes places one and what joins them, all lengths in voxels."""
+
+    cell: int  # side of a compression cell
+    merge: float  # touching places nearer than this are one
+    edge: float  # smallest clearance between touching places
+    reach: float  # longest edge across free space ...
+    free: float  # ... and its smallest clearance
+
+
+@dataclass
+class Changes:
+    """Ids that an update touched (also those that are gone), and into which place a gone one went."""
+
+    touched: set[int] = field(default_factory=set)
+    merged: dict[int, int] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class _Sight:
+    """The distance field of a window, to look along lines."""
+
+    d2: np.ndarray
+    box: Box
+
+    def clear(self, start: np.ndarray, stop: np.ndarray) -> bool:
+        """Whether the straight line between two voxels stays in free space."""
+        return line_d2(self.d2, start - self.box.low, stop - self.box.low) > 0
+
+
+class PlaceGraph:
+    """All places of the map, also those too isolated to be published."""
+
+    def __init__(self, rules: Rules) -> None:
+        self.rules = rules
+        self.places: dict[int, Place] = {}
+        self.edges: dict[int, dict[int, int]] = {}  # id -> neighbour -> squared clearance (voxels)
+        self._touching: dict[int, set[int]] = {}  # ids whose GVD voxels touch
+        self._by_cell: dict[Voxel, set[int]] = {}
+        self._next_id = 0
+
+    def update(self, grid: VoxelGrid, extraction: Extraction, region: Box) -> Changes:
+        """Replace the places inside `region` (whole cells) by the extracted ones, keep ids, renew edges nearby."""
+        window = region.grown(2 * self._reach_voxels).clipped(grid.bounds)
+        sight = _Sight(grid.gather("d2", window, UNKNOWN_D2), window)
+        changes = Changes()
+        id_of, left = self._replace(extraction, region, sight, changes)
+        self._retire(left, extraction, id_of, sight, changes)
+        self._touch(region, extraction, id_of)
+        self._relink(region, sight, changes)
+        return changes
+
+    @property
+    def _reach_voxels(self) -> int:
+        return int(np.ceil(self.rules.reach))
+
+    def _replace(
+        self, extraction: Extraction, region: Box, sight: _Sight, changes: Changes
+    ) -> tuple[dict[int, int], list[int]]:
+        """Give the extracted places of `region` their old ids, or new ones.
+
+        Returns the id of every extracted place that has one, and the old ids of `region` that nothing took over.
+        """
+        old_ids = self._ids_within(region)
+        inside = region.contains(extraction.voxels)
+        new = np.flatnonzero(inside)
+        matched = _match(self._voxels(old_ids), extraction.voxels[new], self.rules.cell, sight)
+        id_of: dict[int, int] = {}
+        for position, index in enumerate(new.tolist()):
+            if position in matched:
+                id_of[index] = old_ids[matched[position]]
+            else:
+                id_of[index], self._next_id = self._next_id, self._next_id + 1
+            x, y, z = extraction.voxels[index].tolist()
+            place = Place((x, y, z), int(extraction.d2[index]), int(extraction.basis[index]))
+            if self.places.get(id_of[index]) != place:
+                changes.touched.add(id_of[index])
+                self._put(id_of[index], place)
+        for index in np.flatnonzero(~inside).tolist():
+            outside = self._id_at(extraction.voxels[index])
+            if outside is not None:
+                id_of[index] = outside
+        return id_of, sorted(set(old_ids) - set(id_of.values()))
+
+    def _retire(
+        self, gone: list[int], extraction: Extraction, id_of: dict[int, int], sight: _Sight, changes: Changes
+    ) -> None:
+        """Remove places; each goes into the place that now owns its centre, else into the nearest in clear sight."""
+        known = sorted(id_of)
+        for place_id in gone:
+            voxel = np.array(self.places[place_id].voxel, np.int64)
+            owner = id_of.get(extraction.place_at(voxel))
+            if owner is None and known:
+                squared = ((extraction.voxels[known] - voxel) ** 2).sum(axis=1)
+                nearest = known[int(squared.argmin())]
+                if squared.min() <= self.rules.merge**2 and sight.clear(voxel, extraction.voxels[nearest]):
+                    owner = id_of[nearest]
+            if owner is not None:
+                changes.merged[place_id] = owner
+            changes.touched.add(place_id)
+            changes.touched.update(self.edges.get(place_id, ()))
+            self._drop(place_id)
+
+    def _touch(self, region: Box, extraction: Extraction, id_of: dict[int, int]) -> None:
+        """Renew which places touch, for all pairs with an end inside `region`."""
+        inside = set(self._ids_within(region))
+        for place_id in inside:
+            for other in self._touching.pop(place_id, set()):
+                self._touching.get(other, set()).discard(place_id)
+        for one, two in extraction.touching.tolist():
+            a, b = id_of.get(one), id_of.get(two)
+            if a is not None and b is not None and (a in inside or b in inside):
+                self._touching.setdefault(a, set()).add(b)
+                self._touching.setdefault(b, set()).add(a)
+
+    def _relink(self, region: Box, sight: _Sight, changes: Changes) -> None:
+        """Renew the edges that may have changed: those with an end in `region`, or both ends within reach of it."""
+        inside = set(self._ids_within(region))
+        near = set(self._ids_within(region.grown(self._reach_voxels)))
+        renewed: dict[int, dict[int, int]] = {a: {} for a in near}
+        renewed.update({b: {} for a in inside for b in self.edges.get(a, ())})
+
+        def concerned(a: int, b: int) -> bool:
+            return a in inside or b in inside or (a in near and b in near)
+
+        for a, b, clearance in self._links_within(region.grown(2 * self._reach_voxels), sight):
+            if concerned(a, b):
+                renewed.setdefault(a, {})[b] = renewed.setdefault(b, {})[a] = clearance
+        for a in sorted(renewed):
+            known = self.edges.get(a, {})
+            links = {b: clearance for b, clearance in known.items() if not concerned(a, b)} | renewed[a]
+            if links != known:
+                changes.touched.add(a)
+            self.edges[a] = links
+
+    def _links_within(self, box: Box, sight: _Sight) -> list[tuple[int, int, int]]:
+        """Edges between the places of `box`: smaller id, larger id, squared clearance."""
+        ids = self._ids_within(box)
+        index = {place_id: n for n, place_id in enumerate(ids)}
+        touching = np.zeros((len(ids), len(ids)), np.bool_)
+        for place_id in ids:
+            for other in self._touching.get(place_id, ()):
+                if other in index:
+                    touching[index[place_id], index[other]] = True
+        voxels = self._voxels(ids) - sight.box.low
+        rules = self.rules
+        clear = clear_lines(sight.d2, voxels, touching, rules.edge**2, rules.reach**2, rules.free**2)
+        keep = thinned(clear, voxels, touching, rules.edge**2)
+        return [(ids[one], ids[two], int(clear[one, two])) for one, two in np.argwhere(keep).tolist()]
+
+    def _voxels(self, ids: list[int]) -> np.ndarray:
+        return np.array([self.places[i].voxel for i in ids], np.int64).reshape(-1, 3)
+
+    def _ids_within(self, box: Box) -> list[int]:
+        """Ids of the places whose centre lies in `box`, ascending."""
+        low = np.floor_divide(box.low, self.rules.cell)
+        high = np.floor_divide(box.high - 1, self.rules.cell) + 1
+        found: list[int] = []
+        for x in range(int(low[0]), int(high[0])):
+            for y in range(int(low[1]), int(high[1])):
+                for z in range(int(low[2]), int(high[2])):
+                    found.extend(self._by_cell.get((x, y, z), ()))
+        return sorted(np.array(found, np.int64)[box.contains(self._voxels(found))].tolist())
+
+    def _id_at(self, voxel: np.ndarray) -> int | None:
+        """The place with exactly this centre."""
+        center = (int(voxel[0]), int(voxel[1]), int(voxel[2]))
+        for place_id in self._by_cell.get(self._cell(center), ()):
+            if self.places[place_id].voxel == center:
+                return place_id
+        return None
+
+    def _cell(self, voxel: Voxel) -> Voxel:
+        x, y, z = voxel
+        return x // self.rules.cell, y // self.rules.cell, z // self.rules.cell
+
+    def _put(self, place_id: int, place: Place) -> None:
+        if place_id in self.places:
+            self._by_cell[self._cell(self.places[place_id].voxel)].discard(place_id)
+        self.places[place_id] = place
+        self._by_cell.setdefault(self._cell(place.voxel), set()).add(place_id)
+
+    def _drop(self, place_id: int) -> None:
+        self._by_cell[self._cell(self.places.pop(place_id).voxel)].discard(place_id)
+        for other in self.edges.pop(place_id, {}):
+            self.edges[other].pop(place_id, None)
+        for other in self._touching.pop(place_id, set()):
+            self._touching[other].discard(place_id)
+
+
+def _match(old_voxels: np.ndarray, new_voxels: np.ndarray, cell_voxels: int, sight: _Sight) -> dict[int, int]:
+    """Index of the old place that each new one continues: nearest first, within a cell or its side, in clear sight."""
+    squared = ((old_voxels[:, None] - new_voxels[None]) ** 2).sum(axis=2)
+    same_cell = (old_voxels[:, None] // cell_voxels == new_voxels[None] // cell_voxels).all(axis=2)
+    rows, columns = np.nonzero(same_cell | (squared <= cell_voxels**2))
+    order = np.lexsort((columns, rows, squared[rows, columns]))
+    matched: dict[int, int] = {}
+    taken: set[int] = set()
+    for row, column in zip(rows[order].tolist(), columns[order].tolist(), strict=True):
+        if row in taken or column in matched:
+            continue
+        if squared[row, column] and not sight.clear(old_voxels[row], new_voxels[column]):
+            continue
+        matched[column] = row
+        taken.add(row)
+    return matched

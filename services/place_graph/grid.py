@@ -1,0 +1,119 @@
+"""A voxel map that grows: hashed blocks of 16 x 16 x 16 voxels, read and written through dense windows (pure)."""
+
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+BLOCK = 16  # voxels along one side of a block
+UNOBSERVED, FREE, OCCUPIED = 0, 1, 2
+UNKNOWN_D2 = -1  # squared distance of an unobserved voxel
+FAR_D2 = 32767  # squared distance of a free voxel farther from any obstacle than the field reaches
+
+
+class Box(NamedTuple):
+    """Half-open range of voxel indices; `low` and `high` are (3,) int64."""
+
+    low: np.ndarray
+    high: np.ndarray
+
+    def grown(self, margin: int | np.ndarray) -> "Box":
+        """The box with `margin` voxels more on every side."""
+        return Box(self.low - margin, self.high + margin)
+
+    def clipped(self, other: "Box") -> "Box":
+        """The part inside `other`."""
+        return Box(np.maximum(self.low, other.low), np.minimum(self.high, other.high))
+
+    def contains(self, voxels: np.ndarray) -> np.ndarray:
+        """Whether each voxel (..., 3) lies inside."""
+        return np.all((voxels >= self.low) & (voxels < self.high), axis=-1)
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Voxels along each axis, never negative."""
+        size = np.maximum(self.high - self.low, 0)
+        return int(size[0]), int(size[1]), int(size[2])
+
+
+def _cube(dtype: str, fill: int = 0) -> np.ndarray:
+    return np.full((BLOCK, BLOCK, BLOCK), fill, dtype)
+
+
+@dataclass
+class Block:
+    """One cube of voxels. What is measured: `tsdf_m`, `weight`, `label`. What follows from it: the rest."""
+
+    tsdf_m: np.ndarray = field(default_factory=lambda: _cube("float32"))  # signed distance along the ray, truncated
+    weight: np.ndarray = field(default_factory=lambda: _cube("float32"))
+    label: np.ndarray = field(default_factory=lambda: _cube("uint8"))  # UNOBSERVED, FREE, OCCUPIED
+    d2: np.ndarray = field(default_factory=lambda: _cube("int16", UNKNOWN_D2))  # squared voxels to the nearest obstacle
+    offset: np.ndarray = field(default_factory=lambda: np.zeros((BLOCK, BLOCK, BLOCK, 3), "int8"))  # voxel - obstacle
+    basis: np.ndarray = field(default_factory=lambda: _cube("uint8"))  # basis points of a GVD voxel, 0 = not on the GVD
+
+
+_EMPTY = Block()
+
+BlockKey = tuple[int, int, int]
+Part = tuple[slice, slice, slice]
+
+
+class VoxelGrid:
+    """Blocks by index. Voxel i covers [i, i + 1) * voxel_m in the world."""
+
+    def __init__(self) -> None:
+        self.blocks: dict[BlockKey, Block] = {}
+        self._low = np.zeros(3, np.int64)
+        self._high = np.zeros(3, np.int64)
+
+    @property
+    def bounds(self) -> Box:
+        """The smallest box of voxels that holds every block."""
+        return Box(self._low * BLOCK, self._high * BLOCK)
+
+    def insert(self, key: BlockKey, block: Block) -> None:
+        """Add a block that is not there yet."""
+        index = np.array(key, np.int64)
+        first = not self.blocks
+        self._low = index if first else np.minimum(self._low, index)
+        self._high = index + 1 if first else np.maximum(self._high, index + 1)
+        self.blocks[key] = block
+
+    def gather(self, name: str, box: Box, fill: int = 0) -> np.ndarray:
+        """Dense copy of one field inside `box`; `fill` where there is no block."""
+        sample = getattr(_EMPTY, name)
+        window = np.full((*box.shape, *sample.shape[3:]), fill, sample.dtype)
+        for block, outer, inner in self._overlaps(box):
+            window[outer] = getattr(block, name)[inner]
+        return window
+
+    def scatter(self, name: str, box: Box, window: np.ndarray) -> None:
+        """Write one field inside `box` back; voxels without a block are left out."""
+        for block, outer, inner in self._overlaps(box):
+            getattr(block, name)[inner] = window[outer]
+
+    def voxels_with(self, label: int) -> np.ndarray:
+        """Indices (n, 3) of all voxels with this label, in ascending order."""
+        parts = [np.argwhere(b.label == label) + np.array(key) * BLOCK for key, b in sorted(self.blocks.items())]
+        voxels = np.concatenate(parts) if parts else np.empty((0, 3), np.int64)
+        return voxels[np.lexsort(voxels.T[::-1])]
+
+    def _overlaps(self, box: Box) -> list[tuple[Block, Part, Part]]:
+        """Blocks that meet `box`, each with its part of the window and its part of the block."""
+        axes = [_axis_overlaps(int(low), int(high)) for low, high in zip(box.low, box.high, strict=True)]
+        found: list[tuple[Block, Part, Part]] = []
+        for bx, ox, ix in axes[0]:
+            for by, oy, iy in axes[1]:
+                for bz, oz, iz in axes[2]:
+                    block = self.blocks.get((bx, by, bz))
+                    if block is not None:
+                        found.append((block, (ox, oy, oz), (ix, iy, iz)))
+        return found
+
+
+def _axis_overlaps(low: int, high: int) -> list[tuple[int, slice, slice]]:
+    overlaps = []
+    for index in range(low // BLOCK, -(-high // BLOCK)):
+        start, stop = max(low, index * BLOCK), min(high, (index + 1) * BLOCK)
+        overlaps.append((index, slice(start - low, stop - low), slice(start - index * BLOCK, stop - index * BLOCK)))
+    return overlaps

@@ -1,0 +1,519 @@
+"""Map, distances, Voronoi diagram and places, against SciPy, brute force, geometry by hand and exact floor plans."""
+
+import csv
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from scipy import ndimage
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import connected_components
+
+from schemas.codec import encode
+from schemas.frames import Intrinsics, Keyframe
+from schemas.places import MapRequest, PlaceDelta, SnapshotRequest
+from schemas.topics import PLACE_DELTA, PLACE_SNAPSHOT, VOXEL_MAP
+from services.geometry import inside_polygon, pose_from_quaternion
+from services.place_graph import core, distance, links, service
+from services.place_graph.grid import BLOCK, FAR_D2, FREE, OCCUPIED, UNKNOWN_D2, UNOBSERVED, Block, Box, VoxelGrid
+from services.runtime.service import Identity
+
+DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+CAMERA = Intrinsics(120, 120, 60.0, 60.0, 59.5, 59.5)
+CFG = core.Config()
+FORWARD = (0.5, -0.5, 0.5, -0.5)  # camera z along world x, image upright
+HALF = np.sqrt(0.5)
+
+
+# World by hand: solids are axis-aligned boxes; a cube of six 90 degree views sees everything around a point.
+
+
+def views(x_m: float, y_m: float, z_m: float) -> list[np.ndarray]:
+    base = pose_from_quaternion(np.array((x_m, y_m, z_m)), np.array(FORWARD))
+    turns = [
+        (0, 0, 0, 1),
+        (0, HALF, 0, HALF),
+        (0, 1, 0, 0),
+        (0, -HALF, 0, HALF),
+        (HALF, 0, 0, HALF),
+        (-HALF, 0, 0, HALF),
+    ]
+    return [base @ pose_from_quaternion(np.zeros(3), np.array(q, float)) for q in turns]
+
+
+def render(solids: np.ndarray, world_from_camera: np.ndarray) -> bytes:
+    v, u = np.indices((CAMERA.height_px, CAMERA.width_px))
+    rays = np.stack(((u - CAMERA.cx_px) / CAMERA.fx_px, (v - CAMERA.cy_px) / CAMERA.fy_px, np.ones(u.shape)), axis=-1)
+    rays = rays.reshape(-1, 1, 3) @ world_from_camera[:3, :3].T + 1e-12
+    bounds = (solids - world_from_camera[:3, 3]) / rays[:, :, None]
+    enter, leave = bounds.min(axis=2).max(axis=-1), bounds.max(axis=2).min(axis=-1)
+    depth_m = np.where((enter < leave) & (enter > 0), enter, np.inf).min(axis=1)
+    image = np.where(np.isfinite(depth_m), depth_m * 1000, 0).astype(np.uint16).reshape(u.shape)
+    return cv2.imencode(".png", image)[1].tobytes()
+
+
+def keyframe(frame_id: int, world_from_camera: np.ndarray, depth: bytes, camera: Intrinsics = CAMERA) -> Keyframe:
+    return Keyframe(
+        robot="r",
+        frame_id=frame_id,
+        stamp_ns=frame_id * 10**9,
+        intrinsics=camera,
+        world_from_camera=world_from_camera,
+        color=b"",
+        depth=depth,
+        depth_scale_m=0.001,
+    )
+
+
+def shell(low: tuple[float, ...], high: tuple[float, ...], wall_m: float = 0.3) -> list[tuple]:
+    """Six slabs around a room."""
+    outer = np.array((np.array(low) - wall_m, np.array(high) + wall_m))
+    slabs = []
+    for axis in range(3):
+        for side in range(2):
+            slab = outer.copy()
+            slab[1 - side, axis] = (low, high)[side][axis]
+            slabs.append(slab)
+    return slabs
+
+
+ROOM = (np.zeros(3), np.array((4.0, 3.0, 2.4)))
+ROOM_SOLIDS = np.array(shell(*ROOM))
+TWO_ROOMS = np.array(
+    [
+        *shell((0, 0, 0), (6.2, 3, 2.4)),
+        ((3.0, 0.0, 0.0), (3.2, 1.05, 2.4)),
+        ((3.0, 1.95, 0.0), (3.2, 3.0, 2.4)),
+        ((3.0, 1.05, 2.1), (3.2, 1.95, 2.4)),  # lintel: the doorway is 0.9 m wide and 2.1 m high
+    ]
+)
+
+
+def walk(solids: np.ndarray, stations: list[tuple[float, float, float]]) -> list[Keyframe]:
+    poses = [pose for station in stations for pose in views(*station)]
+    return [keyframe(n, pose, render(solids, pose)) for n, pose in enumerate(poses)]
+
+
+ROOM_WALK = walk(ROOM_SOLIDS, [(1.1, 1.4, 1.3), (2.9, 1.6, 1.2)])
+TWO_ROOMS_WALK = walk(TWO_ROOMS, [(1.4, 1.5, 1.3), (3.1, 1.5, 1.3), (4.7, 1.5, 1.3)])
+
+
+def start(cfg: core.Config = CFG) -> core.State:
+    return service.init(cfg, Identity("r", "test", 7))
+
+
+def play(state: core.State, frames: list[Keyframe], cfg: core.Config = CFG) -> list[PlaceDelta]:
+    deltas = []
+    for frame in frames:
+        for topic, delta in service.step(state, frame, cfg):
+            assert topic is PLACE_DELTA
+            deltas.append(delta)
+    return deltas
+
+
+@pytest.fixture(scope="module")
+def room():
+    state = start()
+    return state, play(state, ROOM_WALK)
+
+
+@pytest.fixture(scope="module")
+def two_rooms():
+    state = start()
+    return state, play(state, TWO_ROOMS_WALK)
+
+
+def ask(state: core.State) -> PlaceDelta:
+    return service.SERVICE.answers[PLACE_SNAPSHOT](state, SnapshotRequest(robot="r"), CFG)
+
+
+# What a reader of the stream knows, in the order of application that the schema states.
+
+
+@dataclass
+class Reader:
+    places: dict = field(default_factory=dict)
+    edges: dict = field(default_factory=dict)
+    merged: set = field(default_factory=set)
+
+    def apply(self, delta: PlaceDelta) -> None:
+        for a, b in delta.removed_edges.tolist():
+            del self.edges[a, b]
+        for gone in [*delta.removed_ids.tolist(), *delta.merged_ids[:, 0].tolist()]:
+            del self.places[gone]
+            self.edges = {pair: c for pair, c in self.edges.items() if gone not in pair}
+        for n, place_id in enumerate(delta.place_ids.tolist()):
+            assert place_id not in self.merged
+            self.places[place_id] = (
+                *delta.positions_m[n].tolist(),
+                float(delta.radii_m[n]),
+                int(delta.basis_points[n]),
+            )
+        self.merged.update(delta.merged_ids[:, 0].tolist())
+        assert all(into in self.places for _, into in delta.merged_ids.tolist())
+        for (a, b), clearance in zip(delta.edges.tolist(), delta.clearances_m.tolist(), strict=True):
+            assert a < b and a in self.places and b in self.places
+            self.edges[a, b] = clearance
+
+
+def read(deltas: list[PlaceDelta]) -> Reader:
+    reader = Reader()
+    for delta in deltas:
+        reader.apply(delta)
+    return reader
+
+
+def canonical(state: core.State) -> tuple[dict, dict]:
+    """Places and edges by position instead of id."""
+    places = state.graph.places
+    edges = {
+        (places[a].voxel, places[b].voxel): c for a, links_ in state.graph.edges.items() for b, c in links_.items()
+    }
+    return {p.voxel: (p.d2, p.basis) for p in places.values()}, edges
+
+
+# Distance field.
+
+
+def field_of(label: np.ndarray, max_distance: float) -> tuple[np.ndarray, np.ndarray]:
+    d2 = np.full(label.shape, UNKNOWN_D2, np.int32)
+    offset = np.zeros((*label.shape, 3), np.int8)
+    distance.spread(label, d2, offset, distance.RIM, int(max_distance**2))
+    return d2, offset
+
+
+def random_world(seed: int, density: float, unobserved: float = 0.0) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    draw = rng.random((34, 30, 26))
+    label = np.where(draw < density, OCCUPIED, np.where(draw < density + unobserved, UNOBSERVED, FREE)).astype(np.uint8)
+    solid = np.zeros(label.shape, bool)
+    solid[distance.RIM : -distance.RIM, distance.RIM : -distance.RIM, distance.RIM : -distance.RIM] = True
+    return np.where(solid, label, UNOBSERVED).astype(np.uint8)
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("density", [0.0005, 0.005, 0.05])
+def test_distances_of_an_observed_world_are_euclidean(seed, density):
+    label = random_world(seed, density)
+    d2, offset = field_of(label, 15.0)
+    exact, nearest = ndimage.distance_transform_edt(label != OCCUPIED, return_indices=True)
+    exact2 = ((nearest - np.indices(label.shape)) ** 2).sum(axis=0)
+    reached = (label == FREE) & (exact <= 15.0)
+    assert (d2[reached] >= exact2[reached]).all()
+    assert (d2[reached] == exact2[reached]).mean() > 0.999  # a wave front may miss a sliver of a Voronoi cell ...
+    assert (np.sqrt(d2[reached]) - exact[reached]).max() < 0.2  # ... and is then wrong by a fraction of a voxel
+    assert (d2[(label == FREE) & (exact > 15.0)] == FAR_D2).all()
+    sites = np.argwhere(reached) - offset[reached]
+    assert (label[tuple(sites.T)] == OCCUPIED).all()
+    assert ((offset[reached].astype(int) ** 2).sum(axis=1) == d2[reached]).all()
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_waves_stay_in_observed_space(seed):
+    label = random_world(seed, 0.003, unobserved=0.6)
+    d2, offset = field_of(label, 15.0)
+    part, _ = ndimage.label(label != UNOBSERVED, np.ones((3, 3, 3)))
+    reached = np.argwhere((label == FREE) & (d2 != FAR_D2))
+    assert len(reached) > 50
+    sites = reached - offset[tuple(reached.T)]
+    assert (part[tuple(reached.T)] == part[tuple(sites.T)]).all()
+    assert (d2[label == UNOBSERVED] == UNKNOWN_D2).all()
+
+
+def test_no_wave_behind_an_unobserved_wall():
+    label = np.full((24, 12, 12), FREE, np.uint8)
+    label[4] = OCCUPIED
+    label[10] = UNOBSERVED
+    d2, _ = field_of(label, 20.0)
+    inner = slice(distance.RIM, -distance.RIM)
+    assert (d2[9, inner, inner] == 25).all()
+    assert (d2[11:-2, inner, inner] == FAR_D2).all()
+
+
+def grid_of(label: np.ndarray) -> VoxelGrid:
+    grid = VoxelGrid()
+    for index in np.ndindex(*(n // BLOCK for n in label.shape)):
+        part = tuple(slice(i * BLOCK, (i + 1) * BLOCK) for i in index)
+        grid.insert(index, Block(label=label[part].copy()))
+    return grid
+
+
+FIELD = {"max_distance_voxels": 7.0, "voronoi_min_voxels": 1.0, "parent_l1_voxels": 20.0, "parent_cos": 0.2}
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_recomputing_around_a_change_equals_recomputing_everything(seed):
+    rng = np.random.default_rng(seed)
+    label = np.where(rng.random((48, 48, 32)) < 0.01, OCCUPIED, FREE).astype(np.uint8)
+    label[rng.random(label.shape) < 0.2] = UNOBSERVED
+    changed = Box(np.array((20, 22, 10)), np.array((26, 25, 16)))
+    part = tuple(slice(a, b) for a, b in zip(changed.low, changed.high, strict=True))
+    local, whole = grid_of(label), None
+    distance.refresh(local, local.bounds, **FIELD)
+    label[part] = rng.choice((UNOBSERVED, FREE, OCCUPIED), label[part].shape).astype(np.uint8)
+    local.scatter("label", changed, label[part])
+    distance.refresh(local, changed, **FIELD)
+    whole = grid_of(label)
+    distance.refresh(whole, whole.bounds, **FIELD)
+    for name in ("d2", "offset", "basis"):
+        np.testing.assert_array_equal(local.gather(name, whole.bounds), whole.gather(name, whole.bounds))
+
+
+def test_diagram_of_two_walls_is_the_plane_between_them():
+    label = np.full((16, 32, 32), FREE, np.uint8)
+    label[2] = label[12] = OCCUPIED
+    label[:2] = label[13:] = UNOBSERVED
+    grid = grid_of(np.concatenate((label, np.zeros_like(label))))
+    distance.refresh(grid, grid.bounds, **FIELD)
+    basis = grid.gather("basis", grid.bounds)[:, 8:24, 8:24]
+    assert (basis[7] == 2).all()
+    assert not basis[3:6].any() and not basis[9:12].any()
+
+
+# Map.
+
+
+def test_one_ray_frees_voxels_before_the_surface_and_leaves_those_behind_unobserved():
+    camera = Intrinsics(1, 1, 10.0, 10.0, 0.0, 0.0)
+    pose = pose_from_quaternion(np.array((0.0, 0.05, 0.05)), np.array(FORWARD))
+    state = start()
+    core.fuse(state, keyframe(0, pose, b"", camera), np.array([[2.05]], np.float32), CFG)
+    line = Box(np.array((0, 0, 0)), np.array((32, 1, 1)))
+    label = state.grid.gather("label", line).ravel()
+    tsdf_m, weight = state.grid.gather("tsdf_m", line).ravel(), state.grid.gather("weight", line).ravel()
+    # Centres at 0.05, 0.15, ...; truncated at 0.3 m; obstacle from 0.05 m before the surface to 0.3 m behind it.
+    assert label[:2].tolist() == [UNOBSERVED] * 2
+    assert (label[2:20] == FREE).all() and (label[20:23] == OCCUPIED).all() and (label[23:] == UNOBSERVED).all()
+    assert tsdf_m[[5, 17, 19, 20, 22]] == pytest.approx([0.3, 0.3, 0.1, 0.0, -0.2], abs=1e-6)
+    assert weight[[5, 20, 21, 22]] == pytest.approx([1 / 0.55**2, 1 / 2.05**2, 1 / 2.15**2, 0.5 / 2.25**2], rel=1e-5)
+
+
+def test_voxels_of_a_room_are_free_inside_and_occupied_at_its_walls(room):
+    state, _ = room
+    answer = service.SERVICE.answers[VOXEL_MAP](state, MapRequest(robot="r"), CFG)
+    free = (answer.free + 0.5) * answer.voxel_m
+    low, high = ROOM
+    assert ((free > low - 0.05) & (free < high + 0.05)).all()
+    inside = np.prod(np.round((high - low) / CFG.voxel_m))
+    assert len(free) > 0.85 * inside
+    occupied = (answer.occupied + 0.5) * answer.voxel_m
+    outside_m = np.maximum(low - occupied, occupied - high).max(axis=1)
+    assert outside_m.min() > -0.1 and outside_m.max() < 0.3
+    assert not {tuple(v) for v in answer.free.tolist()} & {tuple(v) for v in answer.occupied.tolist()}
+
+
+# Places.
+
+
+def test_places_of_a_room_are_connected_and_know_the_distance_to_its_walls(room):
+    state, _ = room
+    places = ask(state)
+    low, high = ROOM
+    positions = places.positions_m.astype(float)
+    truth_m = np.minimum(positions - low, high - positions).min(axis=1)
+    assert len(places.place_ids) >= 8
+    assert np.abs(places.radii_m - truth_m).max() < CFG.voxel_m
+    assert places.radii_m.max() == pytest.approx(1.2, abs=CFG.voxel_m)
+    assert places.radii_m.min() >= CFG.min_node_distance_m
+    assert (places.basis_points >= 2).all()
+    assert parts(places) == 1
+
+
+def parts(places: PlaceDelta) -> int:
+    index = np.searchsorted(places.place_ids, places.edges)
+    size = len(places.place_ids)
+    return connected_components(csr_matrix((np.ones(len(index)), index.T), (size, size)), directed=False)[0]
+
+
+def test_an_edge_leads_through_the_doorway_and_none_through_the_wall(two_rooms):
+    state, _ = two_rooms
+    places = ask(state)
+    by_id = dict(zip(places.place_ids.tolist(), places.positions_m.astype(float), strict=True))
+    crossings = []
+    for a, b in places.edges.tolist():
+        one, two = by_id[a], by_id[b]
+        if (one[0] - 3.1) * (two[0] - 3.1) < 0:
+            crossings.append(one + (two - one) * (3.1 - one[0]) / (two[0] - one[0]))
+    assert crossings
+    assert all(1.05 < y < 1.95 and 0 < z < 2.1 for _, y, z in crossings)
+    assert parts(places) == 1
+
+
+def test_clearance_is_what_every_edge_has_all_along(two_rooms):
+    state, _ = two_rooms
+    places = ask(state)
+    by_id = dict(zip(places.place_ids.tolist(), places.positions_m.astype(float), strict=True))
+    for (a, b), clearance_m in zip(places.edges.tolist(), places.clearances_m.tolist(), strict=True):
+        points = np.linspace(by_id[a], by_id[b], 50)[:, None]
+        gap_m = np.linalg.norm(np.maximum(np.maximum(TWO_ROOMS[:, 0] - points, points - TWO_ROOMS[:, 1]), 0), axis=-1)
+        assert gap_m.min() > clearance_m - 1.5 * CFG.voxel_m
+        assert clearance_m >= CFG.min_edge_distance_m - 1e-6
+
+
+def test_graph_after_each_frame_equals_the_graph_of_the_finished_map(two_rooms):
+    state, _ = two_rooms
+    batch = start()
+    for frame in TWO_ROOMS_WALK:
+        core.fuse(batch, frame, service.depth_of(frame), CFG)
+    core.refresh(batch, batch.grid.bounds, CFG)
+    assert canonical(state) == canonical(batch)
+
+
+def test_readers_of_the_deltas_know_what_the_snapshot_says(two_rooms):
+    state, deltas = two_rooms
+    told, snapshot = read(deltas), ask(state)
+    assert [d.revision for d in deltas] == list(range(len(TWO_ROOMS_WALK)))
+    assert (snapshot.snapshot, snapshot.revision, snapshot.epoch) == (True, deltas[-1].revision, 7)
+    assert snapshot.past_frame_ids.tolist() == [d.frame_id for d in deltas]
+    np.testing.assert_allclose(snapshot.past_cameras_m, [d.camera_m for d in deltas], rtol=1e-6)
+    assert (np.diff(snapshot.place_ids) > 0).all()
+    known = Reader()
+    known.apply(snapshot)
+    assert (told.places, told.edges) == (known.places, known.edges)
+    assert sum(len(d.merged_ids) + len(d.removed_ids) for d in deltas) > 0
+
+
+def test_same_keyframes_give_the_same_bytes(two_rooms):
+    _, deltas = two_rooms
+    assert [encode(d) for d in play(start(), TWO_ROOMS_WALK)] == [encode(d) for d in deltas]
+
+
+def test_nothing_changes_when_the_same_views_come_again():
+    state = start()
+    play(state, ROOM_WALK)
+    before = ask(state)
+    again = [keyframe(100 + n, f.world_from_camera, f.depth) for n, f in enumerate(ROOM_WALK)]
+    deltas = play(state, again)
+    assert [d.frame_id for d in deltas] == [100 + n for n in range(len(ROOM_WALK))]
+    assert set(before.place_ids.tolist()) <= set(ask(state).place_ids.tolist())
+    assert sum(len(d.place_ids) for d in deltas) <= len(before.place_ids) // 4
+
+
+def test_places_keep_their_ids_when_an_obstacle_appears_elsewhere():
+    forgetful = core.Config(max_weight=2.0)
+    state = start(forgetful)
+    play(state, TWO_ROOMS_WALK, forgetful)
+    before = ask(state)
+    box = np.concatenate((TWO_ROOMS, [((0.4, 1.2, 0.0), (0.9, 1.8, 1.2))]))
+    away_from_the_door = views(1.9, 1.5, 1.3)[2]  # along -x
+    seen = render(box, away_from_the_door)
+    later = [keyframe(50 + n, away_from_the_door, seen) for n in range(12)]
+    deltas = play(state, later, forgetful)
+    told = {i for d in deltas for i in (*d.place_ids.tolist(), *d.removed_ids.tolist(), *d.merged_ids[:, 0].tolist())}
+    near = {i for i, (x, *_) in zip(before.place_ids.tolist(), before.positions_m.tolist(), strict=True) if x < 3.1}
+    assert told & near
+    assert told.isdisjoint(set(before.place_ids.tolist()) - near)
+    assert len(near & set(ask(state).place_ids.tolist())) >= len(near) // 2
+    after = read([before, *deltas])
+    known = Reader()
+    known.apply(ask(state))
+    assert (after.places, after.edges) == (known.places, known.edges)
+
+
+def test_thinning_keeps_what_is_connected_connected():
+    rng = np.random.default_rng(3)
+    voxels = rng.integers(0, 40, (60, 3))
+    squared = ((voxels[:, None] - voxels[None]) ** 2).sum(axis=2)
+    clear = np.where((squared > 0) & (squared < 14**2) & (rng.random(squared.shape) < 0.5), 9, 0).astype(np.int32)
+    clear = np.triu(clear, 1) + np.triu(clear, 1).T
+    keep = links.thinned(clear, voxels, np.zeros(clear.shape, bool), 1.0)
+    before = connected_components(csr_matrix(clear), directed=False)
+    after = connected_components(csr_matrix(keep), directed=False)
+    assert before[0] == after[0] and (before[1] == after[1]).all()
+    assert keep.sum() < np.triu(clear > 0).sum()
+
+
+# Inputs that must do no harm.
+
+
+def bad_frames() -> dict[str, Keyframe]:
+    good = ROOM_WALK[0]
+    size = (CAMERA.height_px, CAMERA.width_px)
+    png = {
+        "all zero": np.zeros(size, np.uint16),
+        "wrong size": np.full((50, 60), 1000, np.uint16),
+        "8 bit": np.full(size, 100, np.uint8),
+        "colour": np.full((*size, 3), 100, np.uint16),
+    }
+    frames = {name: cv2.imencode(".png", image)[1].tobytes() for name, image in png.items()}
+    frames |= {"not an image": b"hello", "empty": b"", "cut off": good.depth[: len(good.depth) // 3]}
+    far = np.eye(4)
+    far[0, 3] = 1e7
+    made = {name: keyframe(1000 + n, good.world_from_camera, data) for n, (name, data) in enumerate(frames.items())}
+    return made | {"beyond the index range": keyframe(2000, far, good.depth)}
+
+
+@pytest.mark.parametrize("name", list(bad_frames()))
+def test_unusable_keyframes_leave_the_map_alone_and_give_an_empty_delta(name):
+    state = start()
+    play(state, ROOM_WALK[:6])
+    before = canonical(state), encode(core.voxel_map(state, CFG))
+    frame = bad_frames()[name]
+    (delta,) = play(state, [frame])
+    assert (delta.frame_id, delta.revision) == (frame.frame_id, 6)
+    assert not any(
+        len(a) for a in (delta.place_ids, delta.removed_ids, delta.merged_ids, delta.edges, delta.removed_edges)
+    )
+    assert state.rejected == 1
+    assert (canonical(state), encode(core.voxel_map(state, CFG))) == before
+
+
+def test_a_repeated_keyframe_is_ignored(room):
+    state, _ = room
+    before = encode(ask(state))
+    assert play(state, [ROOM_WALK[3]]) == []
+    assert encode(ask(state)) == before
+
+
+def test_config_refuses_what_cannot_work():
+    for bad in ({"voxel_m": 0.0}, {"voxel_m": 0.5}, {"max_distance_m": 13.0}, {"min_range_m": 6.0}):
+        with pytest.raises(ValueError):
+            core.Config(**bad)
+
+
+# A home with exact floor polygons.
+
+
+@pytest.mark.skipif(not (DATA / "infinigen_home_a").is_dir(), reason="shared data is not here")
+def test_rooms_of_a_home_are_joined_by_their_doorways_only():
+    folder = DATA / "infinigen_home_a"
+    lens = json.loads((folder / "camera.json").read_text())
+    camera = Intrinsics(lens["width"], lens["height"], lens["fx"], lens["fy"], lens["cx"], lens["cy"])
+    state, deltas = start(), []
+    with (folder / "trajectory.csv").open() as rows:
+        for row in csv.DictReader(rows):
+            values = {key: float(value) for key, value in row.items()}
+            position = np.array([values[k] for k in ("x_m", "y_m", "z_m")])
+            pose = pose_from_quaternion(position, np.array([values[k] for k in ("qx", "qy", "qz", "qw")]))
+            depth = (folder / "depth" / f"{int(row['frame']):06d}.png").read_bytes()
+            deltas += play(state, [keyframe(int(row["frame"]), pose, depth, camera)])
+    places = ask(state)
+    rooms = {r["label"]: np.array(r["polygon_m"]) for r in json.loads((folder / "regions.json").read_text())["regions"]}
+    positions = places.positions_m.astype(float)
+    ends = positions[np.searchsorted(places.place_ids, places.edges)]
+    along = ends[:, :1] + (ends[:, 1:] - ends[:, :1]) * np.linspace(0, 1, 41)[None, :, None]
+    in_room = np.array(
+        [inside_polygon(along.reshape(-1, 3)[:, :2], p).reshape(along.shape[:2]) for p in rooms.values()]
+    )
+    assert in_room.any(axis=0).mean() > 0.999  # polygons reach into the doorways; between them lies a millimetre or so
+    names = np.array(list(rooms))
+    joined = {
+        frozenset((str(names[a]), str(names[b])))
+        for a, b in zip(in_room[:, :, 0].argmax(axis=0), in_room[:, :, -1].argmax(axis=0), strict=True)
+        if a != b
+    }
+    assert joined == {
+        frozenset(pair)
+        for pair in (
+            ("bathroom", "living room"),
+            ("bedroom", "living room"),
+            ("dining room", "kitchen"),
+            ("dining room", "living room"),
+        )
+    }
+    assert 100 <= len(places.place_ids) <= 600
+    told = read(deltas)
+    assert sorted(told.places) == places.place_ids.tolist() and len(told.edges) == len(places.edges)
