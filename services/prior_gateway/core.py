@@ -1,17 +1,18 @@
-"""From a task in plain words to a prior graph (paper, Prior Graph Extraction), by knowledge that is already written down.
+"""From a task in plain words to a prior graph (paper, Prior Graph Extraction), by knowledge already written down.
 
 A *provider* answers a task with a prior; the curated library is the first. Tasks divide an environment by merging its
 base regions. With w_i = P(r_i | E0) of the members i of a merged region m:
 
     P(m | E0)     = sum_i w_i
-    P(o | m)      = sum_i w_i P(o | r_i) / sum_i w_i            a place of m is a place of r_i with probability w_i / sum w
-    P(m <-> n)    = max_ij P(r_i <-> r_j)                       they touch where any of their members touch
+    P(o | m)      = sum_i w_i P(o | r_i) / sum_i w_i    a place of m is a place of r_i with probability w_i / sum w
+    P(m <-> n)    = max_ij P(r_i <-> r_j)               they touch where any of their members touch
     mean, std     = of the mixture of the members' inclinations (law of total variance)
     r_Q           = sum_i w_i r_Q,i / sum_i w_i
-    phrases       = union of the members' phrases
+    phrases       = of each member, the first w_i / max_j w_j of its own
 
 The maximum and not a noisy-or: that one grows with the number of members, so a coarse task would get cheap boundaries
-everywhere.
+everywhere. A task that fixes its regions says that they are there, so their P(r | E0) is drawn towards uniform: a gym
+is rare among homes, not small in a home that has one.
 """
 
 import math
@@ -41,10 +42,12 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
     unlisted_adjacency: float = 0.08
     # P(ri <-> rj) where nothing is known: a region known by name alone, or two of different environments.
     unknown_adjacency: float = 0.3
+    # Weight of the uniform distribution in P(r | E0) where the task fixes the regions.
+    named_existence_uniform: float = 0.5
     # r_Q of every region in metres; 0 takes the library's (0.75; the paper takes 1.5 in simulations without texture).
     query_radius_m: float = 0.0
-    # Observation phrases of a name; {} is the name with its article.
-    templates: list[str] = msgspec.field(default_factory=lambda: ["{}", "a picture of {}"])
+    # Phrases of a name; {} is the name with its article. Encoders add what their space asks for ("A picture of ...").
+    templates: list[str] = msgspec.field(default_factory=lambda: ["{}"])
     # Priors remembered for questions by digest; the oldest is forgotten first.
     remembered_priors: int = 256
 
@@ -126,7 +129,7 @@ def compose(
     """The prior graph over the chosen regions; `entry` adds the objects that matter to its task."""
     extra = entry.objects if entry else {}
     objects = _object_names(chosen, extra)
-    existence = _existence(chosen)
+    existence = _existence(chosen, cfg.named_existence_uniform if task.regions else 0.0)
     return Prior(
         environment=task.environment,
         task=task.task,
@@ -158,7 +161,9 @@ def with_article(name: str) -> str:
     if plural or last in MASS_NOUNS:
         return name
     first = name.casefold()
-    vowel = first.startswith(("a", "e", "i", "o", "u", "x-ray")) and not first.startswith(("uni", "use", "eu", "one"))
+    vowel = first.startswith(("a", "e", "i", "o", "u", "x-ray")) and not first.startswith(
+        ("uni", "use", "uti", "eu", "one")
+    )
     return f"{'an' if vowel else 'a'} {name}"
 
 
@@ -174,25 +179,25 @@ def _weights(one: Chosen) -> list[float]:
     return [one.environment.share(member) for member in one.members]
 
 
-def _existence(chosen: Sequence[Chosen]) -> list[float]:
-    """P(r | E0), summing to one; a region known by name alone counts as the mean of the others."""
+def _existence(chosen: Sequence[Chosen], uniform: float) -> list[float]:
+    """P(r | E0), summing to one, mixed with `uniform` parts of the uniform distribution; a region known by name alone
+    counts as the mean of the others."""
     known = [sum(_weights(one)) for one in chosen if one.environment]
     mean = sum(known) / len(known) if known else 1.0
     raw = [sum(_weights(one)) if one.environment else mean for one in chosen]
-    return [value / sum(raw) for value in raw]
+    return [uniform / len(raw) + (1 - uniform) * value / sum(raw) for value in raw]
 
 
 def _region(one: Chosen, existence: float, named: bool, cfg: Config) -> RegionPrior:
     """`named`: the given name describes the region itself, as in a fixed vocabulary; the abstract names of tasks
     ("service zone") say nothing about appearance."""
     phrases = _phrases_of(one.name, cfg) if named or not one.members else []
-    for member in one.members:
-        phrases += [*_phrases_of(member.name, cfg), *member.phrases]
     if not one.members:
         return RegionPrior(
             name=one.name, phrases=phrases, existence=existence, query_radius_m=cfg.query_radius_m or 0.75
         )
     weights = _weights(one)
+    phrases += _member_phrases(one.members, weights, cfg)
     mean, std = _mixture([(e.inclination_deg, e.inclination_std_deg) for e in one.members], weights)
     radius = _mean([member.query_radius_m for member in one.members], weights)
     parents = {member.parent for member in one.members}
@@ -205,6 +210,16 @@ def _region(one: Chosen, existence: float, named: bool, cfg: Config) -> RegionPr
         query_radius_m=cfg.query_radius_m or radius,
         parent=one.members[0].parent if len(parents) == 1 else "",
     )
+
+
+def _member_phrases(members: Sequence[RegionEntry], weights: Sequence[float], cfg: Config) -> list[str]:
+    """Name and appearance of the members, of rarer ones fewer phrases: a region's concept is the mean of its phrases'
+    embeddings, where each member should count by its share."""
+    found: list[str] = []
+    for member, weight in zip(members, weights, strict=True):
+        phrases = [*_phrases_of(member.name, cfg), *member.phrases]
+        found += phrases[: max(1, round(len(phrases) * weight / max(weights)))]
+    return found
 
 
 def _mixture(parts: Sequence[tuple[float, float]], weights: Sequence[float]) -> tuple[float, float]:

@@ -57,13 +57,14 @@ def match_environment(text: str, environments: Sequence[Environment]) -> Environ
 
 def match_task(text: str, environment: Environment) -> TaskMatch:
     """The curated task that `text` asks for: its own name, else the highest score (one point per word of every keyword
-    found), the first of equals; without any keyword the generic task. The note says which case it was."""
+    found), of equals a special one before the generic, then the first; without any keyword the generic task. The note
+    says which case it was."""
     for task in environment.tasks:
         if words(task.name) == words(text):
             return TaskMatch(task, len(words(text)), f"task {task.name!r}")
     hits = {task.name: _keywords_in(text, task) for task in environment.tasks}
     scores = {name: sum(len(stems(keyword)) for keyword in found) for name, found in hits.items()}
-    best = max(environment.tasks, key=lambda task: scores[task.name])
+    best = max(environment.tasks, key=lambda task: (scores[task.name], not task.generic))
     score = scores[best.name]
     if score == 0:
         generic = environment.generic_task
@@ -135,22 +136,23 @@ def _is_head(asked: Words, known: str) -> bool:
 
 def _first(name: str, rule: Rule, where: Sequence[Environment], taken: dict[str, str]) -> Chosen | None:
     asked = words(name)
-    for environment in where:
-        for known, members in _names_of(environment):
-            if rule(asked, known) and not any(_key(environment, member) in taken for member in members):
-                return Chosen(name, environment, members, f"{name!r} as {known!r} of {environment.name!r}")
+    for environment, known, members in _names_of(where):
+        if rule(asked, known) and not any(_key(environment, member) in taken for member in members):
+            return Chosen(name, environment, members, f"{name!r} as {known!r} of {environment.name!r}")
     return None
 
 
-def _names_of(environment: Environment) -> Iterator[tuple[str, tuple[RegionEntry, ...]]]:
+def _names_of(where: Sequence[Environment]) -> Iterator[tuple[Environment, str, tuple[RegionEntry, ...]]]:
     """Names of base regions, then their synonyms, then task regions, with the base regions behind each."""
-    for entry in environment.regions:
-        yield entry.name, (entry,)
-    for entry in environment.regions:
-        yield from ((synonym, (entry,)) for synonym in entry.synonyms)
-    for task in environment.tasks:
-        for name, members in task.regions.items():
-            yield name, tuple(environment.region(member) for member in members)
+    for environment in where:
+        yield from ((environment, entry.name, (entry,)) for entry in environment.regions)
+    for environment in where:
+        for entry in environment.regions:
+            yield from ((environment, synonym, (entry,)) for synonym in entry.synonyms)
+    for environment in where:
+        for task in environment.tasks:
+            for name, members in task.regions.items():
+                yield environment, name, tuple(environment.region(member) for member in members)
 
 
 def _key(environment: Environment | None, entry: RegionEntry) -> str:

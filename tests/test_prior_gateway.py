@@ -1,0 +1,452 @@
+"""Priors from the curated library."""
+
+import math
+from itertools import combinations
+
+import msgspec
+import numpy as np
+import pytest
+
+from schemas.codec import decode, encode
+from schemas.priors import Prior, PriorRequest, Task
+from schemas.topics import PRIOR
+from services.prior_gateway import core, library, service
+from services.prior_gateway.core import Config, Library, NoPrior, first_answer, with_article
+from services.prior_gateway.knowledge import Environment, RegionEntry, TaskEntry, check_environment
+from services.prior_gateway.matching import contains, match_environment, match_task, stems, words
+
+LIBRARY = library.load()
+CASES = [(environment, task) for environment in LIBRARY.environments for task in environment.tasks]
+CASE_NAMES = [f"{environment.name}-{task.name}" for environment, task in CASES]
+HOME = next(environment for environment in LIBRARY.environments if environment.name == "residential home")
+OFFICE = next(environment for environment in LIBRARY.environments if environment.name == "office floor")
+
+
+def asked(environment: str, task: str = "", regions: list[str] | None = None) -> Task:
+    return Task(robot="spot", stamp_ns=1, environment=environment, task=task, regions=regions or [])
+
+
+def prior_of(environment: str, task: str = "", regions: list[str] | None = None, cfg: Config | None = None) -> Prior:
+    return LIBRARY.answer(asked(environment, task, regions), cfg or Config())
+
+
+def names_of(prior: Prior) -> list[str]:
+    return [region.name for region in prior.regions]
+
+
+def touch(prior: Prior, one: str, other: str) -> float:
+    names = names_of(prior)
+    return float(prior.adjacency[names.index(one), names.index(other)])
+
+
+def held(prior: Prior, region: str, thing: str) -> float:
+    column = [item.name for item in prior.objects].index(thing)
+    return float(prior.containment[names_of(prior).index(region), column])
+
+
+# The library as a whole
+
+
+def test_names_of_environments_and_their_synonyms_are_unambiguous():
+    spoken = [words(name) for e in LIBRARY.environments for name in {e.name, *e.synonyms}]
+    doubled = {name for name in spoken if spoken.count(name) > 1}
+    shared = {
+        (one.name, other.name)
+        for one, other in combinations(LIBRARY.environments, 2)
+        if {words(n) for n in (one.name, *one.synonyms)} & {words(n) for n in (other.name, *other.synonyms)}
+    }
+    assert not shared, doubled
+
+
+@pytest.mark.parametrize("environment", LIBRARY.environments, ids=lambda environment: environment.name)
+def test_an_environment_is_found_by_its_name_and_every_synonym(environment):
+    for name in (environment.name, *environment.synonyms):
+        assert match_environment(name, LIBRARY.environments) is environment, name
+
+
+@pytest.mark.parametrize("environment", LIBRARY.environments, ids=lambda environment: environment.name)
+def test_every_region_name_and_synonym_names_one_region(environment):
+    owner: dict[tuple[str, ...], str] = {}
+    for entry in environment.regions:
+        for name in (entry.name, *entry.synonyms):
+            assert owner.setdefault(words(name), entry.name) == entry.name, name
+
+
+@pytest.mark.parametrize("environment", LIBRARY.environments, ids=lambda environment: environment.name)
+def test_tasks_differ_in_how_they_divide_the_environment(environment):
+    partitions = [{frozenset(group) for group in task.regions.values()} for task in environment.tasks]
+    assert len(partitions) >= 2
+    assert all(one != other for one, other in combinations(partitions, 2))
+
+
+@pytest.mark.parametrize(("environment", "task"), CASES, ids=CASE_NAMES)
+def test_every_task_gives_a_valid_prior(environment, task):
+    prior = prior_of(environment.name, task.name)
+    prior.check()
+    assert names_of(prior) == list(task.regions)
+    assert prior.provenance.source == "library"
+    assert prior.provenance.detail == f"{environment.name}/{task.name}@{LIBRARY.version}"
+    assert prior.answers(asked(environment.name, task.name))
+    assert np.array_equal(np.diag(prior.adjacency), np.ones(len(prior.regions)))
+    assert prior.containment.max(axis=1).min() >= 0.25, "every region holds something typical"
+    assert len({tuple(region.phrases) for region in prior.regions}) == len(prior.regions)
+    for region in prior.regions:
+        assert len(set(region.phrases)) == len(region.phrases)
+        assert 0 <= region.inclination_mean_rad < math.pi / 2
+        assert 0.2 <= region.query_radius_m <= 5
+
+
+def test_stairs_are_the_only_steep_region_of_a_home():
+    prior = prior_of("house", "real-estate listing")
+    steep = [region.name for region in prior.regions if region.inclination_mean_rad > math.radians(15)]
+    assert steep == ["staircase"]
+
+
+def test_listing_shows_the_generic_task_first():
+    shown = {listing.name: listing for listing in library.environments()}
+    assert list(shown) == sorted(shown)
+    assert next(iter(shown["residential home"].tasks)) == "real-estate listing"
+    assert shown["office floor"].regions == [entry.name for entry in OFFICE.regions]
+
+
+def test_knowledge_as_expected_of_a_home():
+    prior = prior_of("house", "real-estate listing")
+    assert {"kitchen", "dining room", "living room", "bedroom", "bathroom"} <= set(names_of(prior))
+    assert touch(prior, "kitchen", "dining room") > touch(prior, "hallway", "bedroom") - 0.1 > 0.5
+    assert touch(prior, "kitchen", "bathroom") < 0.1
+    assert held(prior, "kitchen", "refrigerator") > 10 * held(prior, "bathroom", "refrigerator")
+
+
+# Merging, by numbers worked by hand
+
+
+def small_world(**changes: object) -> Environment:
+    regions = [
+        RegionEntry(
+            name="den",
+            phrases=["a den with a sofa"],
+            existence=6,
+            objects={"sofa": 0.9},
+            adjacent={"bar": 0.4},
+            parent="day",
+        ),
+        RegionEntry(
+            name="bar",
+            phrases=["a bar with a tap", "bottles"],
+            existence=2,
+            objects={"tap": 0.5, "sofa": 0.1},
+            parent="day",
+            inclination_deg=20,
+            inclination_std_deg=3,
+            query_radius_m=1.25,
+        ),
+        RegionEntry(name="hatch", phrases=["a small hatch"], existence=2, objects={"lid": 0.7}, connects=0.6),
+    ]
+    tasks = [
+        TaskEntry(name="plan", generic=True, regions={"den": ["den"], "bar": ["bar"], "hatch": ["hatch"]}),
+        TaskEntry(
+            name="drink",
+            keywords=["serve drinks"],
+            regions={"front": ["den", "bar"], "back": ["hatch"]},
+            objects={"glass": {"bar": 0.8}},
+        ),
+    ]
+    fields = {"name": "pub", "regions": regions, "tasks": tasks, "objects": {"tap": ["a beer tap"]}} | changes
+    return Environment(**fields)
+
+
+def small_library(environment: Environment | None = None) -> Library:
+    return Library(environments=(environment or small_world(),), version="0")
+
+
+def test_merged_regions_by_hand():
+    check_environment(small_world())
+    prior = small_library().answer(asked("pub", "drink"), Config(unlisted_containment=0.04))
+    front, back = prior.regions
+    # w = 0.6, 0.2 of the whole, so 3/4 and 1/4 of the merged region
+    assert (front.existence, back.existence) == pytest.approx((0.8, 0.2))
+    assert held(prior, "front", "sofa") == pytest.approx(0.75 * 0.9 + 0.25 * 0.1)
+    assert held(prior, "front", "tap") == pytest.approx(0.75 * 0.04 + 0.25 * 0.5)
+    assert held(prior, "front", "glass") == pytest.approx(0.75 * 0.04 + 0.25 * 0.8)
+    assert held(prior, "back", "lid") == pytest.approx(0.7)
+    assert touch(prior, "front", "back") == pytest.approx(0.6)  # the hatch connects
+    # den: (0, 11.5), bar: (20, 3): mean 5; variance 3/4 (11.5^2 + 25) + 1/4 (9 + 225) = 176.4375
+    assert math.degrees(front.inclination_mean_rad) == pytest.approx(5)
+    assert math.degrees(front.inclination_std_rad) == pytest.approx(math.sqrt(176.4375))
+    assert front.query_radius_m == pytest.approx(0.75 * 0.75 + 0.25 * 1.25)
+    assert (front.parent, back.parent) == ("day", "")
+
+
+def test_a_merged_region_looks_like_its_members_by_their_share():
+    front = small_library().answer(asked("pub", "drink"), Config()).regions[0]
+    # both phrases of the den; of the bar's three the first third
+    assert front.phrases == ["a den", "a den with a sofa", "a bar"]
+
+
+def test_existence_of_fixed_regions_is_half_uniform():
+    prior = small_library().answer(asked("pub", "", ["den", "bar"]), Config())
+    assert [region.existence for region in prior.regions] == pytest.approx([0.5 * 0.5 + 0.5 * 0.75, 0.25 + 0.125])
+
+
+def test_adjacency_listed_connecting_and_default():
+    prior = small_library().answer(asked("pub", "plan"), Config(unlisted_adjacency=0.05))
+    assert touch(prior, "den", "bar") == pytest.approx(0.4)
+    assert touch(prior, "den", "hatch") == pytest.approx(0.6)
+    plain = msgspec.structs.replace(small_world().regions[2], connects=None)
+    world = small_world(regions=[*small_world().regions[:2], plain])
+    prior = small_library(world).answer(asked("pub", "plan"), Config(unlisted_adjacency=0.05))
+    assert touch(prior, "bar", "hatch") == pytest.approx(0.05)
+
+
+def test_objects_have_their_names_and_further_phrases():
+    prior = small_library().answer(asked("pub", "plan"), Config(templates=["{}", "here is {}"]))
+    phrases = {item.name: item.phrases for item in prior.objects}
+    assert phrases["tap"] == ["a tap", "here is a tap", "a beer tap"]
+    assert "glass" not in phrases, "an object of another task"
+
+
+def test_query_radius_of_the_configuration_holds_everywhere():
+    prior = prior_of("house", "", ["kitchen", "airlock"], cfg=Config(query_radius_m=1.5))
+    assert [region.query_radius_m for region in prior.regions] == [1.5, 1.5]
+
+
+@pytest.mark.parametrize(
+    ("broken", "says"),
+    [
+        ({"tasks": [TaskEntry(name="plan", generic=True, regions={"den": ["den"], "bar": ["bar"]})]}, "partition"),
+        ({"tasks": [TaskEntry(name="plan", regions={"all": ["den", "bar", "hatch"]})]}, "generic"),
+        ({"regions": [*small_world().regions, small_world().regions[0]]}, "unique"),
+        ({"regions": [msgspec.structs.replace(r, objects={"x": 1.5}) for r in small_world().regions]}, "probability"),
+        ({"regions": [msgspec.structs.replace(r, adjacent={"moon": 0.5}) for r in small_world().regions]}, "moon"),
+        ({"regions": [msgspec.structs.replace(r, phrases=[]) for r in small_world().regions]}, "phrases"),
+    ],
+)
+def test_contradictions_are_named(broken, says):
+    with pytest.raises(ValueError, match=says):
+        check_environment(small_world(**broken))
+
+
+# Plain words
+
+
+@pytest.mark.parametrize(
+    ("text", "task"),
+    [
+        ("list this home for sale", "real-estate listing"),
+        ("serve drinks to guests", "hospitality service"),
+        ("Serving our guests a glass of wine", "hospitality service"),
+        ("hospitality", "hospitality service"),
+        ("find the leaking pipe and repair it", "facility maintenance"),
+        ("vacuum the living room", "cleaning"),
+        ("patrol the house at night", "security patrol"),
+        ("assist my grandmother with her medication", "elderly care"),
+    ],
+)
+def test_tasks_of_a_home(text, task):
+    match = match_task(text, HOME)
+    assert (match.task.name, match.score > 0) == (task, True), match.note
+
+
+@pytest.mark.parametrize(
+    ("text", "task"),
+    [
+        ("deliver parcels and refreshments", "deliver parcels and refreshments"),
+        ("bring coffee to the meeting room", "deliver parcels and refreshments"),
+        ("clean the meeting room at night", "night cleaning"),
+        ("repair the air conditioning", "facility maintenance"),
+        ("draw a floor plan", "floor plan"),
+    ],
+)
+def test_tasks_of_an_office(text, task):
+    assert match_task(text, OFFICE).task.name == task
+
+
+def test_a_delivery_tells_the_rooms_of_an_open_office_apart():
+    wanted = {"corridor", "lounge", "kitchen", "dining area", "games area", "workspace", "meeting room", "reception"}
+    assert wanted <= set(names_of(prior_of("open-plan office", "deliver parcels and refreshments")))
+
+
+def test_an_unknown_task_falls_back_to_the_generic_one_and_says_so():
+    prior = prior_of("my flat", "compose a symphony")
+    assert names_of(prior) == list(HOME.generic_task.regions)
+    assert "'compose a symphony'" in prior.provenance.note
+    assert "fell back to the generic task 'real-estate listing'" in prior.provenance.note
+    assert "no task was given" in prior_of("my flat").provenance.note
+
+
+def test_of_equal_scores_the_special_task_wins():
+    generic = TaskEntry(name="plan", generic=True, keywords=["door"], regions={"all": ["den", "bar", "hatch"]})
+    special = TaskEntry(name="lock up", keywords=["lock"], regions=small_world().tasks[0].regions)
+    assert match_task("lock the door", small_world(tasks=[generic, special])).task is special
+
+
+def test_an_unknown_environment_has_a_reason():
+    with pytest.raises(NoPrior, match=r"no environment like 'coral reef'; it knows .*residential home"):
+        prior_of("coral reef", "serve drinks")
+
+
+def test_the_head_of_a_name_decides_the_environment():
+    assert match_environment("a home office", LIBRARY.environments) is OFFICE
+    assert match_environment("The small HOUSE of my parents", LIBRARY.environments) is HOME
+
+
+def test_words_and_stems():
+    assert words("The kid's dining-rooms, 2 boxes") == ("kid", "dining", "room", "box")
+    assert stems("serving") == stems("served") == stems("serve")
+    assert contains(words("a big dining room"), words("dining rooms"))
+    assert not contains(words("room for dining"), words("dining room"))
+    assert not contains(words("anything"), ())
+
+
+@pytest.mark.parametrize(
+    ("name", "phrase"),
+    [
+        ("stove", "a stove"),
+        ("oven", "an oven"),
+        ("stairs", "stairs"),
+        ("office chair", "an office chair"),
+        ("clothing", "clothing"),
+        ("glass", "a glass"),
+        ("utility room", "a utility room"),
+        ("umbrella stand", "an umbrella stand"),
+        ("x-ray machine", "an x-ray machine"),
+    ],
+)
+def test_articles(name, phrase):
+    assert with_article(name) == phrase
+
+
+# Fixed vocabularies
+
+
+def test_a_fixed_vocabulary_keeps_names_and_order():
+    regions = ["quiet area", "games area", "sun lounge", "flux chamber", "kitchen", "dining area", "entrance"]
+    prior = prior_of("small house", "tidy up", regions)
+    prior.check()
+    assert names_of(prior) == prior.vocabulary == regions
+    assert prior.answers(asked("small house", "tidy up", regions))
+    by_name = {region.name: region for region in prior.regions}
+    assert "a bookcase full of books" in by_name["quiet area"].phrases
+    assert by_name["quiet area"].phrases[:2] == ["a quiet area", "a reading nook"]
+    assert by_name["flux chamber"].phrases == ["a flux chamber"]
+    assert "'flux chamber' from its name alone" in prior.provenance.note
+
+
+def test_a_name_that_nobody_knows_gets_uniform_matrices():
+    prior = prior_of("house", "", ["kitchen", "flux chamber", "bedroom"])
+    row = prior.containment[1]
+    assert row.size and np.ptp(row) == 0, "no object speaks for or against it"
+    assert np.array_equal(prior.adjacency[1], np.array([0.3, 1.0, 0.3], np.float32))
+    existence = [region.existence for region in prior.regions]
+    assert existence[1] == pytest.approx((existence[0] + existence[2]) / 2)
+
+
+def test_a_fixed_vocabulary_reads_what_the_environment_knows():
+    prior = prior_of("office", "", ["corridor", "lounge", "kitchen", "dining area", "games area"])
+    expected = OFFICE.region("kitchen").adjacent
+    assert touch(prior, "kitchen", "dining area") == pytest.approx(expected["dining area"])
+    assert touch(prior, "kitchen", "lounge") == pytest.approx(expected["lounge"])
+    assert held(prior, "games area", "football table") > 0.5 > held(prior, "kitchen", "football table")
+
+
+def test_a_region_of_another_environment_is_found_there():
+    prior = prior_of("house", "", ["kitchen", "meeting room", "hallway"])
+    assert "conference table" in [item.name for item in prior.objects]
+    # a meeting room lies at a hallway as it does at its counterpart, the corridor of an office
+    assert touch(prior, "meeting room", "hallway") == pytest.approx(OFFICE.region("corridor").adjacent["meeting room"])
+
+
+def test_two_names_for_one_entry_share_it_and_say_so():
+    prior = small_library().answer(asked("pub", "", ["upper bar", "lower bar"]), Config())
+    assert "shared with 'upper bar'" in prior.provenance.note
+    assert touch(prior, "upper bar", "lower bar") == pytest.approx(Config().unknown_adjacency)
+    assert prior.regions[0].phrases != prior.regions[1].phrases
+
+
+def test_a_fixed_vocabulary_needs_no_known_environment():
+    prior = prior_of("coral reef", "", ["kitchen", "anemone garden plot"])
+    prior.check()
+    assert "no environment like 'coral reef'" in prior.provenance.note
+
+
+@pytest.mark.parametrize("regions", [["kitchen", "kitchen"], ["kitchen", " "], ["?!"]])
+def test_a_vocabulary_must_be_distinct_words(regions):
+    with pytest.raises(NoPrior, match="only once"):
+        prior_of("house", "", regions)
+
+
+# Identity, providers, service
+
+
+def test_digest_depends_on_the_question_and_nothing_else():
+    one = prior_of("house", "serve drinks to guests")
+    again = Library(environments=library.load().environments, version=LIBRARY.version).answer(
+        Task(robot="other", stamp_ns=99, environment="house", task="serve drinks to guests"), Config()
+    )
+    assert one.digest() == again.digest()
+    assert encode(one) == encode(again)
+    assert decode(Prior, encode(one)).digest() == one.digest()
+    assert prior_of("house", "clean").digest() != one.digest()
+    assert prior_of("house", "serve drinks to guests", ["kitchen"]).digest() != one.digest()
+
+
+class Silent:
+    name = "silent"
+
+    def answer(self, task: Task, cfg: Config) -> Prior:
+        raise NoPrior("Nobody answers at this endpoint.")
+
+
+def test_the_next_provider_answers_and_tells_why_the_first_did_not():
+    prior = first_answer([Silent(), LIBRARY], asked("house", "clean"), Config())
+    assert prior.provenance.source == "library"
+    assert prior.provenance.note.startswith("Nobody answers at this endpoint. ")
+    with pytest.raises(NoPrior, match=r"endpoint\. The library knows no environment"):
+        first_answer([Silent(), LIBRARY], asked("coral reef"), Config())
+    with pytest.raises(NoPrior, match="No provider"):
+        first_answer([], asked("house"), Config())
+
+
+@pytest.fixture
+def state() -> service.State:
+    return service.State(providers=(LIBRARY,))
+
+
+def test_step_publishes_one_prior_per_task(state):
+    task = asked("house", "list this home for sale")
+    outputs = list(service.step(state, task, Config()))
+    assert [topic for topic, _ in outputs] == [PRIOR]
+    prior = outputs[0][1]
+    assert prior.answers(task)
+    again = list(service.step(state, task, Config()))
+    assert encode(again[0][1]) == encode(prior)
+    assert list(service.step(state, prior, Config())) == []
+
+
+def test_answers_by_digest_by_question_and_with_reasons(state):
+    [(_, prior)] = service.step(state, asked("house", "clean"), Config())
+    found = service.answer(state, PriorRequest(digest=prior.digest()), Config())
+    assert encode(found.priors[0]) == encode(prior)
+    by_question = service.answer(state, PriorRequest(environment="house", task="clean"), Config())
+    assert by_question.priors[0].digest() == prior.digest()
+    missing = service.answer(state, PriorRequest(digest="00"), Config())
+    assert (missing.priors, "digest 00" in missing.reason) == ([], True)
+    assert list(service.step(state, asked("coral reef"), Config())) == []
+    for environment in ("coral reef", "another reef"):  # one asked for in a task, one only here
+        refused = service.answer(state, PriorRequest(environment=environment), Config())
+        assert (refused.priors, f"no environment like {environment!r}" in refused.reason) == ([], True)
+
+
+def test_memory_forgets_the_oldest(state):
+    cfg = Config(remembered_priors=2)
+    digests = [
+        next(iter(service.step(state, asked("house", task), cfg)))[1].digest() for task in ("clean", "patrol", "sell")
+    ]
+    assert list(state.priors) == digests[1:]
+
+
+def test_service_starts_with_the_library_and_the_library_first():
+    started = service.init(Config(), None)
+    assert [provider.name for provider in started.providers] == ["library"]
+    assert started.providers[0].version == LIBRARY.version
+    assert isinstance(started.providers[0], core.Library)
