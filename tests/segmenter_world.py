@@ -14,7 +14,7 @@ from schemas.regions import RegionDelta
 ROOM_M = 4.0  # rooms are squares; room i spans x in [4 i, 4 i + 4], y in [0, 4]
 DOOR_M = (1.5, 2.5)  # doorways lie at these y
 CAMERA = Intrinsics(width_px=64, height_px=48, fx_px=40.0, fy_px=40.0, cx_px=31.5, cy_px=23.5)
-SPACE = "conse/efficientnet-lite0/minilm-l6-v2"
+SPACE = "conse/efficientnet-lite2/minilm-l6-v2"
 DIM = 6
 ROBOT = "r1"
 

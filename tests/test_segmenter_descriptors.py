@@ -26,15 +26,14 @@ def literal_kernel(message, position_world, radius_m, gamma):
     return np.array(weights), sum(scale * peak for peak, scale in best.values()), feature
 
 
-def gather(frames, positions, order=None, radii_m=None):
+def gather(frames, positions, order=None):
     """Evidence of places from frames."""
     evidence, archive = Evidence(), Archive()
     for index in range(len(frames)) if order is None else order:
         archive.add(frames[index].frame_id, descriptors.compact(frames[index]))
     ids = list(range(len(positions)))
     evidence.add(ids)
-    radii_m = np.full(len(ids), 0.5) if radii_m is None else radii_m
-    targets = Targets(evidence.of(ids), positions.astype(float), radii_m)
+    targets = Targets(evidence.of(ids), positions.astype(float))
     descriptors.integrate_all(evidence, archive, targets, RADIUS_M, CFG)
     return evidence, targets
 
@@ -72,7 +71,7 @@ def test_descriptor_is_the_trust_weighted_mean_over_frames():
     place = 5
     total, trusts = np.zeros(DIM), []
     for message in frames:
-        if place in descriptors.visible(descriptors.compact(message), targets.positions_m, targets.radii_m, CFG):
+        if place in descriptors.visible(descriptors.compact(message), targets.positions_m, CFG):
             _, trust, feature = literal_kernel(message, positions[place], RADIUS_M, CFG.gamma)
             total += trust * feature
             trusts.append(trust)
@@ -82,23 +81,22 @@ def test_descriptor_is_the_trust_weighted_mean_over_frames():
 
 
 CAMERA_AT_ORIGIN = look(0.0, 0.0, 0.0)  # looks along x at height 1
-VISIBILITY = [  # position, radius, seen; the surface lies at x = 3
-    ("in front", (2.0, 0.0, 1.0), 0.5, True),
-    ("behind the camera", (-2.0, 0.0, 1.0), 0.5, False),
-    ("nearer than min_depth_m", (0.2, 0.0, 1.0), 0.5, False),
-    ("left of the image", (2.0, 1.7, 1.0), 0.5, False),
-    ("inside at the left border", (2.0, 1.55, 1.0), 0.5, True),
-    ("above the image", (2.0, 0.0, 2.3), 0.5, False),
-    ("behind the wall", (4.0, 0.0, 1.0), 0.5, False),
-    ("behind the wall within tolerance", (3.25, 0.0, 1.0), 0.1, True),
-    ("as far behind as half its radius", (3.9, 0.0, 1.0), 2.0, True),
+VISIBILITY = [  # position, seen; the surface lies at x = 3
+    ("in front", (2.0, 0.0, 1.0), True),
+    ("behind the camera", (-2.0, 0.0, 1.0), False),
+    ("nearer than min_depth_m", (0.2, 0.0, 1.0), False),
+    ("left of the image", (2.0, 1.7, 1.0), False),
+    ("inside at the left border", (2.0, 1.55, 1.0), True),
+    ("above the image", (2.0, 0.0, 2.3), False),
+    ("behind the wall", (4.0, 0.0, 1.0), False),
+    ("behind the wall within tolerance", (3.25, 0.0, 1.0), True),
 ]
 
 
-@pytest.mark.parametrize("name, position, radius_m, seen", VISIBILITY, ids=[case[0] for case in VISIBILITY])
-def test_visibility(name, position, radius_m, seen):
+@pytest.mark.parametrize("name, position, seen", VISIBILITY, ids=[case[0] for case in VISIBILITY])
+def test_visibility(name, position, seen):
     message = pyramid(0, CAMERA_AT_ORIGIN, rooms=1, surface_m=np.full((12, 16), 3.0, dtype=np.float32))
-    rows = descriptors.visible(descriptors.compact(message), np.array([position]), np.array([radius_m]), CFG)
+    rows = descriptors.visible(descriptors.compact(message), np.array([position]), CFG)
     assert (len(rows) == 1) == seen
 
 
@@ -106,7 +104,7 @@ def test_beyond_the_depth_range_nothing_is_seen():
     message = pyramid(0, CAMERA_AT_ORIGIN, rooms=1, surface_m=np.full((12, 16), 50.0, dtype=np.float32))
     frame = descriptors.compact(message)
     for depth_m, count in ((CFG.max_depth_m - 0.1, 1), (CFG.max_depth_m + 0.1, 0)):
-        assert len(descriptors.visible(frame, np.array([(depth_m, 0.0, 1.0)]), np.array([0.5]), CFG)) == count
+        assert len(descriptors.visible(frame, np.array([(depth_m, 0.0, 1.0)]), CFG)) == count
 
 
 def test_a_hole_takes_the_depth_of_the_nearest_measured_cell():
@@ -121,14 +119,14 @@ def test_a_hole_takes_the_depth_of_the_nearest_measured_cell():
 
 def test_without_any_depth_nothing_is_seen():
     message = pyramid(0, CAMERA_AT_ORIGIN, rooms=1, surface_m=np.zeros((12, 16), dtype=np.float32))
-    rows = descriptors.visible(descriptors.compact(message), np.array([(2.0, 0.0, 1.0)]), np.array([0.5]), CFG)
+    rows = descriptors.visible(descriptors.compact(message), np.array([(2.0, 0.0, 1.0)]), CFG)
     assert len(rows) == 0
 
 
 def test_a_wall_hides_the_room_behind_it():
     positions, _ = place_grid(2)
     frame = descriptors.compact(pyramid(0, look(3.0, 3.5, 0.0), rooms=2))  # faces the wall beside the doorway
-    seen = descriptors.visible(frame, positions.astype(float), np.full(len(positions), 0.5), CFG)
+    seen = descriptors.visible(frame, positions.astype(float), CFG)
     assert len(seen) > 0
     assert (positions[seen, 0] <= 4.0).all()
 
@@ -141,7 +139,7 @@ def test_frustum_candidates_miss_no_frame_that_sees_a_place():
         archive.add(message.frame_id, descriptors.compact(message))
     for row in range(0, len(positions), 5):
         place = positions[row : row + 1].astype(float)
-        seeing = [i for i, f in enumerate(archive.frames) if len(descriptors.visible(f, place, np.array([0.5]), CFG))]
+        seeing = [i for i, f in enumerate(archive.frames) if len(descriptors.visible(f, place, CFG))]
         assert set(seeing) <= set(archive.candidates(place, CFG).tolist())
         assert len(archive.candidates(place, CFG)) < len(frames)
 

@@ -28,7 +28,7 @@ UNLABELLED = -1
 class Config(msgspec.Struct, frozen=True, kw_only=True):
     """Settings of the segmenter. Those marked (paper) are published values; the others were chosen here."""
 
-    space: str = "conse/efficientnet-lite0/minilm-l6-v2"  # embedding space of the evidence; other pyramids are ignored
+    space: str = "conse/efficientnet-lite2/minilm-l6-v2"  # embedding space of the evidence; other pyramids are ignored
     kernel: descriptors.KernelConfig = msgspec.field(default_factory=descriptors.KernelConfig)
     default_query_radius_m: float = 0.75  # r_Q until a prior is in force (paper)
     experts: dict[str, float] = msgspec.field(  # names, with their reliabilities lambda (paper)
@@ -36,7 +36,7 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
     )
     beta: float = 2.0  # weight of the pairwise term (paper)
     edge_decay_m: float = 2.0  # w_dist = exp(-length / edge_decay_m)
-    edge_clearance_m: float = 0.0  # > 0: w_dist is also multiplied by min(clearance / edge_clearance_m, 1)
+    edge_clearance_m: float = 0.0  # > 0: w_dist times min(clearance / edge_clearance_m, 1); no gain seen, so off
     probability_floor: float = 1e-6  # least probability in a logarithm, so that every cost is finite
     object_phrases: int = 0  # objects whose phrases join a region's concept, the most discriminative first
     trust_half: float = 0.5  # sum of trust at which half of the unknown mass is left
@@ -433,7 +433,7 @@ def _reintegrate(state: State, rows: np.ndarray, cfg: Config) -> None:
 def _targets(state: State, rows: np.ndarray) -> descriptors.Targets:
     graph = state.graph
     slots = state.evidence.of(graph.ids[rows].tolist())
-    return descriptors.Targets(slots, graph.positions_m[rows], graph.radii_m[rows])
+    return descriptors.Targets(slots, graph.positions_m[rows])
 
 
 def _concept_key(concepts: list[list[str]]) -> tuple[str, ...]:

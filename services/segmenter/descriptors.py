@@ -24,8 +24,9 @@ class KernelConfig(msgspec.Struct, frozen=True, kw_only=True):
     min_depth_m: float = 0.3  # places closer to the camera plane are not observed
     max_depth_m: float = 10.0  # nor places further away
     border_share: float = 0.0  # share of the image's sides, at its border, in which places are not observed
-    occlusion_tolerance_m: float = 0.3  # a place may lie this far behind the depth surface,
-    occlusion_tolerance_radii: float = 0.5  # or this share of its own radius, which is free of obstacles
+    occlusion_tolerance_m: float = (
+        0.3  # a place may lie this far behind the depth surface; less than wall and clearance
+    )
 
     def __post_init__(self) -> None:
         if not (self.gamma > 0 and 0 <= self.min_depth_m < self.max_depth_m and 0 <= self.border_share < 0.5):
@@ -80,11 +81,11 @@ def project(frame: Frame, positions_m: np.ndarray) -> tuple[np.ndarray, np.ndarr
     return pixels, depths_m
 
 
-def visible(frame: Frame, positions_m: np.ndarray, radii_m: np.ndarray, cfg: KernelConfig) -> np.ndarray:
+def visible(frame: Frame, positions_m: np.ndarray, cfg: KernelConfig) -> np.ndarray:
     """Rows of the places that the frame observes: in front, inside the image, and not behind the depth surface.
 
-    A place counts as hidden when its centre lies behind the surface at its pixel by more than the tolerance. Its sphere
-    holds no obstacle, so a surface nearer than its radius to the centre is an error of depth or of the coarse surface.
+    A place counts as hidden when its centre lies behind the surface at its pixel by more than the tolerance, which
+    covers the errors of depth and of the coarse surface.
     """
     pixels, depths_m = project(frame, positions_m)
     size = np.array((frame.intrinsics.width_px, frame.intrinsics.height_px))
@@ -94,8 +95,7 @@ def visible(frame: Frame, positions_m: np.ndarray, radii_m: np.ndarray, cfg: Ker
     rows = np.flatnonzero(seen)
     cells = ((pixels[rows] + 0.5) / size * frame.surface_m.shape[::-1]).astype(np.int64)
     surface_m = frame.surface_m[cells[:, 1], cells[:, 0]]
-    tolerance_m = np.maximum(cfg.occlusion_tolerance_m, cfg.occlusion_tolerance_radii * radii_m[rows])
-    return rows[(surface_m > 0) & (depths_m[rows] - tolerance_m <= surface_m)]
+    return rows[(surface_m > 0) & (depths_m[rows] - cfg.occlusion_tolerance_m <= surface_m)]
 
 
 def kernel(frame: Frame, positions_m: np.ndarray, query_radius_m: float, gamma: float) -> tuple[np.ndarray, np.ndarray]:
@@ -231,7 +231,6 @@ class Targets(NamedTuple):
 
     slots: np.ndarray  # (place,)
     positions_m: np.ndarray  # (place, 3)
-    radii_m: np.ndarray  # (place,)
 
 
 def integrate(
@@ -240,7 +239,7 @@ def integrate(
     """Add one frame to the evidence of the targets that it observes; returns their rows."""
     if not len(frame.sigmas_px):
         return np.zeros(0, dtype=np.int64)
-    rows = visible(frame, targets.positions_m, targets.radii_m, cfg)
+    rows = visible(frame, targets.positions_m, cfg)
     if len(rows):
         weights, trust = kernel(frame, targets.positions_m[rows], query_radius_m, cfg.gamma)
         evidence.observe(targets.slots[rows], frame, weights, trust)

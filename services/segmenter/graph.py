@@ -35,7 +35,7 @@ class Step:
 
     graph: PlaceGraph
     previous: np.ndarray  # (place,) row of each place in the former graph, -1 = new
-    moved: np.ndarray  # (place,) bool: new, or position or radius differ
+    moved: np.ndarray  # (place,) bool: new, or the position differs
     removed: np.ndarray  # (removed,) ids that are gone
 
 
@@ -56,7 +56,6 @@ def apply(graph: PlaceGraph, delta: PlaceDelta, replaces: bool) -> Step:
     after.positions_m[rows], after.radii_m[rows] = delta.positions_m, delta.radii_m
     moved = ~old
     moved[old] = (after.positions_m[old] != graph.positions_m[known[old]]).any(axis=1)
-    moved[old] |= after.radii_m[old] != graph.radii_m[known[old]]
     _join_edges(graph, after, delta, merged, replaces)
     return Step(graph=after, previous=known, moved=moved, removed=np.setdiff1d(graph.ids, ids))
 

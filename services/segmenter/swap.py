@@ -81,7 +81,7 @@ def swap_pair(
     alpha, beta = pair
     rows = np.flatnonzero(members)
     local = np.cumsum(members) - 1
-    inner = np.flatnonzero(members[field.edges].all(axis=1))
+    inner = np.flatnonzero(members[field.edges[:, 0]] & members[field.edges[:, 1]])
     edges = local[field.edges[inner]]
     weights = field.weights[inner] * field.pairwise[alpha, beta]
     costs = field.unary[rows][:, pair] + _border_costs(field, labels, members, local, pair)
