@@ -162,7 +162,7 @@ def cmd_run(arguments: argparse.Namespace) -> int:
         speed=arguments.speed,
         settings=arguments.set,
         config=arguments.config,
-        on_pids=lambda pids: console.print(
+        on_started=lambda endpoint, pids: console.print(
             f"{len(pids)} service processes: " + ", ".join(f"{name} {pid}" for name, pid in sorted(pids.items()))
         ),
     )
@@ -259,6 +259,8 @@ def cmd_export(arguments: argparse.Namespace) -> int:
 
     voxels = None
     if arguments.database is not None:
+        if not arguments.database.exists():
+            raise UserError(f"{arguments.database} does not exist; `run` and `up` write it as scene.sqlite")
         scene = report.scene_in(arguments.database, arguments.robot)
     else:
         with _client(arguments.connect) as client:
@@ -409,10 +411,14 @@ def main(argv: list[str] | None = None) -> int:
     from services.runtime.bus import BusError
     from services.runtime.config import ConfigError
     from services.runtime.record import LogError
+    from services.runtime.service import ServiceError
 
     try:
         return globals()[f"cmd_{arguments.command}"](arguments)
-    except (UserError, RunError, ChildFailed, BusError, ConfigError, LogError, SourceError) as error:
+    except BrokenPipeError:  # the reader of a pipe has left
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    except (UserError, RunError, ChildFailed, BusError, ConfigError, LogError, SourceError, ServiceError) as error:
         print(f"prior-sg: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:

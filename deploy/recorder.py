@@ -8,24 +8,26 @@ from collections.abc import Callable
 from pathlib import Path
 
 from deploy.client import Client
-from schemas.codec import DecodeError, decode
+from schemas.codec import DecodeError, Message, decode
 from schemas.status import Consumed
-from schemas.topics import JOURNAL, TOPICS, Topic
+from schemas.topics import TOPICS, Topic
 from services.registry import SERVICES
 from services.runtime.bus import Sample
 from services.runtime.record import LogWriter
 
 FLUSH_S = 1.0
+Tap = Callable[[Sample, Message], None]
 
 
 class Recorder:
-    """Subscribes at once; writes on a thread of its own until `close`. `taps` see every sample on that thread."""
+    """Subscribes at once; writes on its own thread until `close`. `taps` see every valid message on that thread."""
 
     def __init__(self, client: Client, path: Path) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         self._log = LogWriter(path)
-        self.taps: list[Callable[[Sample], None]] = []
+        self.taps: list[Tap] = []
         self.counts: Counter[str] = Counter()
+        self.malformed: Counter[str] = Counter()
         self.attachments: dict[str, tuple[str, bytes]] = {}  # name: media type and content, written at the end
         self._queue: queue.SimpleQueue[Sample | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._write, name="recorder")
@@ -58,13 +60,19 @@ class Recorder:
                 flushed_s = time.monotonic()
 
     def _add(self, sample: Sample) -> None:
+        """Record what is valid; what is not never reached any service's state either."""
+        try:
+            message = decode(sample.topic.type, sample.payload)
+        except DecodeError:
+            self.malformed[sample.topic.name] += 1
+            return
         self.counts[sample.topic.name] += 1
         if sample.writer:
             self._log.add(
                 sample.topic, sample.key, sample.payload, sample.writer, sample.sequence, sample.sent_ns, time.time_ns()
             )
         for tap in self.taps:
-            tap(sample)
+            tap(sample, message)
 
 
 class Settling:
@@ -75,32 +83,25 @@ class Settling:
         self._readers = [
             (service.name, topic.name) for service in SERVICES for topic in service.reads if topic.name in self._topics
         ]
-        self._published: dict[tuple[str, str], int] = {}
-        self._consumed: dict[tuple[str, str, str], int] = {}
+        self._published: dict[tuple[str, str, str], int] = {}  # newest by topic, key, writer
+        self._consumed: dict[tuple[str, str, str], int] = {}  # newest by service, key, writer
         self.changed_s = time.monotonic()
 
-    def __call__(self, sample: Sample) -> None:
-        """See one recorded sample."""
-        if sample.topic is JOURNAL:
-            self._saw_journal(sample)
-        elif sample.topic.name in self._topics and sample.writer:
-            self._published[sample.topic.name, sample.writer] = sample.sequence
-            self.changed_s = time.monotonic()
-
-    def _saw_journal(self, sample: Sample) -> None:
-        try:
-            entry = decode(Consumed, sample.payload)
-        except DecodeError:
-            return
-        if entry.writer:
-            name = (entry.service, entry.topic, entry.writer)
-            self._consumed[name] = max(entry.sequence, self._consumed.get(name, -1))
+    def __call__(self, sample: Sample, message: Message) -> None:
+        """See one recorded message."""
+        match message:
+            case Consumed() if message.writer:
+                name = (message.service, message.key, message.writer)
+                self._consumed[name] = max(message.sequence, self._consumed.get(name, -1))
+            case _ if sample.topic.name in self._topics and sample.writer:
+                self._published[sample.topic.name, sample.key, sample.writer] = sample.sequence
+                self.changed_s = time.monotonic()
 
     def settled(self, quiet_s: float) -> bool:
         """Nothing waits anywhere, and nothing new has been published for a while."""
         behind = any(
-            self._consumed.get((service, topic, writer), -1) < newest
-            for (topic, writer), newest in list(self._published.items())
+            self._consumed.get((service, key, writer), -1) < newest
+            for (topic, key, writer), newest in list(self._published.items())
             for service, read in self._readers
             if read == topic
         )

@@ -71,7 +71,7 @@ class Log:
             if logged.topic is JOURNAL:
                 journal.append(decode(Consumed, logged.payload))
                 continue
-            self.messages[logged.topic.name, logged.writer, logged.sequence] = logged
+            self.messages[logged.key, logged.writer, logged.sequence] = logged
             self.order.append(logged)
             if logged.topic is KEYFRAME:
                 self.frames[decode(Keyframe, logged.payload).frame_id] = logged
@@ -89,7 +89,7 @@ class Log:
         elif not entry.writer:
             return decode(topic.type, entry.inline)
         else:
-            logged = self.messages.get((entry.topic, entry.writer, entry.sequence))
+            logged = self.messages.get((entry.key, entry.writer, entry.sequence))
         if logged is None:
             raise LogError(f"the log lacks {entry.topic} {entry.sequence} of {entry.writer}, which was consumed")
         return decode(topic.type, logged.payload)
@@ -97,11 +97,11 @@ class Log:
     def recorded(self, life: Life) -> dict[str, list[Message]]:
         """What this life published, by topic, in order."""
         writer = f"{life.service}/{life.instance}/{life.started.epoch}"
-        outputs: dict[str, list[tuple[int, Message]]] = {}
-        for (name, by, sequence), logged in self.messages.items():
-            if by == writer:
-                outputs.setdefault(name, []).append((sequence, decode(logged.topic.type, logged.payload)))
-        return {name: [message for _, message in sorted(found, key=lambda f: f[0])] for name, found in outputs.items()}
+        outputs: dict[str, list[Message]] = {}
+        for logged in self.order:
+            if logged.writer == writer:
+                outputs.setdefault(logged.topic.name, []).append(decode(logged.topic.type, logged.payload))
+        return outputs
 
 
 def replay_life(log: Log, life: Life) -> Iterator[tuple[Topic, Message]]:

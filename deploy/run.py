@@ -1,5 +1,6 @@
 """The main job: start everything, stream a source, wait until all is settled, write the results."""
 
+import contextlib
 import signal
 import threading
 import time
@@ -14,7 +15,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn
 from deploy.client import Client
 from deploy.recorder import Recorder, Settling
 from deploy.supervisor import Supervisor
-from schemas.codec import DecodeError, decode, encode
+from schemas.codec import DecodeError, Message, decode, encode
 from schemas.features import Pyramid
 from schemas.frames import IngestState, Keyframe
 from schemas.places import MapRequest, VoxelMap
@@ -62,7 +63,7 @@ class Job:
     speed: float = 0.0  # 0 = as fast as the pipeline drains
     settings: list[str] = field(default_factory=list)
     config: str = ""
-    on_pids: Callable[[dict[str, int]], None] = lambda pids: None
+    on_started: Callable[[str, dict[str, int]], None] = lambda endpoint, pids: None
 
 
 @dataclass
@@ -87,12 +88,8 @@ class Counts:
     ingest: IngestState | None = None
     regions: RegionDelta | None = None
 
-    def __call__(self, sample: Sample) -> None:
-        """See one sample."""
-        try:
-            message = decode(sample.topic.type, sample.payload)
-        except DecodeError:
-            return
+    def __call__(self, sample: Sample, message: Message) -> None:
+        """See one message."""
         match message:
             case Keyframe():
                 self.keyframes.add(message.frame_id)
@@ -100,8 +97,6 @@ class Counts:
                 self.pyramids[message.frame_id] = self.pyramids.get(message.frame_id, 0) + 1
                 self.crops += len(message.embeddings)
                 self.crops_total += message.crops_total
-            case IngestState():
-                self.ingest = message
             case RegionDelta():
                 self.regions = message
 
@@ -151,7 +146,11 @@ class Run:
         self.settling = Settling((KEYFRAME, PLACE_DELTA, PYRAMID, REGION_DELTA))
         self.interrupted = threading.Event()
         recorder.taps += [self.counts, self.settling]
-        client.listen(INGEST_STATE, job.robot, self.counts)
+        client.listen(INGEST_STATE, job.robot, self._saw_ingest)
+
+    def _saw_ingest(self, sample: Sample) -> None:
+        with contextlib.suppress(DecodeError):
+            self.counts.ingest = decode(IngestState, sample.payload)
 
     def stream(self, started_s: float) -> Result:
         """Start everything, follow the stream to its end, read the result."""
@@ -163,7 +162,7 @@ class Run:
             prior = self._task()
             progress.console.print(f"prior: {prior.provenance.source}, {prior.provenance.note}")
             self._start(["ingest"])  # last: the stream must not begin before its readers stand
-            self.job.on_pids(self.supervisor.pids())
+            self.job.on_started(self.supervisor.connect, self.supervisor.pids())
             self._follow(progress, bar)
             progress.update(bar, description="reading the scene")
             scene = self.client.ask(SCENE, SceneRequest(robot=self.job.robot), 30.0)

@@ -24,11 +24,12 @@ from services.runtime.config import (
 )
 from services.runtime.host import Host
 from services.runtime.logs import start_logging
-from services.runtime.service import Identity, Service
+from services.runtime.service import Identity, Service, ServiceError
 from services.runtime.zenoh_bus import ZenohBus
 
 log = logging.getLogger(__name__)
 PARENT_CHECK_S = 1.0
+EXIT_HOPELESS = 2  # starting again would fail again
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -85,9 +86,9 @@ def run(arguments: argparse.Namespace) -> int:
 
             asyncio.set_event_loop_policy(uvloop.EventLoopPolicy())
         asyncio.run(serve(arguments, instance))
-    except (ConfigError, BusError) as error:
+    except (ConfigError, BusError, ServiceError) as error:
         log.error(str(error))
-        return 2
+        return EXIT_HOPELESS
     except Exception:
         log.exception("the service failed")
         return 1

@@ -1,5 +1,6 @@
 """Child processes: one per service instance, restarted when they die, stopped in order."""
 
+import json
 import os
 import signal
 import subprocess
@@ -8,11 +9,15 @@ import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from deploy.serve import EXIT_HOPELESS
+from services.registry import BY_NAME
+
 RESTART_DELAY_S = 0.5
 MAX_RESTART_DELAY_S = 10.0
 STABLE_AFTER_S = 20.0
 GIVE_UP_AFTER = 5
 STOP_TIMEOUT_S = 10.0
+THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 class ChildFailed(Exception):
@@ -27,6 +32,7 @@ class Child:
     instance: str
     arguments: list[str]
     log_path: Path
+    threads: int
     process: subprocess.Popen | None = None
     started_s: float = 0.0
     deaths: int = 0
@@ -37,6 +43,7 @@ class Child:
         """Start the process; its log is appended to."""
         command = [sys.executable, "-m", "deploy.serve", self.service, "--parent", str(os.getpid()), *self.arguments]
         suffix = f"-r{self.restarts}" if self.restarts else ""
+        environment = os.environ | {name: str(self.threads) for name in THREAD_VARIABLES}
         with self.log_path.open("ab") as log:
             self.process = subprocess.Popen(
                 [*command, "--instance", f"{self.instance}{suffix}"],
@@ -44,13 +51,18 @@ class Child:
                 stdout=log,
                 stderr=log,
                 start_new_session=True,
+                env=environment | {"OMP_WAIT_POLICY": "PASSIVE"},
             )
         self.started_s = time.monotonic()
 
-    def last_line(self) -> str:
+    def last_words(self) -> str:
         """The end of its log, for an error message."""
-        lines = self.log_path.read_text(errors="replace").strip().splitlines()
-        return lines[-1][-400:] if lines else "(empty log)"
+        lines = self.log_path.read_text(errors="replace").strip().splitlines() or ["(empty log)"]
+        try:
+            entry = json.loads(lines[-1])
+        except ValueError:
+            return lines[-1][-400:]
+        return entry.get("error", entry["event"]).splitlines()[-1]
 
 
 @dataclass
@@ -67,6 +79,8 @@ class Supervisor:
     def start(self, service: str, copies: int = 1) -> None:
         """Start one service, or several workers of it."""
         self.log_folder.mkdir(parents=True, exist_ok=True)
+        # Workers share the cores; the others do much with little and would only get in each other's way.
+        threads = max(1, (os.cpu_count() or 1) // copies) if BY_NAME[service].job is not None else 1
         for number in range(copies):
             instance = f"{service}-{number + 1}"
             arguments = ["--robot", self.robot, "--connect", self.connect]
@@ -75,7 +89,7 @@ class Supervisor:
                 arguments += ["--set", setting]
             log_path = self.log_folder / f"{instance}.log"
             log_path.unlink(missing_ok=True)
-            child = Child(service, instance, arguments, log_path)
+            child = Child(service, instance, arguments, log_path, threads)
             child.start()
             self.children.append(child)
 
@@ -99,8 +113,8 @@ class Supervisor:
                     events.append(f"{child.instance} restarted")
             elif (code := child.process.poll()) is not None:
                 child.deaths = 1 if now_s - child.started_s > STABLE_AFTER_S else child.deaths + 1
-                if code == 2 or child.deaths >= GIVE_UP_AFTER:
-                    raise ChildFailed(f"{child.instance} does not run; {child.log_path} ends with: {child.last_line()}")
+                if code == EXIT_HOPELESS or child.deaths >= GIVE_UP_AFTER:
+                    raise ChildFailed(f"{child.instance} does not run: {child.last_words()} (log: {child.log_path})")
                 delay_s = min(RESTART_DELAY_S * 2 ** (child.deaths - 1), MAX_RESTART_DELAY_S)
                 child.process, child.restart_at_s = None, now_s + delay_s
                 events.append(f"{child.instance} ended ({_reason(code)}), restarting")

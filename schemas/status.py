@@ -8,7 +8,7 @@ from schemas.codec import Message
 class Consumed(Message, frozen=True, kw_only=True):
     """One input a service has taken and finished with, in its order: what replay needs, and what flow control reads.
 
-    `writer` and `sequence` point at a recorded message. Inputs that no topic carries (start, ticks, replies to
+    `key`, `writer` and `sequence` point at a recorded message. Inputs that no topic carries (start, ticks, replies to
     questions, messages of unknown writers) travel whole in `inline`.
     """
 
@@ -21,6 +21,7 @@ class Consumed(Message, frozen=True, kw_only=True):
     writer: str = ""
     sequence: int = -1
     inline: bytes = b""
+    key: str = ""
 
 
 class Started(Message, frozen=True, kw_only=True):

@@ -7,8 +7,8 @@ import pytest
 
 from schemas.codec import encode
 from schemas.frames import IngestState
-from schemas.topics import INGEST_STATE, KEYFRAME, TASK
 from schemas.priors import Task
+from schemas.topics import INGEST_STATE, KEYFRAME, TASK
 from services.runtime.bus import Answer, BusError, Hub, LocalBus, key_matches, pack_header, unpack_header
 from services.runtime.zenoh_bus import ZenohBus
 
@@ -16,15 +16,11 @@ from services.runtime.zenoh_bus import ZenohBus
 @pytest.fixture(params=["local", "zenoh"])
 def new_bus(request):
     buses = []
-    if request.param == "local":
-        hub = Hub()
-        make = lambda: LocalBus(hub)
-    else:
-        address = request.getfixturevalue("endpoint")
-        make = lambda: ZenohBus(address)
+    hub = Hub()
+    address = request.getfixturevalue("endpoint") if request.param == "zenoh" else ""
 
     def new():
-        buses.append(make())
+        buses.append(ZenohBus(address) if address else LocalBus(hub))
         return buses[-1]
 
     yield new
@@ -143,7 +139,7 @@ def test_who_is_alive(new_bus):
 
 
 def test_no_router_is_one_clear_sentence():
-    with pytest.raises(BusError, match="no router answers on tcp/127.0.0.1:1; start one with"):
+    with pytest.raises(BusError, match=r"no router answers on tcp/127.0.0.1:1; start one with"):
         ZenohBus("tcp/127.0.0.1:1", wait_s=0.1)
 
 

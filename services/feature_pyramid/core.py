@@ -16,7 +16,7 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
     min_area_m2: float = 2.25  # A_min: crops that see less physical area are not encoded
     surface_cell_px: int = 8  # cell size of the coarse depth surface
     batch_size: int = 4  # crops per forward pass
-    threads: int = 2  # of the neural network library; 0 = its own choice
+    threads: int = 0  # of the neural network library; 0 = its own choice (OMP_NUM_THREADS)
 
     def __post_init__(self) -> None:
         if self.smallest_crop_px < 1 or self.layers < 1 or self.surface_cell_px < 1 or self.batch_size < 1:

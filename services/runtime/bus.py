@@ -4,6 +4,7 @@ Callbacks are called on a foreign thread: they must only enqueue and return.
 """
 
 import itertools
+import re
 import struct
 import threading
 from collections.abc import Callable
@@ -14,6 +15,7 @@ from typing import Protocol
 from schemas.topics import Topic
 
 HEADER = struct.Struct("<Qq")
+WRITER = re.compile(r"[\w.:-]+(/[\w.:-]+)*")
 
 
 class BusError(Exception):
@@ -94,10 +96,8 @@ def unpack_header(header: bytes | None) -> tuple[str, int, int]:
     if header is None or len(header) <= HEADER.size:
         return "", -1, 0
     sequence, sent_ns = HEADER.unpack_from(header)
-    try:
-        return header[HEADER.size :].decode(), sequence, sent_ns
-    except UnicodeDecodeError:
-        return "", -1, 0
+    writer = header[HEADER.size :].decode(errors="replace")
+    return (writer, sequence, sent_ns) if WRITER.fullmatch(writer) else ("", -1, 0)
 
 
 def key_matches(pattern: str, key: str) -> bool:

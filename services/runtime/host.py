@@ -208,6 +208,7 @@ class Host:
             writer=sample.writer,
             sequence=sample.sequence if known else -1,
             inline=b"" if known else sample.payload,
+            key=sample.key,
         )
 
     def _handle_reply(self, reply: Reply) -> None:
@@ -237,11 +238,12 @@ class Host:
             return
         self.inbox.of(job.name).consumed += 1
         self._step(message)
-        self._journal(job.name, frame_id=getattr(message, "frame_id", -1), inline=b"")
+        self._journal(job.name, frame_id=getattr(message, "frame_id", -1))
         work.request.reply(b"done")
 
     def _queue_question(self, query: Query, request: Request) -> None:
-        self.inbox.put(Question(query, request))
+        """Questions come first: they change nothing, and whoever asks waits."""
+        self.inbox.put(Question(query, request), first=True)
 
     def _offer_work(self, request: Request) -> None:
         if self._slots.acquire(blocking=False):
@@ -289,20 +291,15 @@ class Host:
             self._progress.published(topic.name, sequence)
         self.bus.put(topic, key, encode(message), pack_header(self.writer, sequence, time.time_ns()))
 
-    def _journal(
-        self, topic: str, frame_id: int = -1, writer: str = "", sequence: int = -1, inline: bytes = b""
-    ) -> None:
-        robot = self.identity.robot if self.identity.robot != "*" else "fleet"
+    def _journal(self, topic: str, **fields: Any) -> None:
+        """One more input is finished with; `fields` are those of `Consumed` that say which."""
         entry = Consumed(
-            robot=robot,
+            robot=self.identity.robot if self.identity.robot != "*" else "fleet",
             service=self.service.name,
             instance=self.identity.instance,
             order=self._order,
             topic=topic,
-            frame_id=frame_id,
-            writer=writer,
-            sequence=sequence,
-            inline=inline,
+            **fields,
         )
         self._order += 1
         self._put(JOURNAL, entry)

@@ -59,11 +59,14 @@ class Inbox:
                 place = next(self._ids)
             self._put(place, sample)
 
-    def put(self, item: Any, once: Hashable | None = None) -> None:
-        """Take in anything else; with `once`, only if no item put under the same name is waiting."""
+    def put(self, item: Any, once: Hashable | None = None, first: bool = False) -> None:
+        """Take in anything else; with `once`, only if no item of that name is waiting; with `first`, before all."""
         with self._lock:
             if once is None or once not in self._waiting:
-                self._put(next(self._ids) if once is None else once, item)
+                place = next(self._ids) if once is None else once
+                self._put(place, item)
+                if first:
+                    self._waiting.move_to_end(place, last=False)
 
     def missed(self, topic: str, number: int) -> None:
         """Count samples known to be lost for good."""

@@ -10,6 +10,10 @@ from schemas.codec import Message
 from schemas.topics import Query, Topic
 
 
+class ServiceError(RuntimeError):
+    """A service cannot run as it is configured; the message is one sentence that says what to do."""
+
+
 @dataclass(frozen=True)
 class Identity:
     """Who a running service is. `robot` is `*` for a service of the whole fleet."""

@@ -15,6 +15,7 @@ import numpy as np
 from schemas.codec import encode
 from schemas.priors import Prior, Task
 from schemas.regions import Region
+from services.runtime.service import ServiceError
 from services.scene_store import core
 
 APPLICATION_ID = 0x70736753  # "psgS", in the header of the file
@@ -63,7 +64,7 @@ CREATE TABLE revisions (
 """
 
 
-class StoreError(Exception):
+class StoreError(ServiceError):
     """The database cannot be used; the message says what to do."""
 
 

@@ -3,6 +3,8 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+import msgspec
+
 from schemas.codec import Message
 from schemas.places import PlaceDelta, SnapshotRequest
 from schemas.priors import Prior, Task
@@ -137,4 +139,5 @@ SERVICE = Service(
     asks=(PLACE_SNAPSHOT, REGION_SNAPSHOT),
     tick_s=CHECKPOINT_S,
     close=close,
+    replay_config=lambda cfg: msgspec.structs.replace(cfg, path=":memory:"),
 )
