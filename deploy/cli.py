@@ -63,7 +63,13 @@ def build_parser() -> argparse.ArgumentParser:
     demo = command("demo", "run everything on the sample home and score the result", "prior-sg demo --workers 2")
     demo.add_argument("--out", type=Path, default=Path("out/demo"), help="folder for the results")
     demo.add_argument("--task", default=DEMO_TASK, help="what the robot is to do (default: %(default)s)")
-    demo.add_argument("--regions", default="", help="fixed region names, separated by commas")
+    demo.add_argument("--regions", default="", help="fixed region names, separated by commas; see --open")
+    demo.add_argument(
+        "--open",
+        action="store_true",
+        help="let the prior name the regions; by default the demo fixes the ground truth's names, as the paper's "
+        "benchmarks do, so that labels can be scored",
+    )
     _add_run_options(demo)
 
     run = command(
@@ -121,6 +127,10 @@ def build_parser() -> argparse.ArgumentParser:
     health.add_argument("--json", action="store_true", help="print JSON")
     _add_bus(health, robot=False)
 
+    bench = command("bench", "measure one part, or all", "prior-sg bench places --json")
+    bench.add_argument("name", help="bus, places, features, swap, e2e, or all")
+    bench.add_argument("--json", action="store_true", help="print one JSON object per measurement")
+
     priors = command("priors", "list the curated priors", "prior-sg priors list")
     priors.add_argument("action", choices=("list",))
     return parser
@@ -139,7 +149,15 @@ def _names(text: str) -> list[str]:
 
 def cmd_demo(arguments: argparse.Namespace) -> int:
     """The main job on the embedded sample."""
+    from deploy import report
+
     arguments.source, arguments.environment = str(SAMPLE), DEMO_ENVIRONMENT
+    if not (arguments.regions or arguments.open) and arguments.task == DEMO_TASK:
+        truth = report.truth_of(arguments.source) or {"regions": []}
+        arguments.regions = ",".join(dict.fromkeys(region["label"] for region in truth["regions"]))
+        console.print(
+            f"region names fixed to the ground truth's: {arguments.regions.replace(',', ', ')} (--open frees them)"
+        )
     return cmd_run(arguments)
 
 
@@ -390,6 +408,25 @@ def _print_health(statuses: list, silent: list) -> None:
         console.print(f"[red]{entry['error']}[/]")
     if not statuses and not silent:
         console.print("no service is running; start them with `prior-sg up`")
+
+
+def cmd_bench(arguments: argparse.Namespace) -> int:
+    """Measure."""
+    from deploy import bench
+
+    if arguments.name not in (*bench.BENCHES, "all"):
+        raise UserError(f"there is no measurement {arguments.name!r}; known: {', '.join(bench.BENCHES)}, all")
+    for name in bench.BENCHES if arguments.name == "all" else [arguments.name]:
+        with console.status(f"measuring {name}"):
+            found = bench.run(name)
+        if arguments.json:
+            print(json.dumps(found))
+        else:
+            table = Table("metric", "value", title=f"{name} ({found['machine']['cores']} cores)")
+            for metric, value in found["metrics"].items():
+                table.add_row(metric, f"{value:.4g}")
+            console.print(table)
+    return 0
 
 
 def cmd_priors(arguments: argparse.Namespace) -> int:

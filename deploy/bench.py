@@ -1,0 +1,243 @@
+"""Measurements: `prior-sg bench NAME --json`. Keys are fixed; docs/performance.md keeps figures with their commands."""
+
+import os
+import platform
+import statistics
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+from scipy.spatial import cKDTree
+
+from schemas.codec import decode, encode
+from schemas.features import TextEmbeddings, TextRequest
+from schemas.frames import Keyframe
+from schemas.priors import PriorRequest, Task
+from schemas.topics import KEYFRAME, PLACE_DELTA, PRIORS, PYRAMID, TEXT
+from services.ingest.sources import open_source
+from services.registry import BY_NAME
+from services.runtime.bus import pack_header
+from services.runtime.service import Ask, Identity
+from services.runtime.zenoh_bus import ZenohBus, free_endpoint, open_router
+from services.segmenter import swap
+
+SAMPLE = Path(__file__).parent / "sample" / "home.mcap"
+LABELS = 12
+
+
+def machine() -> dict[str, Any]:
+    """Where a figure was measured."""
+    return {
+        "cores": os.cpu_count(),
+        "processor": platform.processor() or platform.machine(),
+        "system": platform.system(),
+    }
+
+
+def _sample_keyframes() -> list[Keyframe]:
+    """Every frame of the sample as a keyframe."""
+    keyframes = []
+    for frame in open_source(SAMPLE):
+        fields = {name: getattr(frame, name) for name in Keyframe.__struct_fields__ if name != "robot"}
+        keyframes.append(Keyframe(robot="bench", **fields))
+    return keyframes
+
+
+def _percentiles(milliseconds: list[float]) -> dict[str, float]:
+    ordered = sorted(milliseconds)
+    return {"ms_p50": statistics.median(ordered), "ms_p99": ordered[min(len(ordered) - 1, int(0.99 * len(ordered)))]}
+
+
+def places() -> tuple[dict, dict]:
+    """Place extraction per keyframe of the sample, image decoding included."""
+    keyframes, service = _sample_keyframes(), BY_NAME["place_graph"]
+    metrics: dict[str, float] = {}
+    for voxel_m in (0.2, 0.1):
+        cfg = service.config(voxel_m=voxel_m)
+        for _ in range(2):  # the first round loads the compiled kernels
+            state, spent = service.init(cfg, Identity("bench", "b", 1)), []
+            for keyframe in keyframes:
+                started_s = time.perf_counter()
+                list(service.step(state, keyframe, cfg))
+                spent.append(1e3 * (time.perf_counter() - started_s))
+        suffix = "" if voxel_m == 0.2 else f"_{voxel_m}m"
+        metrics |= {f"{name}{suffix}": value for name, value in _percentiles(spent).items()}
+    return metrics, {"keyframes": len(keyframes), "image": "640x480", "voxel_m": 0.2}
+
+
+def features() -> tuple[dict, dict]:
+    """Crops encoded per second by one worker, selection and decoding included."""
+    keyframes, service = _sample_keyframes()[:24], BY_NAME["feature_pyramid"]
+    cfg = service.config()
+    state = service.init(cfg, Identity("*", "b", 1))
+    list(service.step(state, keyframes[0], cfg))
+    started_s, crops = time.perf_counter(), 0
+    for keyframe in keyframes:
+        crops += sum(
+            len(message.embeddings) for topic, message in service.step(state, keyframe, cfg) if topic is PYRAMID
+        )
+    seconds = time.perf_counter() - started_s
+    return {"crops_per_s": crops / seconds, "ms_per_keyframe": 1e3 * seconds / len(keyframes)}, {"space": cfg.space}
+
+
+def random_field(nodes: int, rng: np.random.Generator) -> swap.Field:
+    """A field as place graphs have: points in a hall, edges to near ones, patches of labels, non-metric costs."""
+    side_m = np.sqrt(nodes) * 0.7
+    points_m = rng.uniform(0, side_m, (nodes, 2))
+    edges = cKDTree(points_m).query_pairs(1.2, output_type="ndarray")
+    centers_m = rng.uniform(0, side_m, (max(2, nodes // 40), 2))
+    truth = rng.integers(0, LABELS, len(centers_m))[cKDTree(centers_m).query(points_m)[1]]
+    unary = rng.gumbel(0, 1.0, (nodes, LABELS)) + 1.5
+    unary[np.arange(nodes), truth] -= 1.2
+    costs = -2 * np.log(rng.uniform(0.02, 1.0, (LABELS, LABELS)))
+    costs = np.triu(costs, 1) + np.triu(costs, 1).T
+    lengths_m = np.linalg.norm(points_m[edges[:, 0]] - points_m[edges[:, 1]], axis=1)
+    return swap.Field(unary=unary, edges=edges, weights=np.exp(-lengths_m / 2), costs=costs)
+
+
+def swap_cold() -> tuple[dict, dict]:
+    """Cold α-β-swap against gco-wrapper's on the same fields, in the same run."""
+    import gco
+
+    metrics: dict[str, float] = {}
+    for nodes in (500, 2_000, 10_000):
+        field = random_field(nodes, np.random.default_rng(nodes))
+        start = field.unary.argmin(axis=1)
+        started_s = time.perf_counter()
+        ours = swap.minimise(field, start)
+        seconds = time.perf_counter() - started_s
+        started_s = time.perf_counter()
+        theirs = gco.cut_general_graph(
+            field.edges, field.weights, field.unary, field.costs, n_iter=-1, algorithm="swap", init_labels=start
+        )
+        gco_seconds = time.perf_counter() - started_s
+        suffix = "" if nodes == 10_000 else f"_{nodes}"
+        metrics[f"cold_time_ratio_gco{suffix}"] = seconds / gco_seconds
+        metrics[f"cold_energy_ratio_gco{suffix}"] = swap.energy(field, ours) / swap.energy(field, np.asarray(theirs))
+        metrics[f"cold_seconds{suffix}"] = seconds
+    return metrics, {"labels": LABELS, "nodes": [500, 2_000, 10_000]}
+
+
+def bus() -> tuple[dict, dict]:
+    """Typed publish → handler through a router, as share of bare Zenoh put → callback of the same size."""
+    import zenoh
+
+    from services.runtime.zenoh_bus import client_config
+
+    endpoint = free_endpoint("tcp/127.0.0.1:0")
+    stop = open_router(endpoint)
+    metrics: dict[str, float] = {}
+    try:
+        for name, size, number in (("150kB", 150_000, 600), ("1.5MB", 1_500_000, 80)):
+            keyframe = msgspec.structs.replace(
+                _sample_keyframes()[0], color=os.urandom(size // 2), depth=os.urandom(size // 2)
+            )
+            typed = _typed_rate(endpoint, keyframe, number)
+            with zenoh.open(client_config(endpoint)) as reader, zenoh.open(client_config(endpoint)) as writer:
+                bare = _bare_rate(reader, writer, encode(keyframe), number)
+            metrics |= {f"throughput_ratio_{name}": typed / bare, f"messages_per_s_{name}": typed}
+    finally:
+        stop()
+    metrics["throughput_ratio"] = min(value for name, value in metrics.items() if name.startswith("throughput"))
+    return metrics, {"path": "client, router, client on loopback"}
+
+
+def _typed_rate(endpoint: str, keyframe: Keyframe, number: int) -> float:
+    reader, writer, received = ZenohBus(endpoint), ZenohBus(endpoint), []
+    reader.subscribe(
+        KEYFRAME, KEYFRAME.pattern("bench"), lambda s: received.append(decode(Keyframe, s.payload)), _ignore
+    )
+    time.sleep(0.5)
+    key = KEYFRAME.key_of(keyframe)
+
+    def put(sequence: int) -> None:
+        writer.put(KEYFRAME, key, encode(keyframe), pack_header("bench", sequence, time.time_ns()))
+
+    rate = _rate(put, lambda: len(received), number)
+    reader.close()
+    writer.close()
+    return rate
+
+
+def _bare_rate(reader: Any, writer: Any, payload: bytes, number: int) -> float:
+    received: list[bytes] = []
+    reader.declare_subscriber("bench/bare", lambda sample: received.append(sample.payload.to_bytes()))
+    import zenoh
+
+    publisher = writer.declare_publisher("bench/bare", congestion_control=zenoh.CongestionControl.BLOCK)
+    time.sleep(0.5)
+    return _rate(lambda sequence: publisher.put(payload), lambda: len(received), number)
+
+
+def _rate(put: Callable[[int], None], received: Callable[[], int], number: int) -> float:
+    started_s = time.perf_counter()
+    for sequence in range(number):
+        put(sequence)
+    while received() < number and time.perf_counter() - started_s < 60:
+        time.sleep(0.001)
+    return received() / (time.perf_counter() - started_s)
+
+
+def _ignore(topic: object, number: int) -> None:
+    """A missed sample shows in the rate."""
+
+
+def e2e() -> tuple[dict, dict]:
+    """Keyframe published → region delta that follows from its places, at 5 keyframes a second, encoder time excluded.
+
+    Everything but the encoder runs as in production, on the local bus: mapping, integration, inference, publishing.
+    """
+    keyframes = _sample_keyframes()
+    place_graph, features_service, segmenter = (BY_NAME[n] for n in ("place_graph", "feature_pyramid", "segmenter"))
+    configs = {s.name: s.config() for s in (place_graph, features_service, segmenter)}
+    states = {
+        s.name: s.init(configs[s.name], Identity("bench", "b", 1)) for s in (place_graph, features_service, segmenter)
+    }
+    gateway = BY_NAME["prior_gateway"]
+    gateway_state = gateway.init(gateway.config(), Identity("*", "b", 1))
+    request = PriorRequest(environment="residential home", task="real-estate listing")
+    prior = gateway.answers[PRIORS](gateway_state, request, gateway.config()).priors[0]  # type: ignore[attr-defined]
+    task = Task(robot="bench", stamp_ns=0, environment=request.environment, task=request.task)
+
+    def segment(message: Any) -> None:
+        for output in list(segmenter.step(states["segmenter"], message, configs["segmenter"])):
+            if isinstance(output, Ask) and isinstance(output.request, TextRequest):
+                text = features_service.answers[TEXT](
+                    states["feature_pyramid"], output.request, configs["feature_pyramid"]
+                )
+                assert isinstance(text, TextEmbeddings)
+                segment(text)
+
+    segment(task)
+    segment(prior)
+    spent = []
+    for keyframe in keyframes:
+        pyramids = [
+            m for t, m in features_service.step(states["feature_pyramid"], keyframe, configs["feature_pyramid"])
+        ]
+        started_s = time.perf_counter()
+        for topic, delta in place_graph.step(states["place_graph"], keyframe, configs["place_graph"]):
+            if topic is PLACE_DELTA:
+                segment(delta)
+        for pyramid in pyramids:
+            segment(pyramid)
+        spent.append(1e3 * (time.perf_counter() - started_s))
+    return _percentiles(spent[3:]), {"keyframes": len(keyframes), "transport": "none (see bench bus)"}
+
+
+BENCHES: dict[str, Callable[[], tuple[dict, dict]]] = {
+    "bus": bus,
+    "places": places,
+    "features": features,
+    "swap": swap_cold,
+    "e2e": e2e,
+}
+
+
+def run(name: str) -> dict[str, Any]:
+    """One measurement as the object that `--json` prints."""
+    metrics, settings = BENCHES[name]()
+    return {"bench": name, "metrics": metrics, "machine": machine(), "settings": settings}
