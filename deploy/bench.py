@@ -10,18 +10,18 @@ from typing import Any
 
 import msgspec
 import numpy as np
+import zenoh
 from scipy.spatial import cKDTree
 
 from schemas.codec import decode, encode
-from schemas.features import TextEmbeddings, TextRequest
 from schemas.frames import Keyframe
 from schemas.priors import PriorRequest, Task
-from schemas.topics import KEYFRAME, PLACE_DELTA, PRIORS, PYRAMID, TEXT
+from schemas.topics import KEYFRAME, PRIORS, TEXT, Query
 from services.ingest.sources import open_source
 from services.registry import BY_NAME
-from services.runtime.bus import pack_header
+from services.runtime.bus import Sample, pack_header
 from services.runtime.service import Ask, Identity
-from services.runtime.zenoh_bus import ZenohBus, free_endpoint, open_router
+from services.runtime.zenoh_bus import ZenohBus, client_config, free_endpoint, open_router
 from services.segmenter import swap
 
 SAMPLE = Path(__file__).parent / "sample" / "home.mcap"
@@ -30,11 +30,7 @@ LABELS = 12
 
 def machine() -> dict[str, Any]:
     """Where a figure was measured."""
-    return {
-        "cores": os.cpu_count(),
-        "processor": platform.processor() or platform.machine(),
-        "system": platform.system(),
-    }
+    return {"cores": os.cpu_count(), "processor": platform.machine(), "system": platform.system()}
 
 
 def _sample_keyframes() -> list[Keyframe]:
@@ -76,9 +72,7 @@ def features() -> tuple[dict, dict]:
     list(service.step(state, keyframes[0], cfg))
     started_s, crops = time.perf_counter(), 0
     for keyframe in keyframes:
-        crops += sum(
-            len(message.embeddings) for topic, message in service.step(state, keyframe, cfg) if topic is PYRAMID
-        )
+        crops += sum(len(pyramid.embeddings) for _, pyramid in service.step(state, keyframe, cfg))
     seconds = time.perf_counter() - started_s
     return {"crops_per_s": crops / seconds, "ms_per_keyframe": 1e3 * seconds / len(keyframes)}, {"space": cfg.space}
 
@@ -95,7 +89,7 @@ def random_field(nodes: int, rng: np.random.Generator) -> swap.Field:
     costs = -2 * np.log(rng.uniform(0.02, 1.0, (LABELS, LABELS)))
     costs = np.triu(costs, 1) + np.triu(costs, 1).T
     lengths_m = np.linalg.norm(points_m[edges[:, 0]] - points_m[edges[:, 1]], axis=1)
-    return swap.Field(unary=unary, edges=edges, weights=np.exp(-lengths_m / 2), costs=costs)
+    return swap.Field(unary=unary, edges=edges, weights=np.exp(-lengths_m / 2), pairwise=costs)
 
 
 def swap_cold() -> tuple[dict, dict]:
@@ -111,7 +105,7 @@ def swap_cold() -> tuple[dict, dict]:
         seconds = time.perf_counter() - started_s
         started_s = time.perf_counter()
         theirs = gco.cut_general_graph(
-            field.edges, field.weights, field.unary, field.costs, n_iter=-1, algorithm="swap", init_labels=start
+            field.edges, field.weights, field.unary, field.pairwise, n_iter=-1, algorithm="swap", init_labels=start
         )
         gco_seconds = time.perf_counter() - started_s
         suffix = "" if nodes == 10_000 else f"_{nodes}"
@@ -123,18 +117,13 @@ def swap_cold() -> tuple[dict, dict]:
 
 def bus() -> tuple[dict, dict]:
     """Typed publish → handler through a router, as share of bare Zenoh put → callback of the same size."""
-    import zenoh
-
-    from services.runtime.zenoh_bus import client_config
-
     endpoint = free_endpoint("tcp/127.0.0.1:0")
     stop = open_router(endpoint)
     metrics: dict[str, float] = {}
     try:
         for name, size, number in (("150kB", 150_000, 600), ("1.5MB", 1_500_000, 80)):
-            keyframe = msgspec.structs.replace(
-                _sample_keyframes()[0], color=os.urandom(size // 2), depth=os.urandom(size // 2)
-            )
+            half = os.urandom(size // 2)
+            keyframe = msgspec.structs.replace(_sample_keyframes()[0], color=half, depth=half)
             typed = _typed_rate(endpoint, keyframe, number)
             with zenoh.open(client_config(endpoint)) as reader, zenoh.open(client_config(endpoint)) as writer:
                 bare = _bare_rate(reader, writer, encode(keyframe), number)
@@ -146,10 +135,13 @@ def bus() -> tuple[dict, dict]:
 
 
 def _typed_rate(endpoint: str, keyframe: Keyframe, number: int) -> float:
-    reader, writer, received = ZenohBus(endpoint), ZenohBus(endpoint), []
-    reader.subscribe(
-        KEYFRAME, KEYFRAME.pattern("bench"), lambda s: received.append(decode(Keyframe, s.payload)), _ignore
-    )
+    reader, writer = ZenohBus(endpoint), ZenohBus(endpoint)
+    received: list[Keyframe] = []
+
+    def receive(sample: Sample) -> None:
+        received.append(decode(Keyframe, sample.payload))
+
+    reader.subscribe(KEYFRAME, KEYFRAME.pattern("bench"), receive, _ignore)
     time.sleep(0.5)
     key = KEYFRAME.key_of(keyframe)
 
@@ -165,8 +157,6 @@ def _typed_rate(endpoint: str, keyframe: Keyframe, number: int) -> float:
 def _bare_rate(reader: Any, writer: Any, payload: bytes, number: int) -> float:
     received: list[bytes] = []
     reader.declare_subscriber("bench/bare", lambda sample: received.append(sample.payload.to_bytes()))
-    import zenoh
-
     publisher = writer.declare_publisher("bench/bare", congestion_control=zenoh.CongestionControl.BLOCK)
     time.sleep(0.5)
     return _rate(lambda sequence: publisher.put(payload), lambda: len(received), number)
@@ -185,45 +175,45 @@ def _ignore(topic: object, number: int) -> None:
     """A missed sample shows in the rate."""
 
 
+class Pipeline:
+    """Mapping, encoding and segmenting in one thread, for timing what lies between a keyframe and its regions."""
+
+    def __init__(self) -> None:
+        names = ("place_graph", "feature_pyramid", "segmenter", "prior_gateway")
+        self.services = {name: BY_NAME[name] for name in names}
+        self.configs = {name: service.config() for name, service in self.services.items()}
+        self.states = {
+            name: service.init(self.configs[name], Identity("bench", "b", 1)) for name, service in self.services.items()
+        }
+
+    def step(self, name: str, message: Any) -> list[Any]:
+        """What one step publishes; questions of the segmenter to the encoder are answered on the spot."""
+        published = []
+        for output in list(self.services[name].step(self.states[name], message, self.configs[name])):
+            if not isinstance(output, Ask):
+                published.append(output[1])
+            elif output.query is TEXT:
+                self.step(name, self.answer("feature_pyramid", TEXT, output.request))
+        return published
+
+    def answer(self, name: str, query: Query, request: Any) -> Any:
+        """One service's answer."""
+        return self.services[name].answers[query](self.states[name], request, self.configs[name])
+
+
 def e2e() -> tuple[dict, dict]:
-    """Keyframe published → region delta that follows from its places, at 5 keyframes a second, encoder time excluded.
-
-    Everything but the encoder runs as in production, on the local bus: mapping, integration, inference, publishing.
-    """
-    keyframes = _sample_keyframes()
-    place_graph, features_service, segmenter = (BY_NAME[n] for n in ("place_graph", "feature_pyramid", "segmenter"))
-    configs = {s.name: s.config() for s in (place_graph, features_service, segmenter)}
-    states = {
-        s.name: s.init(configs[s.name], Identity("bench", "b", 1)) for s in (place_graph, features_service, segmenter)
-    }
-    gateway = BY_NAME["prior_gateway"]
-    gateway_state = gateway.init(gateway.config(), Identity("*", "b", 1))
+    """Keyframe in hand → region delta that follows from it, encoder time excluded, without transport."""
+    pipeline, keyframes = Pipeline(), _sample_keyframes()
     request = PriorRequest(environment="residential home", task="real-estate listing")
-    prior = gateway.answers[PRIORS](gateway_state, request, gateway.config()).priors[0]  # type: ignore[attr-defined]
-    task = Task(robot="bench", stamp_ns=0, environment=request.environment, task=request.task)
-
-    def segment(message: Any) -> None:
-        for output in list(segmenter.step(states["segmenter"], message, configs["segmenter"])):
-            if isinstance(output, Ask) and isinstance(output.request, TextRequest):
-                text = features_service.answers[TEXT](
-                    states["feature_pyramid"], output.request, configs["feature_pyramid"]
-                )
-                assert isinstance(text, TextEmbeddings)
-                segment(text)
-
-    segment(task)
-    segment(prior)
+    prior = pipeline.answer("prior_gateway", PRIORS, request).priors[0]
+    pipeline.step("segmenter", Task(robot="bench", stamp_ns=0, environment=request.environment, task=request.task))
+    pipeline.step("segmenter", prior)
     spent = []
     for keyframe in keyframes:
-        pyramids = [
-            m for t, m in features_service.step(states["feature_pyramid"], keyframe, configs["feature_pyramid"])
-        ]
+        pyramids = pipeline.step("feature_pyramid", keyframe)
         started_s = time.perf_counter()
-        for topic, delta in place_graph.step(states["place_graph"], keyframe, configs["place_graph"]):
-            if topic is PLACE_DELTA:
-                segment(delta)
-        for pyramid in pyramids:
-            segment(pyramid)
+        for message in pipeline.step("place_graph", keyframe) + pyramids:
+            pipeline.step("segmenter", message)
         spent.append(1e3 * (time.perf_counter() - started_s))
     return _percentiles(spent[3:]), {"keyframes": len(keyframes), "transport": "none (see bench bus)"}
 
