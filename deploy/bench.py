@@ -67,12 +67,13 @@ def places() -> tuple[dict, dict]:
 def features() -> tuple[dict, dict]:
     """Crops encoded per second by one worker, selection and decoding included."""
     keyframes, service = _sample_keyframes()[:24], BY_NAME["feature_pyramid"]
-    cfg = service.config()
+    cfg: Any = service.config()
     state = service.init(cfg, Identity("*", "b", 1))
     list(service.step(state, keyframes[0], cfg))
     started_s, crops = time.perf_counter(), 0
     for keyframe in keyframes:
-        crops += sum(len(pyramid.embeddings) for _, pyramid in service.step(state, keyframe, cfg))
+        outputs: list[Any] = list(service.step(state, keyframe, cfg))
+        crops += sum(len(pyramid.embeddings) for _, pyramid in outputs)
     seconds = time.perf_counter() - started_s
     return {"crops_per_s": crops / seconds, "ms_per_keyframe": 1e3 * seconds / len(keyframes)}, {"space": cfg.space}
 
@@ -181,14 +182,14 @@ class Pipeline:
     def __init__(self) -> None:
         names = ("place_graph", "feature_pyramid", "segmenter", "prior_gateway")
         self.services = {name: BY_NAME[name] for name in names}
-        self.configs = {name: service.config() for name, service in self.services.items()}
+        self.configs: dict[str, Any] = {name: service.config() for name, service in self.services.items()}
         self.states = {
             name: service.init(self.configs[name], Identity("bench", "b", 1)) for name, service in self.services.items()
         }
 
     def step(self, name: str, message: Any) -> list[Any]:
         """What one step publishes; questions of the segmenter to the encoder are answered on the spot."""
-        published = []
+        published: list[Any] = []
         for output in list(self.services[name].step(self.states[name], message, self.configs[name])):
             if not isinstance(output, Ask):
                 published.append(output[1])

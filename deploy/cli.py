@@ -15,6 +15,7 @@ from deploy import serve
 
 if TYPE_CHECKING:
     from deploy.client import Client
+    from schemas.status import ServiceStatus, TopicCount
 
 DEFAULT_CONNECT = "tcp/127.0.0.1:7447"
 DEMO_ENVIRONMENT = "residential home"
@@ -378,36 +379,34 @@ def cmd_health(arguments: argparse.Namespace) -> int:
     return 1 if silent or not statuses else 0
 
 
-def _print_health(statuses: list, silent: list) -> None:
-    table = Table("process", "pid", "up s", "backlog", "busy", "step ms p50/p99", "MB", "waits for", "topics")
+def _print_health(statuses: list["ServiceStatus"], silent: list[dict]) -> None:
+    """Two lines a process: what it is doing, and what went through each topic."""
     for status in statuses:
-        lines = []
-        for count in status.topics:
-            parts = [
-                f"{count.consumed} in" if count.consumed else "",
-                f"{count.published} out" if count.published else "",
-            ]
-            parts += [
-                f"[red]{n} {word}[/]" for n, word in ((count.malformed, "malformed"), (count.missed, "missed")) if n
-            ]
-            parts += [f"{n} {word}" for n, word in ((count.skipped, "skipped"), (count.duplicate, "repeated")) if n]
-            lines.append(f"{count.topic}: {', '.join(filter(None, parts))}")
-        table.add_row(
-            status.instance,
-            str(status.pid),
-            f"{status.uptime_s:.0f}",
-            str(status.backlog),
-            f"{status.busy_share:.0%}",
-            f"{status.step_ms_p50:.1f} / {status.step_ms_p99:.1f}",
-            f"{status.resident_mb:.0f}",
-            ", ".join(status.waiting_for),
-            "\n".join(lines),
+        waits = f", waits for {', '.join(status.waiting_for)}" if status.waiting_for else ""
+        console.print(
+            f"[bold]{status.instance}[/]  pid {status.pid}, up {status.uptime_s:.0f} s, busy {status.busy_share:.0%}, "
+            f"step {status.step_ms_p50:.1f} ms (p99 {status.step_ms_p99:.1f}), {status.resident_mb:.0f} MB, "
+            f"backlog {status.backlog}{waits}"
         )
-    console.print(table)
+        console.print("    " + " · ".join(map(_topic_line, status.topics)))
     for entry in silent:
         console.print(f"[red]{entry['error']}[/]")
     if not statuses and not silent:
         console.print("no service is running; start them with `prior-sg up`")
+
+
+def _topic_line(count: "TopicCount") -> str:
+    """One topic's counts; what should not happen stands out."""
+    parts = [
+        (count.consumed, "in"),
+        (count.published, "out"),
+        (count.skipped, "skipped"),
+        (count.duplicate, "repeated"),
+    ]
+    texts = [f"{number} {word}" for number, word in parts if number]
+    faults = [(count.malformed, "malformed"), (count.missed, "missed")]
+    texts += [f"[red]{number} {word}[/]" for number, word in faults if number]
+    return f"{count.topic} {', '.join(texts) or '-'}"
 
 
 def cmd_bench(arguments: argparse.Namespace) -> int:

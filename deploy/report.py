@@ -57,6 +57,8 @@ def write(result: Result, out: Path, truth: dict[str, Any] | None, console: Cons
     if truth is not None:
         metrics = evaluate(scene, result.voxels, GroundTruth.from_json(truth))
         console.print("against the ground truth: " + ", ".join(f"{name} {metrics[name]:.3f}" for name in MAIN_METRICS))
+        if not set(scene.labels) & {region["label"] for region in truth["regions"]}:
+            console.print("no region name of this task is in the ground truth: only f1_g and miou_g compare anything")
         (out / "metrics.json").write_text(json.dumps(metrics, indent=1))
     for kind, name in (("json", "scene.json"), ("spark-dsg", "dsg.json"), ("png", "map.png")):
         export(scene, result.voxels, kind, out / name, truth)
