@@ -3,7 +3,9 @@
 import argparse
 import json
 import os
+import signal
 import sys
+import threading
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -223,8 +225,6 @@ def cmd_up(arguments: argparse.Namespace) -> int:
 
 def cmd_task(arguments: argparse.Namespace) -> int:
     """Switch the task and wait for the new regions."""
-    import threading
-
     from deploy import report
     from schemas.codec import decode
     from schemas.priors import PriorRequest, Task
@@ -449,6 +449,8 @@ def main(argv: list[str] | None = None) -> int:
     from services.runtime.record import LogError
     from services.runtime.service import ServiceError
 
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, signal.default_int_handler)  # ended by a supervisor: as tidy as Ctrl-C
     try:
         return globals()[f"cmd_{arguments.command}"](arguments)
     except BrokenPipeError:  # the reader of a pipe has left

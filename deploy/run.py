@@ -247,7 +247,7 @@ def _progress(console: Console) -> Progress:
 
 @contextmanager
 def _interrupt_sets(event: threading.Event) -> Iterator[None]:
-    """Ctrl-C sets the event the first time and raises KeyboardInterrupt the second."""
+    """Ctrl-C or SIGTERM sets the event the first time and raises KeyboardInterrupt the second."""
 
     def handle(number: int, frame: object) -> None:
         if event.is_set():
@@ -257,8 +257,9 @@ def _interrupt_sets(event: threading.Event) -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():  # only the main thread may handle signals
         yield
         return
-    previous = signal.signal(signal.SIGINT, handle)
+    previous = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, previous)
+        for number, handler in previous.items():
+            signal.signal(number, handler)

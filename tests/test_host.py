@@ -127,17 +127,30 @@ def test_a_slow_reader_holds_the_source_back_and_loses_nothing(new_bus):
 def test_jobs_are_shared_by_workers_and_survive_one(new_bus):
     async def main():
         services = [
+            (READER, Config(), "a"),
             (WORKER, Config(work_s=0.05), "w1"),
             (WORKER, Config(work_s=0.05), "w2"),
             (SOURCE, Config(frames=16), "s"),
         ]
-        async with running(new_bus, *services) as (first, second, source):
+        async with running(new_bus, *services) as (_, first, second, source):
             await until(lambda: len(source._state["done"]) >= 4)
             first.stop()
             await until(lambda: len(source._state["done"]) == 16)
             assert sorted(frame_id for frame_id, _, _ in source._state["done"]) == list(range(16))
             assert len(second._state) >= 8
             assert set(first._state) | set(second._state) == set(range(16))
+
+    asyncio.run(main())
+
+
+def test_a_source_waits_for_its_first_reader_and_worker(new_bus):
+    async def main():
+        async with running(new_bus, (SOURCE, Config(frames=3), "s")) as (source,):
+            await asyncio.sleep(0.5)
+            assert source._state["lead"] == []
+            async with running(new_bus, (READER, Config(), "a"), (WORKER, Config(), "w")) as (reader, worker):
+                await until(lambda: len(source._state["done"]) == 3)
+                await until(lambda: reader._state == [0, 1, 2])
 
     asyncio.run(main())
 

@@ -5,6 +5,7 @@ All of a service's state is touched by one worker thread only; the event loop ha
 
 import asyncio
 import logging
+import math
 import os
 import threading
 import time
@@ -428,8 +429,8 @@ class Progress:
         """A process has come or gone."""
         (self._dead.discard if alive else self._dead.add)(instance)
 
-    def lag(self, topic: str) -> int:
-        """By how many messages the slowest live reader is behind."""
+    def lag(self, topic: str) -> float:
+        """By how many messages the slowest live reader is behind; infinitely many when nobody reads."""
         newest = self._published.get(topic, -1)
         return max(
             (
@@ -437,7 +438,7 @@ class Progress:
                 for instance, topics in list(self._reads.items())
                 if topic in topics and instance not in self._dead
             ),
-            default=0,
+            default=math.inf,
         )
 
     def changed(self, loop: asyncio.AbstractEventLoop) -> None:
@@ -460,14 +461,18 @@ class Port:
         await done.wait()
 
     async def room(self, window: int) -> None:
-        """Wait until readers are at most `window` messages behind and fewer than `window` jobs are outstanding."""
-        host = self._host
+        """Wait until somebody reads, readers are at most `window` messages behind, there are workers, and fewer than
+        `window` jobs are outstanding."""
+        host, said = self._host, False
         while not host.stopping.is_set():
             host._progress.event.clear()
             lags = [host._progress.lag(topic.name) for topic in host.service.writes if topic.delivery == "every"]
-            jobs = [pool.outstanding for pool in host._pools.values()]
+            jobs = [pool.outstanding if pool.workers else math.inf for pool in host._pools.values()]
             if max(lags, default=0) <= window and max(jobs, default=0) < window:
                 return
+            if not said and math.inf in (*lags, *jobs):
+                said = True
+                log.info("waiting for readers and workers", extra={"lags": lags, "jobs": jobs})
             try:
                 await asyncio.wait_for(host._progress.event.wait(), timeout=1.0)
             except TimeoutError:
