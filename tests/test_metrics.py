@@ -1,7 +1,8 @@
-"""Metrics: cases worked by hand, and a literal slow implementation on random worlds."""
+"""Metrics: cases worked by hand, and literal slow implementations on random worlds."""
 
 import itertools
 import json
+import math
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from deploy.evaluation.metrics import GroundTruth, evaluate, voxel_owners
+from deploy.evaluation.metrics import SCORES, GroundTruth, assign, evaluate, reliability, voxel_owners
 from schemas.places import VoxelMap
 from schemas.regions import Region
 from schemas.scene import Scene
@@ -27,11 +28,12 @@ KEYS = [
     "miou_s_penalised",
     "miou_g_penalised",
     "accuracy",
-]
+    "boundary_f1",
+]  # `ece` besides, which depends on posteriors
 FLOOR = {"id": 0, "z_min_m": 0.0, "z_max_m": 3.0}
 
 
-def make_scene(positions, radii, place_regions, names):
+def make_scene(positions, radii, place_regions, names, *, labels=(), posteriors=None):
     count = len(positions)
     regions = [
         Region(id=i, label=name, place_count=1, probability=1.0, position_m=(0.0, 0.0, 0.0), area_m2=1.0)
@@ -44,14 +46,14 @@ def make_scene(positions, radii, place_regions, names):
         task="",
         prior_digest="",
         space="",
-        labels=[],
+        labels=list(labels),
         regions=regions,
         place_ids=np.arange(count),
         positions_m=np.array(positions, np.float32).reshape(-1, 3),
         radii_m=np.array(radii, np.float32),
         basis_points=np.zeros(count, np.int16),
         place_regions=np.array(place_regions, np.int64),
-        posteriors=np.zeros((count, 0), np.float16),
+        posteriors=np.array(np.zeros((count, 0)) if posteriors is None else posteriors, np.float16),
         unknown=np.zeros(count, np.float16),
         edges=np.zeros((0, 2), np.int64),
         clearances_m=np.zeros(0, np.float32),
@@ -73,6 +75,12 @@ def make_truth(*rooms, floors=(FLOOR,)):
     return GroundTruth.from_json({"floors": list(floors), "regions": regions})
 
 
+def without_ece(scores):
+    """The other scores, of scenes without posteriors."""
+    assert math.isnan(scores["ece"])
+    return {key: value for key, value in scores.items() if key != "ece"}
+
+
 # Six places in a row, one voxel each; the left four in the kitchen, the right two in the hall.
 ROW = make_map([[i, 0, 0] for i in range(6)], voxel_m=1.0)
 ROW_TRUTH = make_truth(("kitchen", rectangle(0, 4)), ("hall", rectangle(4, 6)))
@@ -86,8 +94,8 @@ def row_scores(place_regions, names):
 
 def test_perfect_is_one_everywhere():
     scores = row_scores([7, 7, 7, 7, 3, 3], {7: "kitchen", 3: "hall"})
-    assert list(scores) == KEYS
-    assert set(scores.values()) == {1.0}
+    assert list(scores) == [*KEYS, "ece"] == list(SCORES)
+    assert set(without_ece(scores).values()) == {1.0}
 
 
 # Each row by hand. Voxels: kitchen 4, hall 2.
@@ -109,7 +117,7 @@ BY_HAND = {
     "labels exchanged": (
         [0, 0, 0, 0, 1, 1],
         {0: "hall", 1: "kitchen"},
-        {"p_g": 1, "r_g": 1, "f1_g": 1, "miou_g": 1, "miou_g_penalised": 1}
+        {"p_g": 1, "r_g": 1, "f1_g": 1, "miou_g": 1, "miou_g_penalised": 1, "boundary_f1": 1}
         | {"p_s": 0, "r_s": 0, "f1_s": 0, "miou_s": 0, "miou_s_penalised": 0, "accuracy": 0},
     ),
     "boundary one place off": (
@@ -129,6 +137,7 @@ BY_HAND = {
         {0: "kitchen"},
         {"p_g": 1, "r_g": 1, "p_s": 0.5, "r_s": 0.5, "miou_s": 0.5, "accuracy": 4 / 6},
     ),
+    "one region where two are": ([0] * 6, {0: "kitchen"}, {"boundary_f1": 0}),
     "nothing labelled": ([-1] * 6, {}, dict.fromkeys(KEYS, 0.0)),
 }
 
@@ -156,9 +165,11 @@ def test_two_rooms_with_spheres_worked_by_hand():
     free = make_map([[i, 0, 0] for i in range(8)])
     truth = make_truth(("bath", rectangle(0, 2)), ("bedroom", rectangle(2, 4)))
     scores = evaluate(scene, free, truth)
-    assert scores == pytest.approx(
+    # The boundary is true, but one region holds everything: nothing estimated.
+    assert without_ece(scores) == pytest.approx(
         {"p_g": 5 / 8, "r_g": 1.0, "f1_g": 2 * (5 / 8) / (13 / 8), "p_s": 5 / 8, "r_s": 0.5, "f1_s": (5 / 8) / (9 / 8)}
         | {"miou_g": 5 / 8, "miou_s": 5 / 8, "miou_g_penalised": 5 / 16, "miou_s_penalised": 5 / 16, "accuracy": 5 / 8}
+        | {"boundary_f1": 0.0}
     )
 
 
@@ -173,9 +184,9 @@ def test_empty_worlds_score_zero():
     place = make_scene([[0.5, 0.5, 0.5]], [0.4], [0], {0: "kitchen"})
     nothing = make_scene([], [], [], {})
     zero = dict.fromkeys(KEYS, 0.0)
-    assert evaluate(nothing, ROW, ROW_TRUTH) == zero
-    assert evaluate(place, make_map([]), ROW_TRUTH) == zero
-    assert evaluate(place, ROW, make_truth()) == zero
+    assert without_ece(evaluate(nothing, ROW, ROW_TRUTH)) == zero
+    assert without_ece(evaluate(place, make_map([]), ROW_TRUTH)) == zero
+    assert without_ece(evaluate(place, ROW, make_truth())) == zero
 
 
 def test_malformed_truth_is_refused():
@@ -198,7 +209,7 @@ def slow_scores(scene, voxel_map, truth):
             ):
                 places.append((position.astype(float), float(radius), int(region), room))
                 break
-    estimated, true = {}, {}
+    estimated, true, region_at = {}, {}, {}
     for voxel in voxel_map.free.tolist():
         center = (np.array(voxel) + 0.5) * voxel_map.voxel_m
         holders = [(((center - p[0]) ** 2).sum() - p[1] ** 2, i) for i, p in enumerate(places)]
@@ -206,6 +217,7 @@ def slow_scores(scene, voxel_map, truth):
         if holders:
             _, _, region, room = places[min(holders)[1]]
             true.setdefault(room, set()).add(tuple(voxel))
+            region_at[tuple(voxel)] = (region, room)
             if region != -1:
                 estimated.setdefault(region, set()).add(tuple(voxel))
     names = {region.id: region.label for region in scene.regions}
@@ -232,7 +244,56 @@ def slow_scores(scene, voxel_map, truth):
         out[f"miou_{axis}_penalised"] = total / many if many else 0.0
     volume = sum(len(voxels) for voxels in true.values())
     right = sum(len(estimated[e] & true[t]) for e in estimated for t in true if names.get(e) == rooms[t].label)
-    return out | {"accuracy": right / volume if volume else 0.0}
+    boundary = slow_boundary_f1(region_at, voxel_map.voxel_m) if estimated else 0.0
+    return out | {"accuracy": right / volume if volume else 0.0, "boundary_f1": boundary}
+
+
+def slow_boundary_f1(region_at, voxel_m):
+    """`region_at` maps each scored voxel to its estimated and its true region."""
+    estimated, true = [], []
+    for voxel, (region, room) in region_at.items():
+        for axis in range(3):
+            other = tuple(index + (axis == i) for i, index in enumerate(voxel))
+            if other in region_at:
+                doubled = np.add(voxel, other)
+                if room != region_at[other][1]:
+                    true.append(doubled)
+                if region != region_at[other][0] and -1 not in (region, region_at[other][0]):
+                    estimated.append(doubled)
+    if not (estimated or true):
+        return 1.0
+
+    def found(points, others):  # half voxels: exact at the tolerance
+        reach_squared = round((2 * 0.5 / voxel_m) ** 2, 9)
+        hits = [any(((point - other) ** 2).sum() <= reach_squared for other in others) for point in points]
+        return sum(hits) / len(hits) if hits else 0.0
+
+    precision, recall = found(estimated, true), found(true, estimated)
+    return 2 * precision * recall / (precision + recall) if precision + recall else 0.0
+
+
+def slow_calibration(scene, voxel_map, truth):
+    """Bins of confidence filled voxel by voxel."""
+    names, rooms = {r.id: r.label for r in scene.regions}, {r.id: r.label for r in truth.regions}
+    scored = [row for row, room in enumerate(truth.region_of(scene.positions_m)) if room != -1]
+    bins = [[] for _ in range(10)]
+    for voxel in voxel_map.free.tolist():
+        center = (np.array(voxel) + 0.5) * voxel_map.voxel_m
+        powers = [
+            ((center - scene.positions_m[row].astype(float)) ** 2).sum() - float(scene.radii_m[row]) ** 2
+            for row in scored
+        ]
+        if not powers or min(powers) > 0:
+            continue
+        row = scored[int(np.argmin(powers))]
+        label = names.get(int(scene.place_regions[row]))
+        if label in scene.labels:
+            confidence = float(scene.posteriors[row, scene.labels.index(label)])
+            right = label == rooms[int(truth.region_of(scene.positions_m[[row]])[0])]
+            bins[min(int(confidence * 10), 9)].append((confidence, right))
+    total = sum(map(len, bins))
+    gaps = [len(b) / total * abs(sum(c for c, _ in b) / len(b) - sum(r for _, r in b) / len(b)) for b in bins if b]
+    return sum(gaps) if total else math.nan
 
 
 @settings(max_examples=60, deadline=None)
@@ -249,7 +310,64 @@ def test_a_literal_implementation_agrees(seed):
     scene = make_scene(positions, radii, rng.integers(-1, 5, count), names)
     cut = float(rng.uniform(1, 3))
     truth = make_truth(("a", rectangle(0, cut)), ("b", rectangle(cut, 4)), ("c", rectangle(0, 3, 1.0, 9.0)))
-    assert evaluate(scene, make_map(free), truth) == pytest.approx(slow_scores(scene, make_map(free), truth), abs=1e-12)
+    expected = slow_scores(scene, make_map(free), truth)
+    assert without_ece(evaluate(scene, make_map(free), truth)) == pytest.approx(expected, abs=1e-12)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_a_literal_calibration_agrees(seed):
+    rng = np.random.default_rng(seed)
+    free = np.argwhere(rng.random((8, 8, 2)) < 0.8)
+    count = int(rng.integers(0, 10))
+    posteriors = rng.dirichlet([1, 1], count).round(int(rng.integers(1, 4)))
+    names = {0: "a", 1: "b", 2: "not in the prior"}
+    scene = make_scene(
+        rng.uniform(0, 4, (count, 3)) * [1, 1, 0.2],
+        rng.uniform(0.3, 1.5, count),
+        rng.integers(-1, 4, count),
+        names,
+        labels=["a", "b"],
+        posteriors=posteriors.reshape(count, 2),
+    )
+    truth = make_truth(("a", rectangle(0, 2)), ("b", rectangle(2, 3.5)))
+    expected = slow_calibration(scene, make_map(free), truth)
+    assert evaluate(scene, make_map(free), truth)["ece"] == pytest.approx(expected, abs=1e-12, nan_ok=True)
+
+
+def test_calibration_worked_by_hand():
+    # Kitchen voxels 0..3 believed 0.75, two of them called hall (wrong); hall voxels believed 0.95, both right.
+    # Bin 0.7: 4 voxels, half right: gap 0.25; bin 0.9: 2 voxels, gap 0.05; (4 * 0.25 + 2 * 0.05) / 6.
+    beliefs = [[0.75, 0.25]] * 2 + [[0.25, 0.75]] * 2 + [[0.0, 0.95]] * 2
+    scene = make_scene(
+        [[i + 0.5, 0.5, 0.5] for i in range(6)],
+        [0.4] * 6,
+        [0, 0, 1, 1, 1, 1],
+        {0: "kitchen", 1: "hall"},
+        labels=["kitchen", "hall"],
+        posteriors=beliefs,
+    )
+    assert evaluate(scene, ROW, ROW_TRUTH)["ece"] == pytest.approx(1.1 / 6, abs=2e-4)  # float16 on the way
+    table = reliability(scene, assign(scene, ROW, ROW_TRUTH), ROW_TRUTH)
+    assert table.volumes.tolist() == [0, 0, 0, 0, 0, 0, 0, 4, 0, 2]
+    assert table.accuracy.tolist() == [0, 0, 0, 0, 0, 0, 0, 0.5, 0, 1]
+
+
+def test_a_boundary_counts_up_to_half_a_metre_away():
+    # Voxels of 0.1 m in a row, one place each; the true wall is at x = 2. An estimated wall 5 voxels away still counts.
+    def score(cut):
+        positions = [[(i + 0.5) / 10, 0.05, 0.05] for i in range(40)]
+        regions = [int(i >= cut) for i in range(40)]
+        free = make_map([[i, 0, 0] for i in range(40)], 0.1)
+        scene = make_scene(positions, [0.04] * 40, regions, {0: "a", 1: "b"})
+        return evaluate(scene, free, make_truth(("a", rectangle(0, 2)), ("b", rectangle(2, 4))))["boundary_f1"]
+
+    assert [score(cut) for cut in (14, 15, 20, 25, 26)] == [0, 1, 1, 1, 0]
+
+
+def test_a_superfluous_boundary_costs_precision():
+    scores = row_scores([0, 1, 2, 2, 3, 3], {0: "kitchen", 1: "kitchen", 2: "kitchen", 3: "hall"})
+    assert scores["boundary_f1"] == pytest.approx(2 * (1 / 3) / (4 / 3))  # one of three is true, and it is found
 
 
 def test_equal_power_goes_to_the_smaller_index():
@@ -274,4 +392,4 @@ def test_real_ground_truth_scores_itself_perfectly(sequence):
     free = np.unique(np.floor(centers / 0.25).astype(int), axis=0)
     scene = make_scene(centers, np.full(len(centers), 0.4), ids, {r.id: r.label for r in truth.regions})
     assert len(set(ids.tolist()) - {-1}) == len(truth.regions)
-    assert set(evaluate(scene, make_map(free, 0.25), truth).values()) == {1.0}
+    assert set(without_ece(evaluate(scene, make_map(free, 0.25), truth)).values()) == {1.0}
