@@ -85,6 +85,7 @@ def build_parser() -> argparse.ArgumentParser:
     run.add_argument("--task", required=True, help="what the robot is to do, in plain words")
     run.add_argument("--regions", default="", help="fixed region names, separated by commas; default: the prior's")
     run.add_argument("--out", type=Path, default=Path("out/run"), help="folder for the results")
+    run.add_argument("--in-process", action="store_true", help="all services in this process, for debugging")
     _add_run_options(run)
 
     up = command("up", "start services and a router, until Ctrl-C", "prior-sg up segmenter scene_store")
@@ -183,6 +184,7 @@ def cmd_run(arguments: argparse.Namespace) -> int:
         speed=arguments.speed,
         settings=arguments.set,
         config=arguments.config,
+        in_process=getattr(arguments, "in_process", False),
         on_started=lambda endpoint, pids: console.print(
             f"{len(pids)} service processes: " + ", ".join(f"{name} {pid}" for name, pid in sorted(pids.items()))
         ),

@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TaskID, TextColumn, TimeElapsedColumn
 
 from deploy.client import Client
+from deploy.inprocess import InProcess
 from deploy.recorder import Recorder, Settling
 from deploy.supervisor import Supervisor
 from schemas.codec import DecodeError, Message, decode, encode
@@ -34,7 +35,7 @@ from schemas.topics import (
     VOXEL_MAP,
 )
 from services.registry import SERVICES
-from services.runtime.bus import Sample
+from services.runtime.bus import Bus, LocalBus, Sample
 from services.runtime.zenoh_bus import ZenohBus, free_endpoint, open_router
 
 QUIET_S = 1.5
@@ -63,6 +64,7 @@ class Job:
     speed: float = 0.0  # 0 = as fast as the pipeline drains
     settings: list[str] = field(default_factory=list)
     config: str = ""
+    in_process: bool = False  # all services in this process on the local bus
     on_started: Callable[[str, dict[str, int]], None] = lambda endpoint, pids: None
 
 
@@ -109,38 +111,53 @@ class Counts:
 
 def run(job: Job, console: Console) -> Result:
     """Run one source to its end. Raises RunError, BusError, ChildFailed; KeyboardInterrupt ends it early, cleanly."""
-    started_s = time.monotonic()
-    endpoint = free_endpoint(job.connect)
-    if endpoint != job.connect:
-        console.print(f"{job.connect} is in use; this run's router listens on {endpoint} (--connect {endpoint})")
     job.out.mkdir(parents=True, exist_ok=True)
     database = job.out / "scene.sqlite"
     for leftover in job.out.glob("scene.sqlite*"):
         leftover.unlink()
-    stop_router = open_router(endpoint)
     settings = [
         *job.settings,
         f"scene_store.path={database}",
         f"ingest.source={job.source}",
         f"ingest.speed={job.speed}",
     ]
-    supervisor = Supervisor(endpoint, job.robot, job.out / "logs", settings, job.config)
+    logs = job.out / "logs"
+    if job.in_process:
+        services = InProcess(job.robot, logs, settings, job.config)
+        return _run_on(LocalBus(services.hub), services, job, console)
+    endpoint = free_endpoint(job.connect)
+    if endpoint != job.connect:
+        console.print(f"{job.connect} is in use; this run's router listens on {endpoint} (--connect {endpoint})")
+    stop_router = open_router(endpoint)
     try:
-        with Client(ZenohBus(endpoint)) as client:
-            recorder = Recorder(client, job.out / "log.mcap")
-            try:
-                return Run(job, console, client, recorder, supervisor).stream(started_s)
-            finally:
-                supervisor.stop()
-                recorder.close()
+        supervisor = Supervisor(endpoint, job.robot, logs, settings, job.config)
+        return _run_on(ZenohBus(endpoint), supervisor, job, console)
     finally:
         stop_router()
+
+
+def _run_on(bus: Bus, supervisor: "Supervisor | InProcess", job: Job, console: Console) -> Result:
+    started_s = time.monotonic()
+    with Client(bus) as client:
+        recorder = Recorder(client, job.out / "log.mcap")
+        try:
+            return Run(job, console, client, recorder, supervisor).stream(started_s)
+        finally:
+            supervisor.stop()
+            recorder.close()
 
 
 class Run:
     """One run under way: its services, its bus, and what it has seen."""
 
-    def __init__(self, job: Job, console: Console, client: Client, recorder: Recorder, supervisor: Supervisor) -> None:
+    def __init__(
+        self,
+        job: Job,
+        console: Console,
+        client: Client,
+        recorder: Recorder,
+        supervisor: "Supervisor | InProcess",
+    ) -> None:
         self.job, self.console, self.client, self.recorder, self.supervisor = job, console, client, recorder, supervisor
         self.counts = Counts()
         self.settling = Settling((KEYFRAME, PLACE_DELTA, PYRAMID, REGION_DELTA))

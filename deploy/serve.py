@@ -44,11 +44,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--parent", type=int, default=0, help="end when this process is gone")
 
 
-def resolved_config(service: Service, arguments: argparse.Namespace) -> Any:
+def resolved_config(service: Service, config_path: str, settings: list[str]) -> Any:
     """The service's config from all layers. Raises ConfigError."""
-    file = read_file(arguments.config)
+    file, given = read_file(config_path), from_arguments(settings)
     check_sections(file, list(BY_NAME))
-    given = from_arguments(arguments.set)
     check_sections(given, list(BY_NAME))
     return resolve(service.config, service.name, merge(file, from_environment(os.environ), given))
 
@@ -56,7 +55,7 @@ def resolved_config(service: Service, arguments: argparse.Namespace) -> Any:
 async def serve(arguments: argparse.Namespace, instance: str) -> None:
     """Run until a signal, or until the parent is gone."""
     service = BY_NAME[arguments.service]
-    cfg = resolved_config(service, arguments)
+    cfg = resolved_config(service, arguments.config, arguments.set)
     bus = await asyncio.to_thread(ZenohBus, arguments.connect)
     robot = arguments.robot if service.scope == "robot" else "*"
     host = Host(service, bus, cfg, Identity(robot, instance, time.time_ns()))

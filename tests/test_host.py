@@ -148,7 +148,7 @@ def test_a_source_waits_for_its_first_reader_and_worker(new_bus):
         async with running(new_bus, (SOURCE, Config(frames=3), "s")) as (source,):
             await asyncio.sleep(0.5)
             assert source._state["lead"] == []
-            async with running(new_bus, (READER, Config(), "a"), (WORKER, Config(), "w")) as (reader, worker):
+            async with running(new_bus, (READER, Config(), "a"), (WORKER, Config(), "w")) as (reader, _):
                 await until(lambda: len(source._state["done"]) == 3)
                 await until(lambda: reader._state == [0, 1, 2])
 

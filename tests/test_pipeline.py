@@ -304,3 +304,18 @@ def test_ctrl_c_leaves_results_and_no_processes(tmp_path):
     assert summary(log)["KEYFRAME"] > 0
     left = subprocess.run(["pgrep", "-f", f"--parent {process.pid}"], capture_output=True, text=True, check=False)
     assert left.stdout == ""
+
+
+def test_one_process_maps_the_same_places_as_six(disturbed, tmp_path):
+    scene = disturbed[0].scene
+    job = Job(
+        source=str(shortened(tmp_path / "short.mcap", FRAMES)),
+        out=tmp_path / "out",
+        environment="residential home",
+        task="hospitality service",
+        in_process=True,
+    )
+    local = run(job, Console(quiet=True)).scene
+    for name in ("place_ids", "positions_m", "radii_m", "edges", "clearances_m", "trajectory"):
+        np.testing.assert_array_equal(getattr(local, name), getattr(scene, name))
+    assert (local.place_regions >= 0).all() and local.labels == scene.labels

@@ -1,0 +1,199 @@
+"""What all methods are compared on: the places, the map and the encoded crops of one sequence, made in this process.
+
+Making them takes minutes and judging methods takes seconds, so they are kept on disk, under a digest of everything that
+determines them: the source's files, the settings, and the code that made them.
+"""
+
+import hashlib
+import json
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from deploy.evaluation.metrics import GroundTruth
+from schemas.codec import Message, decode, encode
+from schemas.features import Pyramid, TextEmbeddings, TextRequest
+from schemas.frames import Keyframe
+from schemas.places import MapRequest, PlaceDelta, SnapshotRequest, VoxelMap
+from schemas.topics import KEYFRAME, PLACE_SNAPSHOT, TEXT, VOXEL_MAP
+from services.ingest.sources import Source, open_source
+from services.registry import BY_NAME
+from services.runtime.config import resolve
+from services.runtime.service import Identity
+
+ROBOT = "eval"
+PERCEIVING = ("ingest", "place_graph", "feature_pyramid")  # services whose settings and code make a perception
+
+Layers = Mapping[str, Mapping[str, Any]]
+Report = Callable[[str, int, int], None]  # what is being done, steps done, steps in all (0 = unknown)
+TextOf = Callable[[Sequence[Sequence[str]]], TextEmbeddings]
+
+
+class EvaluationError(RuntimeError):
+    """An evaluation cannot run; the message is one sentence that says what to do."""
+
+
+@dataclass(frozen=True)
+class Perception:
+    """One sequence, perceived."""
+
+    name: str
+    places: PlaceDelta  # the whole place graph
+    voxels: VoxelMap
+    pyramids: tuple[Pyramid, ...]
+    space: str
+    text: TextOf  # concept descriptors in that space
+    seconds: dict[str, float] = field(default_factory=dict)  # what making it took, by part; 0 = was on disk
+
+
+class Cache:
+    """Lists of byte strings on disk, by kind and by everything that determines them."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def get(self, kind: str, key: Any) -> list[bytes] | None:
+        """What was kept, or None."""
+        path = self._path(kind, key)
+        return msgspec.msgpack.decode(path.read_bytes(), type=list[bytes]) if path.exists() else None
+
+    def put(self, kind: str, key: Any, content: list[bytes]) -> None:
+        """Keep it; a half-written file never counts."""
+        path = self._path(kind, key)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial = path.with_suffix(".partial")
+        partial.write_bytes(msgspec.msgpack.encode(content))
+        partial.replace(path)
+
+    def _path(self, kind: str, key: Any) -> Path:
+        digest = hashlib.blake2b(json.dumps(msgspec.to_builtins(key), sort_keys=True).encode(), digest_size=16)
+        return self.folder / f"{kind}-{digest.hexdigest()}.msgpack"
+
+
+class Perceiver:
+    """Perceives sequences, with one loaded encoder per setting at most."""
+
+    def __init__(self, layers: Layers, cache: Cache, report: Report) -> None:
+        self.layers, self.cache, self.report = layers, cache, report
+        self._workers: dict[Any, Any] = {}
+        self._code = {name: code_digest(name) for name in PERCEIVING}
+
+    def perceive(self, path: Path, features: Mapping[str, Any] | None = None) -> Perception:
+        """Places and pyramids of a sequence; `features` are settings of the feature pyramid that differ."""
+        source = open_source(path)
+        cfg = self._config("feature_pyramid", features)
+        seconds: dict[str, float] = {}
+        snapshot, voxels = self._kept("places", path, None, lambda: self._places(source), seconds)
+        pyramids = self._kept("features", path, cfg, lambda: self._pyramids(source, cfg), seconds)
+        return Perception(
+            name=sequence_name(path),
+            places=decode(PlaceDelta, snapshot),
+            voxels=decode(VoxelMap, voxels),
+            pyramids=tuple(decode(Pyramid, pyramid) for pyramid in pyramids),
+            space=cfg.space,
+            text=lambda concepts: self._text(concepts, cfg),
+            seconds=seconds,
+        )
+
+    def _kept(
+        self, kind: str, path: Path, features: Any, make: Callable[[], list[bytes]], seconds: dict[str, float]
+    ) -> list[bytes]:
+        services = PERCEIVING if features is not None else PERCEIVING[:2]
+        made_by = {name: (self._config(name), self._code[name]) for name in services if name != "feature_pyramid"}
+        if features is not None:
+            made_by = {"ingest": made_by["ingest"], "feature_pyramid": (features, self._code["feature_pyramid"])}
+        key = {"source": source_digest(path), "made_by": made_by}
+        seconds[kind] = 0.0
+        content = self.cache.get(f"{sequence_name(path)}-{kind}", key)
+        if content is None:
+            started_s = time.perf_counter()
+            content = make()
+            seconds[kind] = time.perf_counter() - started_s
+            self.cache.put(f"{sequence_name(path)}-{kind}", key, content)
+        return content
+
+    def _config(self, name: str, changes: Mapping[str, Any] | None = None) -> Any:
+        layers = {name: {**self.layers.get(name, {}), **(changes or {})}}
+        return resolve(BY_NAME[name].config, name, layers)
+
+    def _places(self, source: Source) -> list[bytes]:
+        service, cfg = BY_NAME["place_graph"], self._config("place_graph")
+        state = service.init(cfg, Identity(ROBOT, "place_graph", 1))
+        for keyframe in self._keyframes(source, "places"):
+            for _ in service.step(state, keyframe, cfg):
+                pass
+        replies: list[Message] = [
+            service.answers[PLACE_SNAPSHOT](state, SnapshotRequest(robot=ROBOT), cfg),
+            service.answers[VOXEL_MAP](state, MapRequest(robot=ROBOT), cfg),
+        ]
+        return [encode(reply) for reply in replies]
+
+    def _pyramids(self, source: Source, cfg: Any) -> list[bytes]:
+        worker, step = self._worker(cfg), BY_NAME["feature_pyramid"].step
+        frames = self._keyframes(source, "features")
+        return [encode(output[1]) for frame in frames for output in step(worker, frame, cfg) if isinstance(output, tuple)]
+
+    def _keyframes(self, source: Source, what: str) -> Iterator[Keyframe]:
+        """The keyframes that ingest selects, each with a report of how far the source is."""
+        service, cfg = BY_NAME["ingest"], self._config("ingest")
+        state = service.init(cfg, Identity(ROBOT, "ingest", 1))
+        for index, frame in enumerate(source):
+            self.report(f"{sequence_name(source.path)}: {what}", index, source.total)
+            for output in service.step(state, frame, cfg):
+                if isinstance(output, tuple) and output[0] is KEYFRAME and isinstance(output[1], Keyframe):
+                    yield output[1]
+        self.report(f"{sequence_name(source.path)}: {what}", source.total, source.total)
+
+    def _text(self, concepts: Sequence[Sequence[str]], cfg: Any) -> TextEmbeddings:
+        request = TextRequest(space=cfg.space, concepts=[list(phrases) for phrases in concepts])
+        key = {"request": request, "code": self._code["feature_pyramid"]}
+        content = self.cache.get("text", key)
+        if content is None:
+            content = [encode(BY_NAME["feature_pyramid"].answers[TEXT](self._worker(cfg), request, cfg))]
+            self.cache.put("text", key, content)
+        return decode(TextEmbeddings, content[0])
+
+    def _worker(self, cfg: Any) -> Any:
+        """The encoder of these settings; weights are loaded when something is not on disk yet."""
+        key = (cfg.space, cfg.threads, cfg.batch_size)
+        if key not in self._workers:
+            self.report(f"loading {cfg.space}", 0, 0)
+            self._workers[key] = BY_NAME["feature_pyramid"].init(cfg, Identity(ROBOT, "worker", 1))
+        return self._workers[key]
+
+
+def sequence_name(path: Path) -> str:
+    """What a sequence is called in tables: its folder, or its file without the suffix."""
+    return path.stem if path.is_file() else path.resolve().name
+
+
+def ground_truth(path: Path) -> GroundTruth:
+    """The true regions of a sequence. Raises EvaluationError when it has none."""
+    truth = open_source(path).ground_truth
+    if truth is None:
+        raise EvaluationError(f"{path} has no ground truth: put a regions.json beside its frames")
+    try:
+        return GroundTruth.from_json(truth)
+    except ValueError as error:
+        raise EvaluationError(f"{path}: {error}") from error
+
+
+def source_digest(path: Path) -> dict[str, Any]:
+    """What tells one state of a source from another without reading it: its place, and times and sizes of its files."""
+    path = path.resolve()
+    entries = [path, *sorted(path.iterdir())] if path.is_dir() else [path]
+    stats = [(entry.name, entry.stat()) for entry in entries]
+    return {"path": str(path), "entries": [(name, stat.st_mtime_ns, stat.st_size) for name, stat in stats]}
+
+
+def code_digest(service: str) -> str:
+    """Digest of a service's source files: whoever changes the code does not judge what the former code made."""
+    folder = Path(__file__).parent.parent.parent / "services" / service
+    digest = hashlib.blake2b(digest_size=16)
+    for file in sorted(folder.glob("*.py")):
+        digest.update(file.name.encode() + file.read_bytes())
+    return digest.hexdigest()
