@@ -39,7 +39,7 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
     keyframes overlap by more than half at 60 to 75 degrees of view.
     """
 
-    source: str = ""  # dataset folder, 7-Scenes folder or MCAP log; empty = no source
+    source: str = ""  # a folder of a layout in docs/sources.md, or an MCAP log; empty = no source
     source_robot: str = ""  # of a log with several robots: the one to read; empty = the first
     world_up: list[float] = msgspec.field(default_factory=list)  # up in the source's world; empty = as the layout says
     floor_m: float = 0.0  # height of the floor in the source's world, measured along world_up; becomes z = 0

@@ -7,19 +7,29 @@ regions.json      ground truth, where it exists
 """
 
 import csv
-import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from schemas.frames import Intrinsics
-from services.geometry import pose_from_quaternion
 from services.ingest.core import BadFrame, RawFrame
-from services.ingest.sources.base import UP, FrameError, Rig, Source, SourceError, levelling, read_bytes
+from services.ingest.sources.base import (
+    CAMERA,
+    REGIONS,
+    UP,
+    FrameError,
+    Rig,
+    Source,
+    SourceError,
+    camera_of,
+    levelling,
+    quaternion_pose,
+    read_bytes,
+    read_json,
+)
 
-CAMERA, TRAJECTORY, REGIONS = "camera.json", "trajectory.csv", "regions.json"
+TRAJECTORY = "trajectory.csv"
+LOOKS = f"{CAMERA} and {TRAJECTORY} (dataset folder)"
 COLUMNS = ("frame", "stamp_ns", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
 
 
@@ -30,17 +40,15 @@ def fits(path: Path) -> bool:
 
 def load(path: Path, world_up: Sequence[float] = (), floor_m: float = 0.0) -> Source:
     """A dataset folder as a source. Raises SourceError."""
-    camera = _json(path / CAMERA)
+    camera = read_json(path / CAMERA)
     rows = _rows(path / TRAJECTORY)
+    intrinsics = camera_of(path / CAMERA, camera)
     try:
-        intrinsics = Intrinsics(
-            int(camera["width"]), int(camera["height"]), *(float(camera[name]) for name in ("fx", "fy", "cx", "cy"))
-        )
         depth_scale_m = float(camera["depth_scale_m"])
     except (KeyError, TypeError, ValueError) as error:
         raise SourceError(f"{path / CAMERA} is not a camera: {error!r}") from error
     rig = Rig(intrinsics, depth_scale_m, len(rows), levelling(world_up or UP, floor_m))
-    ground_truth = _json(path / REGIONS) if (path / REGIONS).is_file() else None
+    ground_truth = read_json(path / REGIONS) if (path / REGIONS).is_file() else None
     return Source("dataset", path, intrinsics, len(rows), lambda: _frames(path, rig, rows), ground_truth)
 
 
@@ -58,13 +66,10 @@ def _frames(path: Path, rig: Rig, rows: list[dict[str, str]]) -> Iterator[RawFra
 def _posed(row: dict[str, str]) -> tuple[int, int, np.ndarray]:
     try:
         frame_id, stamp_ns = int(row["frame"]), int(row["stamp_ns"])
-        position_m = np.array([float(row[name]) for name in COLUMNS[2:5]])
-        quaternion_xyzw = np.array([float(row[name]) for name in COLUMNS[5:]])
+        words = [str(float(row[name])) for name in COLUMNS[2:]]
     except (TypeError, ValueError) as error:
         raise FrameError(f"its row of {TRAJECTORY} is malformed: {error}") from error
-    if not np.isfinite(position_m).all() or not 0 < np.linalg.norm(quaternion_xyzw) < np.inf:
-        raise FrameError("its pose is not finite")
-    return frame_id, stamp_ns, pose_from_quaternion(position_m, quaternion_xyzw)
+    return frame_id, stamp_ns, quaternion_pose(words)
 
 
 def _images(path: Path, frame_id: int) -> tuple[bytes, bytes]:
@@ -83,11 +88,4 @@ def _rows(path: Path) -> list[dict[str, str]]:
                 raise SourceError(f"{path} lacks the columns {', '.join(missing)}")
             return list(reader)
     except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise SourceError(f"{path} cannot be read: {error}") from error
-
-
-def _json(path: Path) -> Any:
-    try:
-        return json.loads(path.read_text())
-    except (OSError, ValueError) as error:
         raise SourceError(f"{path} cannot be read: {error}") from error

@@ -19,6 +19,7 @@ from services.ingest.sources.base import FrameError, Rig, Source, SourceError, l
 from services.ingest.sources.images import ImageError, image_size
 
 POSES, SEQUENCES = "frame-*.pose.txt", "seq-*"
+LOOKS = f"{POSES} or {SEQUENCES}/{POSES} (7-Scenes folder)"
 INTRINSICS = "camera-intrinsics.txt"
 PUBLISHED = (585.0, 585.0, 320.0, 240.0)  # fx fy cx cy of the data set's description
 UP = (0.0, -1.0, 0.0)
