@@ -314,14 +314,45 @@ def test_beta_zero_labels_each_place_by_its_own_evidence():
     np.testing.assert_array_equal(run.state.places.labels, run.state.places.unary.argmin(axis=1))
 
 
-def test_pairwise_costs_by_hand():
+@pytest.mark.parametrize(("clearance_m", "factor"), [(0.0, 1.0), (0.8, 0.5), (0.2, 1.0)])
+def test_pairwise_costs_by_hand(clearance_m, factor):
     """Two places 1 m apart with clearance 0.4: beta exp(-1 / 2) (-log 0.3) = 2 x 0.60653 x 1.20397 = 1.46049."""
     positions = np.array([(0.0, 0.0, 1.0), (1.0, 0.0, 1.0)])
-    for cfg, factor in ((CFG, 1.0), (core.Config(edge_clearance_m=0.8), 0.5), (core.Config(edge_clearance_m=0.2), 1.0)):
-        run = Run(cfg=cfg).feed(place_delta(positions, np.array([(0, 1)])), task(), prior(ROOMS[:2]))
-        mrf = core.field_of(run.state, cfg)
-        assert mrf.weights[0] * mrf.pairwise[0, 1] == pytest.approx(1.46049 * factor, abs=1e-4)
-        assert mrf.pairwise[0, 0] == 0
+    cfg = core.Config(edge_clearance_m=clearance_m, edge_sum=0.0)
+    run = Run(cfg=cfg).feed(place_delta(positions, np.array([(0, 1)])), task(), prior(ROOMS[:2]))
+    mrf = core.field_of(run.state, cfg)
+    assert mrf.weights[0] * mrf.pairwise[0, 1] == pytest.approx(1.46049 * factor, abs=1e-4)
+    assert mrf.pairwise[0, 0] == 0
+
+
+@pytest.mark.parametrize("scale", [1.0, 50.0])
+def test_edge_weights_by_hand(scale):
+    """Equal edges 0-1, 1-2, 1-3 with sum 3 at a place: 3 / sqrt(1 x 3) = 1.73205 each, whatever their length."""
+    positions = scale * np.array([(0.0, 0.0, 1.0), (1.0, 0.0, 1.0), (2.0, 0.0, 1.0), (1.0, 1.0, 1.0)])
+    positions[:, 2] = 1.0
+    run = Run().feed(place_delta(positions, np.array([(0, 1), (1, 2), (1, 3)])))
+    np.testing.assert_allclose(core.edge_weights(run.state.graph, CFG), np.sqrt(3.0), rtol=1e-6)
+
+
+def test_edge_weights_fall_with_length():
+    """Path of 1 m and 3 m: w = 0.60653, 0.22313; 3 w / sqrt(d_u d_v) = 3 sqrt(w / 0.82966) = 2.5651, 1.5558."""
+    positions = np.array([(0.0, 0.0, 1.0), (1.0, 0.0, 1.0), (4.0, 0.0, 1.0)])
+    run = Run().feed(place_delta(positions, np.array([(0, 1), (1, 2)])))
+    np.testing.assert_allclose(core.edge_weights(run.state.graph, CFG), (2.5651, 1.5558), atol=1e-4)
+
+
+def test_a_label_the_encoder_favours_everywhere_does_not_take_the_map():
+    """The hall's similarity is read too high in all rooms; the proportions of the map tell."""
+    positions, edges, frames = world()
+    shifted = text(np.eye(len(ROOMS)), background_mean=np.array((0.0, -0.8, 0.0), dtype=np.float32))
+    right = {}
+    for limit in (0.0, 10.0):
+        cfg = core.Config(beta=0.0, balance=core.BalanceConfig(limit=limit, half_places=1.0))
+        run = Run(cfg=cfg).feed(place_delta(positions, edges), task(), prior(ROOMS), answer_text=False)
+        run.feed(shifted, *frames, TICK)
+        inside = positions[:, 0] % 4.0 != 0
+        right[limit] = (run.state.places.labels == positions[:, 0] // 4.0)[inside].mean()
+    assert right[0.0] < 0.75 and right[10.0] > 0.9
 
 
 def test_object_phrases_are_the_most_discriminative():
@@ -336,7 +367,14 @@ def test_text_is_asked_in_the_configured_space():
 
 
 @pytest.mark.parametrize(
-    "fields", [{"experts": {"smell": 1.0}}, {"edge_decay_m": 0.0}, {"probability_floor": 0.0}, {"beta": -1.0}]
+    "fields",
+    [
+        {"experts": {"smell": 1.0}},
+        {"edge_decay_m": 0.0},
+        {"probability_floor": 0.0},
+        {"beta": -1.0},
+        {"edge_sum": -1.0},
+    ],
 )
 def test_impossible_settings_are_refused(fields):
     with pytest.raises(ValueError):

@@ -6,11 +6,11 @@ from segmenter_world import prior, text
 
 from schemas.priors import RegionPrior
 from services.segmenter.experts import REGISTRY
-from services.segmenter.experts.context import Context
+from services.segmenter.experts.context import Context, standardised
 
 
-def context(descriptors, frames, **changes):
-    concepts = text(
+def context(descriptors, frames, concepts=None, bias=(0.0, 0.0)):
+    concepts = concepts or text(
         np.array([(1.0, 0.0), (0.0, 1.0)]),
         background_mean=np.array((0.5, 0.1), dtype=np.float32),
         background_std=np.array((0.25, 0.5), dtype=np.float32),
@@ -24,7 +24,11 @@ def context(descriptors, frames, **changes):
     padded = np.zeros((len(descriptors), 6))
     padded[:, :2] = descriptors
     return Context(
-        prior=prior(["kitchen", "hall"], regions=regions), text=concepts, descriptors=padded, frames=np.array(frames)
+        prior=prior(["kitchen", "hall"], regions=regions),
+        text=concepts,
+        similarity=standardised(padded, concepts),
+        frames=np.array(frames),
+        bias=np.array(bias),
     )
 
 
@@ -38,6 +42,13 @@ def test_visual_by_hand():
     np.testing.assert_allclose(np.exp(log_probabilities[0]), (0.26894, 0.73106), atol=1e-5)
 
 
+def test_visual_bias_by_hand():
+    """Odds of hall against kitchen are e^(1.4 - 0.4) = e; a bias of (0.5, -0.5) makes them even; the null has none."""
+    log_probabilities, confidence = REGISTRY["visual"](context([(0.6, 0.8)], [3], bias=(0.5, -0.5)))
+    np.testing.assert_allclose(np.exp(log_probabilities[0]), (0.5, 0.5))
+    assert confidence[0] == pytest.approx(2 * np.exp(0.9) / (2 * np.exp(0.9) + np.exp(0.5)))
+
+
 def test_visual_says_nothing_of_places_never_observed():
     log_probabilities, confidence = REGISTRY["visual"](context([(0.0, 0.0), (1.0, 0.0)], [0, 1]))
     assert confidence[0] == 0
@@ -46,23 +57,14 @@ def test_visual_says_nothing_of_places_never_observed():
 
 
 def test_visual_confidence_falls_when_the_null_class_wins():
-    far = context([(0.6, 0.8)], [1])
-    lower = Context(
-        prior=far.prior,
-        text=text(np.eye(2), temperature=1.0, null_score=50.0),
-        descriptors=far.descriptors,
-        frames=far.frames,
-    )
+    lower = context([(0.6, 0.8)], [1], text(np.eye(2), temperature=1.0, null_score=50.0))
     log_probabilities, confidence = REGISTRY["visual"](lower)
     assert confidence[0] < 1e-15
     assert np.exp(log_probabilities).sum() == pytest.approx(1.0)
 
 
 def test_visual_is_stable_at_extreme_temperatures():
-    base = context([(0.6, 0.8)], [1])
-    hot = Context(
-        prior=base.prior, text=text(np.eye(2), temperature=1e4), descriptors=base.descriptors, frames=base.frames
-    )
+    hot = context([(0.6, 0.8)], [1], text(np.eye(2), temperature=1e4))
     log_probabilities, confidence = REGISTRY["visual"](hot)
     assert np.isfinite(log_probabilities).all()
     assert confidence[0] == pytest.approx(1.0)

@@ -18,8 +18,9 @@ from schemas.regions import ExpertVote, PosteriorReply, PosteriorRequest, Region
 from schemas.status import Tick
 from services.deltas import Follower
 from services.segmenter import descriptors, publication, regions, swap
+from services.segmenter.balance import BalanceConfig, label_bias
 from services.segmenter.experts import REGISTRY, Vote
-from services.segmenter.experts.context import Context
+from services.segmenter.experts.context import Context, standardised
 from services.segmenter.graph import PlaceGraph, Step, apply
 
 UNLABELLED = -1
@@ -36,9 +37,11 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
     )
     beta: float = 2.0  # weight of the pairwise term (paper)
     edge_decay_m: float = 2.0  # w_dist = exp(-length / edge_decay_m)
+    edge_sum: float = 3.0  # sum of w_dist at a place, whatever the graph's density and scale; 0 = w_dist as it is
     edge_clearance_m: float = 0.0  # > 0: w_dist times min(clearance / edge_clearance_m, 1); no gain seen, so off
     probability_floor: float = 1e-6  # least probability in a logarithm, so that every cost is finite
-    object_phrases: int = 0  # objects whose phrases join a region's concept, the most discriminative first
+    object_phrases: int = 2  # objects whose phrases join a region's concept, the most discriminative first
+    balance: BalanceConfig = msgspec.field(default_factory=BalanceConfig)  # beyond the paper
     trust_half: float = 0.5  # sum of trust at which half of the unknown mass is left
     posterior_change: float = 0.01  # smaller changes of a belief are not sent
     footprint_cell_m: float = 0.1  # grid of the regions' areas
@@ -49,8 +52,10 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
         unknown = sorted(set(self.experts) - set(REGISTRY))
         if unknown:
             raise ValueError(f"no such expert: {', '.join(unknown)}; there are {', '.join(sorted(REGISTRY))}")
-        if not (self.beta >= 0 and self.edge_decay_m > 0 and 0 < self.probability_floor < 1 and self.trust_half > 0):
-            raise ValueError("beta, edge_decay_m, probability_floor or trust_half is out of range")
+        if not (self.beta >= 0 and self.edge_decay_m > 0 and self.edge_sum >= 0):
+            raise ValueError("beta, edge_decay_m or edge_sum is out of range")
+        if not (0 < self.probability_floor < 1 and self.trust_half > 0):
+            raise ValueError("probability_floor or trust_half is out of range")
 
 
 @dataclass(frozen=True)
@@ -74,9 +79,10 @@ class Places:
 
     labels: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))  # UNLABELLED = not yet
     regions: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    similarity: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))  # (place, label) standardised
     unary: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))  # (place, label)
     known: np.ndarray = field(default_factory=lambda: np.zeros(0))  # c_vis T / (T + T_half)
-    stale: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=bool))  # unary is to be computed again
+    stale: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=bool))  # similarity is to be computed again
 
     def realigned(self, step: Step) -> "Places":
         """The same beliefs on the rows of the next graph; new places have none."""
@@ -84,12 +90,13 @@ class Places:
         after = Places(
             labels=np.full(len(old), UNLABELLED),
             regions=np.full(len(old), regions.NO_REGION),
+            similarity=np.zeros((len(old), self.similarity.shape[1])),
             unary=np.zeros((len(old), self.unary.shape[1])),
             known=np.zeros(len(old)),
             stale=step.moved.copy(),
         )
         before = step.previous[old]
-        for name in ("labels", "regions", "unary", "known"):
+        for name in ("labels", "regions", "similarity", "unary", "known"):
             getattr(after, name)[old] = getattr(self, name)[before]
         after.stale[old] |= self.stale[before]
         return after
@@ -113,6 +120,7 @@ class State:
     priors: dict[str, Prior] = field(default_factory=dict)  # by digest, latest arrival last
     texts: dict[tuple[str, ...], TextEmbeddings] = field(default_factory=dict)  # by concepts
     alignment: Alignment | None = None
+    bias: np.ndarray = field(default_factory=lambda: np.zeros(0))  # (label,) of the visual scores in this map
     next_region_id: int = 0
     published: publication.View | None = None
     dirty: bool = False  # something changed since the last solution
@@ -234,7 +242,9 @@ def align(state: State, cfg: Config) -> bool:
         state.query_radius_m = query_radius_m
         _reintegrate(state, np.arange(len(state.graph.ids)), cfg)
     state.places.labels[:] = UNLABELLED
+    state.places.similarity = np.zeros((len(state.graph.ids), len(prior.regions)))
     state.places.unary = np.zeros((len(state.graph.ids), len(prior.regions)))
+    state.bias = np.zeros(len(prior.regions))
     state.places.stale[:] = True
     return True
 
@@ -256,43 +266,69 @@ def region_concepts(prior: Prior, object_phrases: int) -> list[list[str]]:
 
 def votes(state: State, rows: np.ndarray, cfg: Config) -> dict[str, Vote]:
     """Each configured expert's vote on the places in `rows`; probabilities are floored."""
-    alignment, evidence = state.alignment, state.evidence
+    alignment = state.alignment
     assert alignment is not None
-    slots = evidence.of(state.graph.ids[rows].tolist())
-    found = evidence.descriptors(slots)
-    if not found.shape[1]:  # before the first pyramid
-        found = np.zeros((len(rows), alignment.text.embeddings.shape[1]))
-    context = Context(prior=alignment.prior, text=alignment.text, descriptors=found, frames=evidence.frames[slots])
+    context = Context(
+        prior=alignment.prior,
+        text=alignment.text,
+        similarity=state.places.similarity[rows],
+        frames=state.evidence.frames[state.evidence.of(state.graph.ids[rows].tolist())],
+        bias=state.bias,
+    )
     floor = np.log(cfg.probability_floor)
     answers = {name: REGISTRY[name](context) for name in cfg.experts}
     return {name: (np.maximum(log_probabilities, floor), sure) for name, (log_probabilities, sure) in answers.items()}
 
 
-def evaluate_experts(state: State, cfg: Config) -> None:
-    """Unary potentials of all places whose evidence changed (eqs. product_of_experts, unary_potential)."""
-    rows = np.flatnonzero(state.places.stale)
-    if not len(rows):
-        return
-    answers = votes(state, rows, cfg)
-    unary = np.zeros((len(rows), state.places.unary.shape[1]))
-    for name, (log_probabilities, confidence) in answers.items():
-        unary -= (confidence * cfg.experts[name])[:, None] * log_probabilities
-    state.places.unary[rows] = unary
-    trust = state.evidence.trust[state.evidence.of(state.graph.ids[rows].tolist())]
-    sight = answers["visual"][1] if "visual" in answers else np.zeros(len(rows))
-    state.places.known[rows] = sight * trust / (trust + cfg.trust_half)
+def compare(state: State) -> None:
+    """Similarity of the places whose evidence changed with each label."""
+    alignment, evidence, rows = state.alignment, state.evidence, np.flatnonzero(state.places.stale)
+    assert alignment is not None
+    found = evidence.descriptors(evidence.of(state.graph.ids[rows].tolist()))
+    if found.shape[1]:  # after the first pyramid
+        state.places.similarity[rows] = standardised(found, alignment.text)
     state.places.stale[rows] = False
+
+
+def evaluate_experts(state: State, cfg: Config) -> None:
+    """Unary potentials of all places (eqs. product_of_experts, unary_potential), after the map's bias is known."""
+    assert state.alignment is not None
+    compare(state)
+    places, prior, slots = state.places, state.alignment.prior, state.evidence.of(state.graph.ids.tolist())
+    scores = state.alignment.text.temperature * places.similarity[state.evidence.frames[slots] > 0]
+    existence = np.array([region.existence for region in prior.regions])
+    state.bias = label_bias(scores, existence, cfg.balance)
+    answers = votes(state, np.arange(len(slots)), cfg)
+    places.unary = np.zeros((len(slots), len(existence)))
+    for name, (log_probabilities, confidence) in answers.items():
+        places.unary -= (confidence * cfg.experts[name])[:, None] * log_probabilities
+    trust = state.evidence.trust[slots]
+    sight = answers["visual"][1] if "visual" in answers else np.zeros(len(slots))
+    places.known = sight * trust / (trust + cfg.trust_half)
+
+
+def edge_weights(graph: PlaceGraph, cfg: Config) -> np.ndarray:
+    """w_dist (edge,) of eq. pairwise_potential: falls with length, then scaled symmetrically.
+
+    With w and the sums of w at both ends, d_u and d_v, the weight is edge_sum w / sqrt(d_u d_v): a place is held by its
+    neighbours about as firmly in a dense graph of small rooms as in a sparse one of large halls.
+    """
+    first, second = graph.edges.T
+    lengths_m = np.linalg.norm(graph.positions_m[first] - graph.positions_m[second], axis=1)
+    weights = np.exp(-lengths_m / cfg.edge_decay_m)
+    if cfg.edge_sum > 0:
+        weights = np.maximum(weights, np.finfo(float).tiny)
+        sums = np.bincount(graph.edges.reshape(-1), np.repeat(weights, 2), minlength=len(graph.ids))
+        weights = cfg.edge_sum * weights / (np.sqrt(sums[first]) * np.sqrt(sums[second]))
+    if cfg.edge_clearance_m > 0:
+        weights = weights * np.minimum(graph.clearances_m / cfg.edge_clearance_m, 1.0)
+    return weights
 
 
 def field_of(state: State, cfg: Config) -> swap.Field:
     """The Markov random field over the place graph (eqs. mrf_energy, pairwise_potential)."""
     assert state.alignment is not None
-    graph = state.graph
-    first, second = graph.positions_m[graph.edges[:, 0]], graph.positions_m[graph.edges[:, 1]]
-    weights = np.exp(-np.linalg.norm(first - second, axis=1) / cfg.edge_decay_m)
-    if cfg.edge_clearance_m > 0:
-        weights = weights * np.minimum(graph.clearances_m / cfg.edge_clearance_m, 1.0)
-    return swap.Field(state.places.unary, graph.edges, weights, state.alignment.pairwise)
+    return swap.Field(state.places.unary, state.graph.edges, edge_weights(state.graph, cfg), state.alignment.pairwise)
 
 
 def _segment(state: State, switched: bool, cfg: Config) -> Iterator[RegionDelta]:
@@ -370,7 +406,7 @@ def snapshot(state: State) -> RegionDelta:
 
 
 def explain(state: State, request: PosteriorRequest, cfg: Config) -> PosteriorReply:
-    """Each expert's vote on one place, from the evidence as it stands."""
+    """Each expert's vote on one place, as it was when the labels were last found."""
     row = int(state.graph.rows(np.array([request.place_id]))[0])
     if row < 0 or state.alignment is None or state.places.labels[row] == UNLABELLED:
         return PosteriorReply(robot=state.robot, place_id=request.place_id, found=False)

@@ -20,7 +20,7 @@ PAIRS_PER_BLOCK = 1 << 19  # frame-place pairs tested at once; bounds the memory
 class KernelConfig(msgspec.Struct, frozen=True, kw_only=True):
     """Which places a frame observes, and how its crops are weighted."""
 
-    gamma: float = 0.5  # bandwidth of the scale trust, in squared natural logarithms (unpublished)
+    gamma: float = 1.0  # bandwidth of the scale trust, in squared natural logarithms (unpublished)
     min_depth_m: float = 0.3  # places closer to the camera plane are not observed
     max_depth_m: float = 10.0  # nor places further away
     border_share: float = 0.0  # share of the image's sides, at its border, in which places are not observed

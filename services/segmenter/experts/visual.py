@@ -8,14 +8,13 @@ from services.segmenter.experts.context import Context
 def visual(context: Context) -> tuple[np.ndarray, np.ndarray]:
     """Softmax with a null class over standardised cosine similarities (paper, The Visual Expert).
 
-    The similarity of each concept is first standardised by its own mean and spread over the space's background set,
-    z = (s - mean) / std, which removes the concept's bias in this space; `temperature` and `null_score` refer to z.
+    The scores are temperature times similarity plus the map's bias of each label; the null class has no bias.
     Confidence is the mass that the null class leaves, and 0 for a place that no frame has observed.
     """
     text = context.text
-    similarity = context.descriptors @ text.embeddings.astype(np.float64).T
-    z = (similarity - text.background_mean) / text.background_std
-    scores = text.temperature * np.column_stack((z, np.full(len(z), text.null_score)))
+    scores = text.temperature * context.similarity + context.bias
+    null = np.full(len(scores), text.temperature * text.null_score)
+    scores = np.column_stack((scores, null))
     log_mass = scores - _log_sum_exp(scores)
     log_confidence = _log_sum_exp(log_mass[:, :-1])
     confidence = np.where(context.frames > 0, np.exp(log_confidence[:, 0]), 0.0)
