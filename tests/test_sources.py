@@ -19,6 +19,7 @@ from services.geometry import back_project, transform
 from services.ingest.core import BadFrame, RawFrame
 from services.ingest.sources import SourceError, open_source
 from services.ingest.sources.lidar import depth_image
+from services.ingest.sources.scannet import resampled
 from services.ingest.sources.tum import associate
 
 ROOM = np.array(((0.5, -1.0, 0.0), (5.5, 3.0, 2.6)))  # lower and upper corner, metres, z up
@@ -515,6 +516,38 @@ def test_scannet_colour_is_resampled_onto_the_depth_camera(tmp_path):
     assert shifted.mean() > 1.5 * difference.mean()  # three pixels beside it would be noticed
 
 
+def test_scannet_resampling_keeps_to_the_pixel():
+    """On a ramp the value is the place: each depth pixel has that of its ray, to a fraction of a pixel."""
+    v, u = np.indices((48, 64))
+    ramp = np.stack((3 * u, 4 * v, 4 * v), axis=-1).astype(np.uint8)
+    color_matrix = np.array(((62.0, 0, 31.6), (0, 63.0, 22.8), (0, 0, 1)))
+    depth_matrix = np.array(((30.0, 0, 15.2), (0, 30.5, 11.9), (0, 0, 1)))
+    camera = Intrinsics(32, 24, 30.0, 30.5, 15.2, 11.9)
+    image = resampled(ramp, color_matrix @ np.linalg.inv(depth_matrix), camera)
+    y, x = np.indices((24, 32))[:, 3:-3, 3:-3]
+    column, row = (x - 15.2) / 30.0 * 62.0 + 31.6, (y - 11.9) / 30.5 * 63.0 + 22.8
+    difference = image[3:-3, 3:-3].astype(float) - np.stack((3 * column, 4 * row, 4 * row), axis=-1)
+    assert np.abs(difference.mean(axis=(0, 1))).max() < 0.25  # 8 bits are rounded twice; a quarter pixel is 0.75
+    assert np.abs(difference).max() < 1.2
+
+
+def test_coda_raw_images_lose_their_distortion(tmp_path):
+    """Bright spots drawn where the lens puts some rays come out where a pinhole puts them."""
+    folder, files = coda_raw(tmp_path)
+    points = np.array([(x, y, 1.0) for x in (-0.6, -0.3, 0.2, 0.65) for y in (-0.55, 0.1, 0.5)])
+    bent = cv2.projectPoints(points, np.zeros(3), np.zeros(3), CODA_MATRIX, np.array(CODA_LENS))[0].reshape(-1, 2)
+    straight = (points @ CODA_MATRIX.T)[:, :2]
+    assert np.linalg.norm(bent - straight, axis=1).max() > 2
+    v, u = np.indices((512, 612))
+    spots = sum(255 * np.exp(-((u - x) ** 2 + (v - y) ** 2) / 18) for x, y in bent)
+    write(files["color"], np.repeat(spots[..., None], 3, axis=-1).astype(np.uint8))
+    image = decoded(list(open_source(folder))[1].color)[..., 0].astype(float)
+    for x, y in straight:
+        near = np.where((np.abs(u - x) < 12) & (np.abs(v - y) < 12) & (image > 20), image, 0)
+        assert (near * u).sum() / near.sum() == pytest.approx(x, abs=0.3)
+        assert (near * v).sum() / near.sum() == pytest.approx(y, abs=0.3)
+
+
 def test_coda_root_with_one_sequence_is_that_sequence_and_with_two_asks(tmp_path):
     folder, _ = coda(tmp_path)
     root = folder.parents[2]
@@ -553,6 +586,16 @@ def test_lidar_depth_is_exact_on_planes_and_empty_across_a_jump():
     np.testing.assert_allclose(depth[10:50, 5:37], 2.0, atol=1e-12)
     np.testing.assert_allclose(depth[10:50, 42:75], 5.0, atol=1e-12)
     assert set(np.unique(np.round(depth, 9))) == {0.0, 2.0, 5.0}  # nothing in between
+
+
+def test_lidar_depth_is_exact_on_a_slanted_plane():
+    """The plane z = 3 + 0.4 x - 0.3 y, measured at a few points."""
+    x, y = np.meshgrid(np.linspace(-0.7, 0.7, 29), np.linspace(-0.5, 0.5, 21))
+    z = 3 / (1 - 0.4 * x + 0.3 * y)
+    depth = depth_image(np.stack((x * z, y * z, z), axis=-1), CAMERA)
+    px, py = (np.indices((60, 80))[1] - 39.5) / 60, (np.indices((60, 80))[0] - 29.5) / 60
+    inside = (np.abs(px) < 0.65) & (np.abs(py) < 0.45)
+    np.testing.assert_allclose(depth[inside], (3 / (1 - 0.4 * px + 0.3 * py))[inside], atol=1e-9)
 
 
 def test_lidar_depth_keeps_the_nearest_and_forgets_points_that_are_not_there():
