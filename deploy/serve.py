@@ -67,6 +67,7 @@ async def serve(arguments: argparse.Namespace, instance: str) -> None:
         await host.run()
     finally:
         watcher.cancel()
+        bus.close()  # also when the service never got so far as to leave by itself
 
 
 async def _stop_with_parent(host: Host, parent: int) -> None:

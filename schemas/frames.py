@@ -35,7 +35,9 @@ class Intrinsics(msgspec.Struct, frozen=True):
 def check_pose(world_from_camera: np.ndarray) -> None:
     """Raise ValueError unless the matrix is a rigid motion."""
     rotation = world_from_camera[..., :3, :3]
-    if np.abs(rotation @ np.swapaxes(rotation, -1, -2) - np.eye(3)).max(initial=0.0) > ROTATION_TOLERANCE:
+    with np.errstate(over="ignore", invalid="ignore"):
+        deviation = np.abs(rotation @ np.swapaxes(rotation, -1, -2) - np.eye(3)).max(initial=0.0)
+    if not deviation <= ROTATION_TOLERANCE:  # also when huge entries made it infinite or not a number
         raise ValueError("world_from_camera: rotation is not orthonormal")
     if (np.linalg.det(rotation) <= 0).any():
         raise ValueError("world_from_camera: rotation mirrors")
