@@ -599,8 +599,9 @@ def test_lidar_depth_is_exact_on_a_slanted_plane():
 
 
 def test_lidar_depth_keeps_the_nearest_and_forgets_points_that_are_not_there():
-    scan = np.concatenate((scan_of_planes(5.0, 5.0), scan_of_planes(2.0, 2.0)), axis=0)
-    np.testing.assert_allclose(depth_image(scan, CAMERA)[10:50, 5:75], 2.0, atol=1e-12)
+    for first, second in ((5.0, 2.0), (2.0, 5.0)):
+        scan = np.concatenate((scan_of_planes(first, first), scan_of_planes(second, second)), axis=0)
+        np.testing.assert_allclose(depth_image(scan, CAMERA)[10:50, 5:75], 2.0, atol=1e-12)
     scan = scan_of_planes(5.0, 5.0)
     scan[10:14, 10:20] = np.nan
     scan[:, 30:] *= -1  # behind the camera
