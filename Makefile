@@ -20,7 +20,7 @@ check: $(VENV)/installed-dev
 	$(BIN)/lint-imports
 	$(BIN)/prior-sg topics --check
 
-bench: $(VENV)/installed
+bench: $(VENV)/installed-dev
 	$(BIN)/prior-sg bench all --json
 
 $(VENV)/installed: pyproject.toml constraints.txt

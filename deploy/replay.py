@@ -19,7 +19,6 @@ from services.runtime.service import Ask, Identity, Service
 
 TOPIC_BY_NAME = {topic.name: topic for topic in TOPICS}
 QUERY_BY_NAME = {query.name: query for query in QUERIES}
-FLOAT_TOLERANCE = 1e-6
 
 
 @dataclass
@@ -126,13 +125,14 @@ def compare(log: Log, life: Life) -> Comparison:
             replayed.setdefault(topic.name, []).append(message)
     recorded = log.recorded(life)
     differences: list[str] = []
+    tolerance = log.service.replay_tolerance
     for name in sorted(replayed.keys() | recorded.keys()):
         new, old = replayed.get(name, []), recorded.get(name, [])
         # A process killed in mid-step may have published outputs of an input that never reached its journal.
         if len(new) != len(old) and (life.ended_cleanly or len(new) > len(old)):
             differences.append(f"{name}: {len(old)} recorded, {len(new)} replayed")
         for index, (before, after) in enumerate(zip(old, new, strict=False)):
-            differences += [f"{name}[{index}].{text}" for text in message_differences(before, after)]
+            differences += [f"{name}[{index}].{text}" for text in message_differences(before, after, tolerance)]
     return Comparison(
         life.instance,
         len(life.inputs),
@@ -142,21 +142,23 @@ def compare(log: Log, life: Life) -> Comparison:
     )
 
 
-def message_differences(before: Message, after: Message) -> list[str]:
+def message_differences(before: Message, after: Message, tolerance: float = 0.0) -> list[str]:
     """Fields in which two messages differ, floats beyond the tolerance."""
     if encode(before) == encode(after):
         return []
-    return list(_differences("", before, after))
+    return list(_differences("", before, after, tolerance))
 
 
-def _differences(path: str, before: Any, after: Any) -> Iterator[str]:
+def _differences(path: str, before: Any, after: Any, tolerance: float) -> Iterator[str]:
     if isinstance(before, msgspec.Struct) and type(before) is type(after):
         for name in before.__struct_fields__:
-            yield from _differences(f"{path}.{name}" if path else name, getattr(before, name), getattr(after, name))
+            yield from _differences(
+                f"{path}.{name}" if path else name, getattr(before, name), getattr(after, name), tolerance
+            )
     elif isinstance(before, np.ndarray):
         if before.shape != after.shape:
             yield f"{path}: shape {before.shape} became {after.shape}"
-        elif not np.allclose(before, after, rtol=FLOAT_TOLERANCE, atol=FLOAT_TOLERANCE):
+        elif not np.allclose(before, after, rtol=tolerance, atol=tolerance):
             worst = np.abs(np.asarray(before, float) - np.asarray(after, float)).max()
             yield f"{path}: differs by up to {worst:.3g}"
     elif isinstance(before, (list, tuple)):
@@ -164,9 +166,9 @@ def _differences(path: str, before: Any, after: Any) -> Iterator[str]:
             yield f"{path}: {len(before)} items became {len(after)}"
             return
         for index, (one, other) in enumerate(zip(before, after, strict=True)):
-            yield from _differences(f"{path}[{index}]", one, other)
+            yield from _differences(f"{path}[{index}]", one, other, tolerance)
     elif isinstance(before, float) and isinstance(after, float):
-        if not math.isclose(before, after, rel_tol=FLOAT_TOLERANCE, abs_tol=FLOAT_TOLERANCE):
+        if not math.isclose(before, after, rel_tol=tolerance, abs_tol=tolerance):
             yield f"{path}: {before!r} became {after!r}"
     elif before != after:
         yield f"{path}: {before!r} became {after!r}"

@@ -115,4 +115,5 @@ SERVICE = Service(
     answers={TEXT: answer_text},
     job=ENCODE,
     key_fields=lambda cfg: {"space": cfg.space},
+    replay_tolerance=2e-3,  # of half-precision embeddings
 )

@@ -60,4 +60,5 @@ class Service:
     drive: Callable[[Any, Any], Awaitable[None]] | None = None
     key_fields: Callable[[Any], dict[str, str]] = lambda cfg: {}  # config values that appear in keys of `answers`
     close: Callable[[Any], None] = lambda state: None
+    replay_tolerance: float = 1e-6  # by which floats of a replay may differ; networks differ with threads and machine
     replay_config: Callable[[Any], Any] = lambda cfg: cfg  # the config for a replay, which must touch nothing outside
