@@ -16,8 +16,8 @@ class Config:
     standardised: bool = True  # compare concepts by standardised similarity rather than by cosine
 
 
-# The visual expert's scale, whatever dev says: with region phrases alone it beats cosines there (0.17 against 0.11, mean
-# of F1_S and penalised mIoU_S), with object phrases too it does not (0.13 against 0.14).
+# The visual expert's scale, whatever dev says: with region phrases alone it beats cosines there (0.17 against 0.11,
+# mean of F1_S and penalised mIoU_S), with object phrases too it does not (0.13 against 0.14).
 TUNED = Config()
 
 

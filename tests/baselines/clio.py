@@ -30,10 +30,10 @@ class Config:
     max_depth_m: float = 10.0
 
 
-# Tuned on split dev (mean of F1_S and penalised mIoU_S, with our segmenter's concepts) for our encoder, whose cosines have
-# another scale and offset per concept than ViT-L's. Tried: standardised, score_threshold 2 to 5, max_delta 0.005 to 0.05,
-# max_depth_m 3, 5, 10; cosines, score_threshold 0.1 to 0.3, max_delta 0.005 to 0.03, max_depth_m 3, 5. A threshold of 2
-# leaves nearly all above the null task.
+# Tuned on split dev (mean of F1_S and penalised mIoU_S, with our segmenter's concepts) for our encoder, whose
+# cosines have another scale and offset per concept than ViT-L's. Tried: standardised, score_threshold 2 to 5,
+# max_delta 0.005 to 0.05, max_depth_m 3, 5, 10; cosines, score_threshold 0.1 to 0.3, max_delta 0.005 to 0.03,
+# max_depth_m 3, 5. A threshold of 2 leaves nearly all above the null task.
 TUNED = Config(standardised=True, score_threshold=2.0, max_delta=0.02, max_depth_m=5.0)
 
 

@@ -43,8 +43,8 @@ class Config:
     standardised: bool = False  # views vote by standardised similarity instead of cosine
 
 
-# Tuned on split dev (mean of F1_S and penalised mIoU_S, with our segmenter's concepts). Tried: both scales of similarity;
-# wall_share 0.1, 0.25, 0.4; wall_from_m 1.0, 1.5.
+# Tuned on split dev (mean of F1_S and penalised mIoU_S, with our segmenter's concepts). Tried: both scales of
+# similarity; wall_share 0.1, 0.25, 0.4; wall_from_m 1.0, 1.5.
 TUNED = Config(standardised=True, wall_share=0.1)
 
 

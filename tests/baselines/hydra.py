@@ -24,8 +24,8 @@ class Config:
     standardised: bool = True  # scale of the similarity that names rooms; Hydra itself does not name them
 
 
-# Tuned on split dev (mean of F1_S and penalised mIoU_S, with our segmenter's concepts). Tried: min_dilation_m 0.3 to 0.5;
-# max_dilation_m 0.8, 1.2; min_component_size 5, 10, 15; min_lifetime_ratio 0.15, 0.25, 0.5.
+# Tuned on split dev (mean of F1_S and penalised mIoU_S, with our segmenter's concepts). Tried: min_dilation_m 0.3
+# to 0.5; max_dilation_m 0.8, 1.2; min_component_size 5, 10, 15; min_lifetime_ratio 0.15, 0.25, 0.5.
 TUNED = Config(min_dilation_m=0.4, min_component_size=5)
 
 
