@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.table import Table
 
 from deploy import serve
+from deploy.evaluation import command as evaluation
 
 if TYPE_CHECKING:
     from deploy.client import Client
@@ -130,6 +131,14 @@ def build_parser() -> argparse.ArgumentParser:
     health = command("health", "show every running process and its topics", "prior-sg health --json")
     health.add_argument("--json", action="store_true", help="print JSON")
     _add_bus(health, robot=False)
+
+    evaluation.add_arguments(
+        command(
+            "eval",
+            "compare methods on datasets with ground truth",
+            'prior-sg eval recordings/home --environment "residential home" --methods ours,clio --html',
+        )
+    )
 
     bench = command("bench", "measure one part, or all", "prior-sg bench places --json")
     bench.add_argument("name", help="bus, places, features, swap, e2e, or all")
@@ -428,6 +437,16 @@ def cmd_bench(arguments: argparse.Namespace) -> int:
                 table.add_row(metric, f"{value:.4g}")
             console.print(table)
     return 0
+
+
+def cmd_eval(arguments: argparse.Namespace) -> int:
+    """Compare methods on datasets with ground truth."""
+    from deploy.evaluation.perception import EvaluationError
+
+    try:
+        return evaluation.run(arguments, console)
+    except EvaluationError as error:
+        raise UserError(str(error)) from error
 
 
 def cmd_priors(arguments: argparse.Namespace) -> int:

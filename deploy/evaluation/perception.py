@@ -1,7 +1,8 @@
 """What all methods are compared on: the places, the map and the encoded crops of one sequence, made in this process.
 
-Making them takes minutes and judging methods takes seconds, so they are kept on disk, under a digest of everything that
-determines them: the source's files, the settings, and the code that made them.
+Making them takes minutes and judging methods takes seconds, so they are kept on disk, under a digest of what
+determines them: the names, times and sizes of the source's files, the settings, and the code that made them, other than
+the loaders of sources: whoever changes one of those deletes the cache.
 """
 
 import hashlib
@@ -26,7 +27,7 @@ from services.runtime.config import resolve
 from services.runtime.service import Identity
 
 ROBOT = "eval"
-PERCEIVING = ("ingest", "place_graph", "feature_pyramid")  # services whose settings and code make a perception
+CODE = {"ingest": "core.py", "place_graph": "*.py", "feature_pyramid": "*.py"}  # what makes a perception
 
 Layers = Mapping[str, Mapping[str, Any]]
 Report = Callable[[str, int, int], None]  # what is being done, steps done, steps in all (0 = unknown)
@@ -80,7 +81,7 @@ class Perceiver:
     def __init__(self, layers: Layers, cache: Cache, report: Report) -> None:
         self.layers, self.cache, self.report = layers, cache, report
         self._workers: dict[Any, Any] = {}
-        self._code = {name: code_digest(name) for name in PERCEIVING}
+        self._code = {name: code_digest(name, files) for name, files in CODE.items()}
 
     def perceive(self, path: Path, features: Mapping[str, Any] | None = None) -> Perception:
         """Places and pyramids of a sequence; `features` are settings of the feature pyramid that differ."""
@@ -102,10 +103,11 @@ class Perceiver:
     def _kept(
         self, kind: str, path: Path, features: Any, make: Callable[[], list[bytes]], seconds: dict[str, float]
     ) -> list[bytes]:
-        services = PERCEIVING if features is not None else PERCEIVING[:2]
-        made_by = {name: (self._config(name), self._code[name]) for name in services if name != "feature_pyramid"}
-        if features is not None:
-            made_by = {"ingest": made_by["ingest"], "feature_pyramid": (features, self._code["feature_pyramid"])}
+        made_by = {"ingest": (self._config("ingest"), self._code["ingest"])}
+        if features is None:
+            made_by["place_graph"] = (self._config("place_graph"), self._code["place_graph"])
+        else:
+            made_by["feature_pyramid"] = (features, self._code["feature_pyramid"])
         key = {"source": source_digest(path), "made_by": made_by}
         seconds[kind] = 0.0
         content = self.cache.get(f"{sequence_name(path)}-{kind}", key)
@@ -135,7 +137,9 @@ class Perceiver:
     def _pyramids(self, source: Source, cfg: Any) -> list[bytes]:
         worker, step = self._worker(cfg), BY_NAME["feature_pyramid"].step
         frames = self._keyframes(source, "features")
-        return [encode(output[1]) for frame in frames for output in step(worker, frame, cfg) if isinstance(output, tuple)]
+        return [
+            encode(output[1]) for frame in frames for output in step(worker, frame, cfg) if isinstance(output, tuple)
+        ]
 
     def _keyframes(self, source: Source, what: str) -> Iterator[Keyframe]:
         """The keyframes that ingest selects, each with a report of how far the source is."""
@@ -190,10 +194,10 @@ def source_digest(path: Path) -> dict[str, Any]:
     return {"path": str(path), "entries": [(name, stat.st_mtime_ns, stat.st_size) for name, stat in stats]}
 
 
-def code_digest(service: str) -> str:
+def code_digest(service: str, files: str) -> str:
     """Digest of a service's source files: whoever changes the code does not judge what the former code made."""
     folder = Path(__file__).parent.parent.parent / "services" / service
     digest = hashlib.blake2b(digest_size=16)
-    for file in sorted(folder.glob("*.py")):
+    for file in sorted(folder.glob(files)):
         digest.update(file.name.encode() + file.read_bytes())
     return digest.hexdigest()

@@ -1,14 +1,15 @@
 """Priors to judge with: the library's, variations of it, and priors with less or more knowledge than it has."""
 
+import itertools
 from collections.abc import Sequence
 
 import msgspec
 import numpy as np
 
-from deploy.evaluation.metrics import NO_REGION, GroundTruth
+from deploy.evaluation.metrics import GroundTruth
 from deploy.evaluation.perception import EvaluationError
 from schemas.places import PlaceDelta
-from schemas.priors import Prior, PriorRequest, RegionPrior
+from schemas.priors import Prior, PriorList, PriorRequest, RegionPrior
 from schemas.topics import PRIORS
 from services.registry import BY_NAME
 from services.runtime.service import Identity
@@ -23,6 +24,7 @@ def library_prior(environment: str, task: str, names: Sequence[str]) -> Prior:
     cfg = service.config()
     state = service.init(cfg, Identity("*", "prior_gateway", 1))
     reply = service.answers[PRIORS](state, PriorRequest(environment=environment, task=task, regions=list(names)), cfg)
+    assert isinstance(reply, PriorList)
     if not reply.priors:
         raise EvaluationError(f"no prior for the environment {environment!r}: {reply.reason}")
     return reply.priors[0]
@@ -69,8 +71,8 @@ def without_structure(prior: Prior) -> Prior:
 
 
 def with_one_phrase(prior: Prior) -> Prior:
-    """Regions are described by the first of their phrases, their name."""
-    regions = [msgspec.structs.replace(region, phrases=region.phrases[:1]) for region in prior.regions]
+    """Regions are described by their name alone."""
+    regions = [msgspec.structs.replace(region, phrases=[region.name]) for region in prior.regions]
     return _changed(prior, regions, prior.containment, prior.adjacency, "one phrase")
 
 
@@ -94,11 +96,9 @@ def counted(prior: Prior, truth: GroundTruth, places: PlaceDelta) -> Prior:
     region_of_place = dict(zip(places.place_ids.tolist(), true_ids.tolist(), strict=True))
     joined = {frozenset((region_of_place[a], region_of_place[b])) for a, b in places.edges.tolist()}
     touching, pairs = np.zeros((2, len(names), len(names)))
-    for one in label_of:
-        for other in label_of:
-            if one != other and NO_REGION not in (one, other):
-                pairs[label_of[one], label_of[other]] += 1
-                touching[label_of[one], label_of[other]] += frozenset((one, other)) in joined
+    for (one, row), (other, column) in itertools.permutations(label_of.items(), 2):
+        pairs[row, column] += 1
+        touching[row, column] += frozenset((one, other)) in joined
     adjacency = (touching + PSEUDO_COUNT) / (pairs + 2 * PSEUDO_COUNT)
     np.fill_diagonal(adjacency, np.diag(prior.adjacency))
     regions = [

@@ -1,0 +1,258 @@
+"""The methods that are compared: ours, its ablations and sweeps, and the baselines of the source checkout."""
+
+import importlib
+import importlib.util
+import itertools
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from deploy.evaluation import oracles, priors
+from deploy.evaluation.metrics import GroundTruth
+from deploy.evaluation.perception import ROBOT, EvaluationError, Perception
+from schemas.codec import Message
+from schemas.features import Pyramid, TextEmbeddings, TextRequest
+from schemas.places import PlaceDelta
+from schemas.priors import Prior, Task
+from schemas.regions import RegionDelta
+from schemas.scene import Scene
+from schemas.status import Tick
+from services.registry import BY_NAME
+from services.runtime.service import Ask, Identity
+from services.scene_store import core as store
+from services.segmenter.core import Config, State, region_concepts
+from services.segmenter.experts import REGISTRY
+
+OURS = "ours"
+BASELINES = ("clio", "hovsg", "hydra", "argmax")
+BASELINE_FOLDER = Path(__file__).parent.parent.parent / "tests" / "baselines"
+BASELINE_PACKAGE = "prior_sg_baselines"
+NEVER_M, ANY_SCALE = 1e6, 1e9
+SWEEPS: dict[str, tuple[Any, ...]] = {
+    "crop": (112, 224, 448),
+    "encoder": tuple(f"conse/efficientnet-lite{size}/minilm-l6-v2" for size in (0, 1, 2)),
+    "radius": (0.375, 0.75, 1.5, 3.0),
+}
+
+
+@dataclass(frozen=True)
+class Case:
+    """One sequence with one prior."""
+
+    perception: Perception
+    prior: Prior
+    truth: GroundTruth
+
+
+@dataclass(frozen=True)
+class Method:
+    """Something that turns a case into a scene."""
+
+    name: str
+    run: Callable[[Case], Scene]
+    about: str = ""
+    group: str = "method"  # or ablation, oracle, and the names of SWEEPS
+    features: Mapping[str, Any] = field(default_factory=dict)  # settings of the feature pyramid that differ
+    value: float | str = ""  # of a sweep
+
+
+@dataclass(frozen=True)
+class Variant:
+    """Our method with parts of it changed or taken away."""
+
+    config: Config
+    prior: Callable[[Case], Prior] = lambda case: case.prior
+    pyramids: Callable[[Case], Sequence[Pyramid]] = lambda case: case.perception.pyramids
+    text: Callable[[TextEmbeddings], TextEmbeddings] = lambda text: text
+    seen: Callable[[Case, State], None] = lambda case, state: None  # may change what the segmenter has seen
+
+    def run(self, case: Case) -> Scene:
+        """Places, then all pyramids, then task and prior: the field is solved once, over everything."""
+        prior, perception = self.prior(case), case.perception
+        config = msgspec.structs.replace(self.config, space=perception.space)
+        task = Task(robot=ROBOT, stamp_ns=0, environment=prior.environment, task=prior.task, regions=prior.vocabulary)
+        segmenter = Segmenter(config, lambda concepts: self.text(perception.text(concepts)))
+        segmenter.read([perception.places, *self.pyramids(case)])
+        self.seen(case, segmenter.state)
+        return segmenter.read([task, prior, Tick(stamp_ns=1)])
+
+
+class Segmenter:
+    """The segmenter without a bus, its text questions answered on the spot."""
+
+    def __init__(self, config: Config, text: Callable[[list[list[str]]], TextEmbeddings]) -> None:
+        self.config, self.text = config, text
+        self.state: State = BY_NAME["segmenter"].init(config, Identity(ROBOT, "segmenter", 1))
+        self._graph = store.Graph(ROBOT)
+
+    def read(self, messages: Sequence[Message]) -> Scene:
+        """The scene after these messages."""
+        waiting = list(messages)
+        while waiting:
+            message = waiting.pop(0)
+            if isinstance(message, PlaceDelta):
+                store.apply_places(self._graph, message)
+            for output in list(BY_NAME["segmenter"].step(self.state, message, self.config)):
+                if not isinstance(output, Ask):
+                    assert isinstance(output[1], RegionDelta)
+                    store.apply_regions(self._graph, output[1])
+                elif isinstance(output.request, TextRequest):
+                    waiting.insert(0, self.text(output.request.concepts))
+        return store.scene(self._graph)
+
+
+def ours(config: Config) -> Method:
+    """The product as configured."""
+    return Method(OURS, Variant(config).run, "the segmenter as configured")
+
+
+def ablations(config: Config) -> list[Method]:
+    """Experts switched on one by one (the paper's table), then single parts taken away."""
+    kernel = config.kernel
+
+    def bare(case: Case) -> Prior:
+        return priors.with_one_phrase(case.prior)
+
+    def large(case: Case) -> list[Pyramid]:
+        return [oracles.top_layer(pyramid) for pyramid in case.perception.pyramids]
+
+    unscaled = msgspec.structs.replace(kernel, gamma=ANY_SCALE)
+    unhidden = msgspec.structs.replace(kernel, occlusion_tolerance_m=NEVER_M)
+    parts = {
+        "no pairwise term": (Variant(msgspec.structs.replace(config, beta=0.0)), "beta = 0"),
+        "no scale trust": (Variant(msgspec.structs.replace(config, kernel=unscaled)), "crops of any scale count alike"),
+        "no occlusion test": (Variant(msgspec.structs.replace(config, kernel=unhidden)), "hidden places count as seen"),
+        "global feature": (
+            Variant(msgspec.structs.replace(config, kernel=unscaled), pyramids=large),
+            "only the pyramid's largest crops, which show nearly the whole image",
+        ),
+        "one phrase": (Variant(config, prior=bare), "each region is described by its name alone"),
+        "raw similarity": (Variant(config, text=raw_similarity), "similarities are not standardised per concept"),
+    }
+    rows = [Method(name, variant.run, about, "ablation") for name, (variant, about) in parts.items()]
+    return expert_rows(config) + rows
+
+
+def expert_rows(config: Config) -> list[Method]:
+    """Every set of registered experts with the visual one; without E the prior's structure is uniform.
+
+    An object expert without E has nothing to say (paper, Ablation Studies) and is left out.
+    """
+    weights = {name: config.experts.get(name, Config().experts.get(name, 1.0)) for name in REGISTRY}
+    others = [name for name in REGISTRY if name not in ("visual", "environment")]
+    rows = []
+    for size, structure in itertools.product(range(len(others) + 1), (False, True)):
+        for extra in itertools.combinations(others, size):
+            if not structure and any(name.startswith("object") for name in extra):
+                continue
+            chosen = ("visual", *(["environment"] if structure else []), *extra)
+            variant = Variant(msgspec.structs.replace(config, experts={name: weights[name] for name in chosen}))
+            if not structure:
+                variant = replace(variant, prior=lambda case: priors.without_structure(case.prior))
+            letters = "+".join(name[0].upper() for name in chosen)
+            rows.append(Method(letters, variant.run, "experts: " + ", ".join(chosen), "ablation"))
+    return rows
+
+
+def raw_similarity(text: TextEmbeddings) -> TextEmbeddings:
+    """One mean and spread for all concepts, so that standardising only shifts and scales."""
+    ones = np.ones_like(text.background_mean)
+    return msgspec.structs.replace(
+        text, background_mean=ones * text.background_mean.mean(), background_std=ones * text.background_std.mean()
+    )
+
+
+def oracle(config: Config, name: str) -> Method:
+    """Our method with one part replaced by the truth."""
+    if name == "prior":
+        variant = Variant(config, prior=lambda case: priors.counted(case.prior, case.truth, case.perception.places))
+        about = "existence and adjacency counted from the ground truth"
+    elif name == "features":
+        variant = Variant(config, pyramids=lambda case: _true_pyramids(case, config.object_phrases))
+        about = "crops carry the text embedding of the true region that most of their points lie in"
+    else:
+        variant = Variant(config, seen=lambda case, state: _see_truth(case, state, config.object_phrases))
+        about = "places carry the text embedding of their true region"
+    return Method(f"oracle {name}", variant.run, about, "oracle")
+
+
+def _concepts(case: Case, object_phrases: int) -> dict[str, np.ndarray]:
+    text = case.perception.text(region_concepts(case.prior, object_phrases))
+    return dict(zip([region.name for region in case.prior.regions], text.embeddings, strict=True))
+
+
+def _true_pyramids(case: Case, object_phrases: int) -> list[Pyramid]:
+    concepts = _concepts(case, object_phrases)
+    return [oracles.true_features(pyramid, case.truth, concepts) for pyramid in case.perception.pyramids]
+
+
+def _see_truth(case: Case, state: State, object_phrases: int) -> None:
+    """Observed places inside a true region are as if its text had been seen there."""
+    labels = {region.id: region.label for region in case.truth.regions}
+    concepts, evidence = _concepts(case, object_phrases), state.evidence
+    slots = evidence.of(state.graph.ids.tolist())
+    for slot, region in zip(slots.tolist(), case.truth.region_of(state.graph.positions_m).tolist(), strict=True):
+        if evidence.frames[slot] and labels.get(region) in concepts:
+            evidence.sums[slot] = concepts[labels[region]]
+
+
+def sweep(config: Config, kind: str) -> list[Method]:
+    """Our method over the values of one setting."""
+    rows = []
+    for value in SWEEPS[kind]:
+        features = {"crop": {"smallest_crop_px": value}, "encoder": {"space": value}}.get(kind, {})
+        variant = Variant(config)
+        if kind == "radius":
+            variant = Variant(config, prior=lambda case, value=value: priors.with_radius(case.prior, value))  # type: ignore[misc]
+        rows.append(Method(f"{kind} {value}", variant.run, f"ours with {kind} {value}", kind, features, value))
+    return rows
+
+
+def baseline(name: str, object_phrases: int = 0, folder: Path = BASELINE_FOLDER) -> Method:
+    """A method of the checkout's tests, with its tuned settings, on the same places, crops and concepts.
+
+    Baselines hold no beliefs, so their scenes have no posteriors. Raises EvaluationError outside a checkout.
+    """
+    package = _baseline_package(folder)
+    if not (folder / f"{name}.py").exists():
+        raise EvaluationError(f"there is no method {name!r}: choose from {', '.join((OURS, *BASELINES))}")
+    module = importlib.import_module(f"{package.__name__}.{name}")
+    common = importlib.import_module(f"{package.__name__}.common")
+
+    def run(case: Case) -> Scene:
+        perception, prior = case.perception, case.prior
+        inputs = common.Inputs.of(
+            perception.places,
+            perception.pyramids,
+            [region.name for region in prior.regions],
+            perception.text(region_concepts(prior, object_phrases)),
+            perception.voxels,
+            query_radius_m=float(np.median([region.query_radius_m for region in prior.regions])),
+        )
+        answer = module.segment(inputs, module.TUNED)
+        scene = common.to_scene(inputs, answer.labels, answer.regions)
+        return msgspec.structs.replace(scene, posteriors=np.zeros((len(scene.place_ids), 0), np.float16))
+
+    return Method(name, run, (module.__doc__ or "").strip().splitlines()[0])
+
+
+def _baseline_package(folder: Path) -> ModuleType:
+    """The folder as an importable package, without touching the import path."""
+    if BASELINE_PACKAGE in sys.modules:
+        return sys.modules[BASELINE_PACKAGE]
+    init = folder / "__init__.py"
+    if not init.exists():
+        raise EvaluationError("baselines live in tests/baselines of a source checkout; without one use --methods ours")
+    spec = importlib.util.spec_from_file_location(BASELINE_PACKAGE, init, submodule_search_locations=[str(folder)])
+    assert spec is not None
+    assert spec.loader is not None
+    package = importlib.util.module_from_spec(spec)
+    sys.modules[BASELINE_PACKAGE] = package
+    spec.loader.exec_module(package)
+    return package

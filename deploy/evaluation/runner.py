@@ -1,0 +1,155 @@
+"""Runs methods over sequences and priors, and sums up."""
+
+import math
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from deploy.evaluation.methods import Case, Method
+from deploy.evaluation.metrics import SCORES, GroundTruth, Reliability, assign, evaluate, reliability
+from deploy.evaluation.perception import Perception, Report
+from deploy.evaluation.priors import variations
+from schemas.features import TextEmbeddings
+from schemas.places import VoxelMap
+from schemas.priors import Prior
+from schemas.scene import Scene
+
+KEYS = (*SCORES, "seconds")
+NO_LABEL = "(none)"
+
+PerceiveOf = Callable[[Path, Mapping[str, Any]], Perception]
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """One sequence to judge on."""
+
+    name: str
+    path: Path
+    truth: GroundTruth
+    prior: Prior  # the library's
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """One method on one sequence with one prior."""
+
+    sequence: str
+    method: Method
+    prior: int  # 0 = the library's
+    scores: dict[str, float]  # by KEYS; NaN where a method has no such score
+
+
+@dataclass(frozen=True)
+class Picture:
+    """What a method made of a sequence with the library's prior."""
+
+    sequence: str
+    method: Method
+    scene: Scene
+    voxels: VoxelMap
+    calibration: Reliability
+    confusion: dict[tuple[str, str], int]  # voxels by (true label, estimated label)
+
+
+@dataclass(frozen=True)
+class Results:
+    """Everything an evaluation found."""
+
+    sequences: tuple[Dataset, ...]
+    methods: tuple[Method, ...]
+    outcomes: tuple[Outcome, ...]
+    pictures: tuple[Picture, ...]
+    perceiving_s: dict[str, dict[str, float]]  # by sequence and part; 0 = was on disk
+
+    def mean(self, method: str, key: str, sequence: str = "") -> float:
+        """Over priors, and over sequences where none is named."""
+        return _summary(self._values(method, key, sequence), np.mean)
+
+    def sd(self, method: str, key: str, sequence: str = "") -> float:
+        """Standard deviation over the same values, 0 for one."""
+        return _summary(self._values(method, key, sequence), np.std)
+
+    def table(self) -> dict[str, Any]:
+        """`{"sequences": {NAME: {METHOD: {...}}}, "mean": {METHOD: {...}}, "sd": {METHOD: {...}}}`; None = no score."""
+        names = [method.name for method in self.methods]
+        return {
+            "sequences": {s.name: {m: self._row(self.mean, m, s.name) for m in names} for s in self.sequences},
+            "mean": {m: self._row(self.mean, m) for m in names},
+            "sd": {m: self._row(self.sd, m) for m in names},
+        }
+
+    def _row(self, summary: Callable[..., float], method: str, sequence: str = "") -> dict[str, float | None]:
+        values = {key: summary(method, key, sequence) for key in KEYS}
+        return {key: None if math.isnan(value) else value for key, value in values.items()}
+
+    def _values(self, method: str, key: str, sequence: str) -> list[float]:
+        found = (o for o in self.outcomes if o.method.name == method and sequence in ("", o.sequence))
+        return [o.scores[key] for o in found if not math.isnan(o.scores[key])]
+
+
+def run(
+    sequences: Sequence[Dataset],
+    methods: Sequence[Method],
+    perceive: PerceiveOf,
+    report: Report,
+    *,
+    priors: int = 1,
+    strength: float = 0.5,
+) -> Results:
+    """Every method on every sequence with every prior, each prior a variation of the library's."""
+    outcomes: list[Outcome] = []
+    pictures: list[Picture] = []
+    perceiving_s: dict[str, dict[str, float]] = {}
+    for sequence in sequences:
+        perceptions: dict[str, Perception] = {}
+        for done, method in enumerate(methods):
+            report(f"{sequence.name}: {method.name}", done, len(methods))
+            key = repr(sorted(method.features.items()))
+            if key not in perceptions:
+                perceptions[key] = perceive(sequence.path, method.features)
+                perceiving_s.setdefault(sequence.name, perceptions[key].seconds)
+            for index, prior in enumerate(variations(sequence.prior, priors, strength)):
+                outcome, picture = judge(method, Case(perceptions[key], prior, sequence.truth), index)
+                outcomes.append(outcome)
+                pictures += [picture] if index == 0 else []
+        report(sequence.name, len(methods), len(methods))
+    return Results(tuple(sequences), tuple(methods), tuple(outcomes), tuple(pictures), perceiving_s)
+
+
+def judge(method: Method, case: Case, prior: int = 0) -> tuple[Outcome, Picture]:
+    """Run a method on a case and compare with the truth; `seconds` is the method's own time, without the encoder's."""
+    encoding_s = 0.0
+
+    def text(concepts: Sequence[Sequence[str]]) -> TextEmbeddings:
+        nonlocal encoding_s
+        asked_s = time.perf_counter()
+        reply = case.perception.text(concepts)
+        encoding_s += time.perf_counter() - asked_s
+        return reply
+
+    started_s = time.perf_counter()
+    scene = method.run(replace(case, perception=replace(case.perception, text=text)))
+    seconds = time.perf_counter() - started_s - encoding_s
+    name, voxels = case.perception.name, case.perception.voxels
+    scores = evaluate(scene, voxels, case.truth) | {"seconds": seconds}
+    assignment = assign(scene, voxels, case.truth)
+    labels = {region.id: region.label or NO_LABEL for region in scene.regions}
+    true_labels = {region.id: region.label for region in case.truth.regions}
+    confusion: dict[tuple[str, str], int] = {}
+    rows = zip(
+        assignment.true_ids.tolist(), assignment.estimated_ids.tolist(), assignment.volumes.tolist(), strict=True
+    )
+    for true_id, estimated_id, volume in rows:
+        pair = (true_labels[true_id], labels.get(estimated_id, NO_LABEL))
+        confusion[pair] = confusion.get(pair, 0) + volume
+    calibration = reliability(scene, assignment, case.truth)
+    return Outcome(name, method, prior, scores), Picture(name, method, scene, voxels, calibration, confusion)
+
+
+def _summary(values: list[float], summary: Callable[..., Any]) -> float:
+    return float(summary(values)) if values else float("nan")
