@@ -125,6 +125,7 @@ def disturbed(tmp_path_factory):
         task="real-estate listing",
         connect="tcp/127.0.0.1:0",
         workers=2,
+        speed=0.5,  # slow enough for the trouble to happen in mid-stream on a fast machine
         on_started=on_started,
     )
     result = run(job, Console(quiet=True))
