@@ -81,7 +81,7 @@ def build_parser() -> argparse.ArgumentParser:
         "turn a recording into a scene graph",
         'prior-sg run recordings/home --environment "residential home" --task "serve drinks to guests" --out out/home',
     )
-    run.add_argument("source", help="a dataset folder, a 7-Scenes folder, or an MCAP log")
+    run.add_argument("source", help="a folder in a known layout (docs/sources.md) or an MCAP log")
     run.add_argument("--environment", required=True, help="what kind of place it is, in plain words")
     run.add_argument("--task", required=True, help="what the robot is to do, in plain words")
     run.add_argument("--regions", default="", help="fixed region names, separated by commas; default: the prior's")
