@@ -98,6 +98,7 @@ class Segmenter:
             message = waiting.pop(0)
             if isinstance(message, PlaceDelta):
                 store.apply_places(self._graph, message)
+                store.note_cameras(self._graph, message)
             for output in list(BY_NAME["segmenter"].step(self.state, message, self.config)):
                 if not isinstance(output, Ask):
                     assert isinstance(output[1], RegionDelta)

@@ -27,9 +27,10 @@ STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; color: #1f2328; margin: 2rem auto; max-width: 1240px; padding: 0 1rem; }
 h1 { font-size: 1.7rem; } h2 { margin-top: 2.6rem; border-bottom: 1px solid #d0d5db; } h3 { margin-bottom: .4rem; }
 table { border-collapse: collapse; margin: .6rem 0 1.2rem; font-variant-numeric: tabular-nums; }
-th, td { padding: .22rem .6rem; text-align: right; border-bottom: 1px solid #eef0f3; white-space: nowrap; }
+th, td { padding: .22rem .5rem; text-align: right; border-bottom: 1px solid #eef0f3; vertical-align: top; }
+td:first-child { white-space: nowrap; } th { vertical-align: bottom; }
 th:first-child, td:first-child { text-align: left; } th { color: #4b525c; font-weight: 600; }
-td.about { text-align: left; color: #6b7280; white-space: normal; } small { color: #6b7280; }
+td.about { text-align: left; color: #6b7280; } small { color: #6b7280; }
 .pictures { display: grid; grid-template-columns: repeat(auto-fill, minmax(560px, 1fr)); gap: .8rem; }
 .pictures img { width: 100%; border: 1px solid #d0d5db; } svg text { font: 12px system-ui, sans-serif; }
 .plots { display: flex; flex-wrap: wrap; gap: 1rem; } details { margin: .3rem 0; } .matrix td { min-width: 3rem; }
@@ -64,14 +65,14 @@ def _scores(results: Results, group: str) -> str:
 
 
 def _table(results: Results, methods: Sequence[Method], sequence: str) -> str:
-    head = "".join(f"<th>{key}</th>" for key in KEYS)
+    head = "".join(f"<th>{key.replace('_', '_<wbr>')}</th>" for key in KEYS)
     best = {key: _best(key, [results.mean(m.name, key, sequence) for m in methods]) for key in KEYS}
     rows = []
     for method in methods:
         cells = []
         for key in KEYS:
             mean, sd = results.mean(method.name, key, sequence), results.sd(method.name, key, sequence)
-            shown = "–" if math.isnan(mean) else f"{mean:.3f}" + (f" <small>± {sd:.3f}</small>" if sd else "")
+            shown = "–" if math.isnan(mean) else f"{mean:.3f}" + (f"<br><small>± {sd:.3f}</small>" if sd else "")
             cells.append(f"<td>{f'<b>{shown}</b>' if mean == best[key] else shown}</td>")
         rows.append(f"<tr><td>{escape(method.name)}</td>{''.join(cells)}</tr>")
     return f"<table><tr><th>method</th>{head}</tr>{''.join(rows)}</table>"
