@@ -21,6 +21,19 @@ class Task(Message, frozen=True, kw_only=True):
     regions: list[str] = []
 
 
+class TaskRequest(Message, frozen=True, kw_only=True):
+    """Which task is in force for a robot? For whoever was not there when it was given."""
+
+    robot: str
+
+
+class TaskInForce(Message, frozen=True, kw_only=True):
+    """The newest task of a robot; None before the first."""
+
+    robot: str
+    task: Task | None = None
+
+
 class RegionPrior(msgspec.Struct, frozen=True, kw_only=True):
     """One expected region with its prototypical place: appearance phrases, inclination to the horizontal, size."""
 

@@ -15,7 +15,7 @@ from schemas.codec import Message
 from schemas.features import Pyramid, TextEmbeddings, TextRequest
 from schemas.frames import ArchiveReply, ArchiveRequest, CameraState, IngestState, Keyframe
 from schemas.places import MapRequest, PlaceDelta, SnapshotRequest, VoxelMap
-from schemas.priors import Prior, PriorList, PriorRequest, Task
+from schemas.priors import Prior, PriorList, PriorRequest, Task, TaskInForce, TaskRequest
 from schemas.regions import PosteriorReply, PosteriorRequest, RegionDelta
 from schemas.scene import Scene, SceneRequest, SceneRevision
 from schemas.status import Consumed, ServiceStatus, StatusRequest
@@ -93,11 +93,12 @@ PLACE_SNAPSHOT = Query("PLACE_SNAPSHOT", SnapshotRequest, PlaceDelta, f"{ROOT}/{
 VOXEL_MAP = Query("VOXEL_MAP", MapRequest, VoxelMap, f"{ROOT}/{{robot}}/ask/voxels")
 REGION_SNAPSHOT = Query("REGION_SNAPSHOT", SnapshotRequest, RegionDelta, f"{ROOT}/{{robot}}/ask/regions")
 POSTERIOR = Query("POSTERIOR", PosteriorRequest, PosteriorReply, f"{ROOT}/{{robot}}/ask/posterior")
+TASK_IN_FORCE = Query("TASK_IN_FORCE", TaskRequest, TaskInForce, f"{ROOT}/{{robot}}/ask/task")
 SCENE = Query("SCENE", SceneRequest, Scene, f"{ROOT}/{{robot}}/ask/scene")
 TEXT = Query("TEXT", TextRequest, TextEmbeddings, f"{ROOT}/encoder/{{space}}/text")
 PRIORS = Query("PRIORS", PriorRequest, PriorList, f"{ROOT}/fleet/ask/prior")
 
-QUERIES = (ARCHIVE, PLACE_SNAPSHOT, VOXEL_MAP, REGION_SNAPSHOT, POSTERIOR, SCENE, TEXT, PRIORS)
+QUERIES = (ARCHIVE, PLACE_SNAPSHOT, VOXEL_MAP, REGION_SNAPSHOT, POSTERIOR, TASK_IN_FORCE, SCENE, TEXT, PRIORS)
 
 STATUS = Query("STATUS", StatusRequest, ServiceStatus, f"{ROOT}/status")
 

@@ -13,7 +13,7 @@ import pytest
 
 from schemas.codec import decode, encode
 from schemas.places import PlaceDelta
-from schemas.priors import ObjectPrior, Prior, Provenance, RegionPrior, Task
+from schemas.priors import ObjectPrior, Prior, Provenance, RegionPrior, Task, TaskRequest
 from schemas.regions import Region, RegionDelta
 from schemas.scene import SceneRequest
 from schemas.status import Tick
@@ -358,6 +358,8 @@ def test_tasks_priors_and_robots(tmp_path):
     assert store.scene("nobody").place_ids.tolist() == []
     store = store.reopened()
     assert store.scene().task == "task 9" and store.scene("other").place_ids.tolist() == [1]
+    in_force = {r: service.answer_task(store.state, TaskRequest(robot=r), store.cfg).task for r in (ROBOT, "nobody")}
+    assert in_force == {ROBOT: tasks[1], "nobody": None}
     rows = sqlite3.connect(store.cfg.path).execute("SELECT digest, message FROM priors").fetchall()
     assert [(digest, decode(Prior, blob)) for digest, blob in rows] == [(prior.digest(), prior)]
     assert asked(store.feed(Tick(stamp_ns=1))) == [PLACE_SNAPSHOT, REGION_SNAPSHOT] * 2

@@ -21,10 +21,18 @@ from segmenter_world import (
 from schemas.codec import decode, encode
 from schemas.features import TextRequest
 from schemas.places import SnapshotRequest
-from schemas.priors import PriorList, PriorRequest, RegionPrior
+from schemas.priors import PriorList, PriorRequest, RegionPrior, TaskInForce
 from schemas.regions import PosteriorRequest, RegionDelta
 from schemas.status import Tick
-from schemas.topics import PLACE_SNAPSHOT, POSTERIOR, PRIORS, REGION_DELTA, REGION_SNAPSHOT, TEXT
+from schemas.topics import (
+    PLACE_SNAPSHOT,
+    POSTERIOR,
+    PRIORS,
+    REGION_DELTA,
+    REGION_SNAPSHOT,
+    TASK_IN_FORCE,
+    TEXT,
+)
 from services.runtime.service import Ask, Identity
 from services.segmenter import core
 from services.segmenter.service import SERVICE
@@ -41,11 +49,14 @@ class Run:
         self.cfg, self.state = cfg, SERVICE.init(cfg, Identity(ROBOT, "i", 1))
         self.concepts = np.eye(3) if concepts is None else concepts
         self.deltas, self.asked, self.reader = [], [], Reader()
+        self.asked_task = 0
 
     def feed(self, *messages, answer_text=True):
         for message in messages:
             for output in list(SERVICE.step(self.state, decode(type(message), encode(message)), self.cfg)):
-                if isinstance(output, Ask):
+                if isinstance(output, Ask) and output.query is TASK_IN_FORCE:
+                    self.asked_task += 1
+                elif isinstance(output, Ask):
                     self.asked.append(output)
                     if output.query is TEXT and answer_text:
                         self.feed(text(self.concepts[: len(output.request.concepts)]))
@@ -177,6 +188,23 @@ def test_a_text_reply_for_a_superseded_prior_is_not_taken_for_the_new_one():
     assert [ask.request.concepts[0] for ask in run.asked] == [["a p"], ["a kitchen"]]
     run.feed(text(np.eye(3)))
     assert run.reader.label(0) == "kitchen"
+
+
+def test_a_restarted_segmenter_learns_the_task_that_was_given_before():
+    positions, edges, frames = world()
+    run = Run().feed(place_delta(positions, edges), *frames, TICK)
+    assert run.asked_task == 1 and not run.deltas
+    run.feed(TaskInForce(robot=ROBOT), TICK)
+    assert not run.deltas
+    run.feed(TaskInForce(robot=ROBOT, task=task()), prior(ROOMS), TICK)
+    assert run.asked_task == 1 and len(run.labels()) == len(positions)
+
+
+def test_an_older_task_changes_nothing():
+    run, _ = finished()
+    before = run.labels()
+    run.feed(task("older", stamp_ns=1), TaskInForce(robot=ROBOT, task=task("oldest", stamp_ns=0)), TICK)
+    assert run.state.task == task() and run.labels() == before
 
 
 def test_a_missing_prior_is_asked_for_and_an_empty_answer_repeated():

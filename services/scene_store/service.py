@@ -7,7 +7,7 @@ import msgspec
 
 from schemas.codec import Message
 from schemas.places import PlaceDelta, SnapshotRequest
-from schemas.priors import Prior, Task
+from schemas.priors import Prior, Task, TaskInForce, TaskRequest
 from schemas.regions import RegionDelta
 from schemas.scene import Scene, SceneRequest
 from schemas.status import Tick
@@ -20,6 +20,7 @@ from schemas.topics import (
     SCENE,
     SCENE_REVISION,
     TASK,
+    TASK_IN_FORCE,
 )
 from services.deltas import Follower
 from services.runtime.service import Ask, Identity, Output, Service
@@ -121,6 +122,12 @@ def answer_scene(state: State, request: SceneRequest, cfg: core.Config) -> Scene
     return core.scene(robot.graph if robot else core.Graph(request.robot))
 
 
+def answer_task(state: State, request: TaskRequest, cfg: core.Config) -> TaskInForce:
+    """The newest task of one robot, for whoever was not there when it was given."""
+    robot = state.robots.get(request.robot)
+    return TaskInForce(robot=request.robot, task=robot.graph.task if robot else None)
+
+
 def close(state: State) -> None:
     """Close the database."""
     state.database.close()
@@ -135,7 +142,7 @@ SERVICE = Service(
     step=step,
     reads=(PLACE_DELTA, REGION_DELTA, TASK, PRIOR),
     writes=(SCENE_REVISION,),
-    answers={SCENE: answer_scene},
+    answers={SCENE: answer_scene, TASK_IN_FORCE: answer_task},
     asks=(PLACE_SNAPSHOT, REGION_SNAPSHOT),
     tick_s=CHECKPOINT_S,
     close=close,

@@ -13,7 +13,7 @@ import numpy as np
 from schemas.codec import Message, copied
 from schemas.features import Pyramid, TextEmbeddings, TextRequest
 from schemas.places import PlaceDelta, SnapshotRequest
-from schemas.priors import Prior, PriorList, PriorRequest, Task
+from schemas.priors import Prior, PriorList, PriorRequest, Task, TaskInForce, TaskRequest
 from schemas.regions import ExpertVote, PosteriorReply, PosteriorRequest, Region, RegionDelta
 from schemas.status import Tick
 from services.deltas import Follower
@@ -127,6 +127,7 @@ class State:
     asked_snapshot: bool = False
     asked_text: TextRequest | None = None
     asked_prior: bool = False
+    asked_task: bool = False
     waited_ticks: int = 0
     ignored_pyramids: int = 0  # repeated, or not of this space
 
@@ -137,7 +138,7 @@ def empty(cfg: Config, robot: str, epoch: int) -> State:
 
 
 def update(state: State, message: Message, cfg: Config) -> Iterator[Message]:
-    """Take one input. Yields RegionDelta when something changed, and SnapshotRequest, TextRequest or PriorRequest."""
+    """Take one input. Yields RegionDelta when something changed, and requests for what is missing."""
     match message:
         case PlaceDelta():
             follow_places(state, message, cfg)
@@ -145,6 +146,9 @@ def update(state: State, message: Message, cfg: Config) -> Iterator[Message]:
             observe(state, message, cfg)
         case Task():
             take_task(state, message)
+        case TaskInForce():
+            if message.task is not None:
+                take_task(state, message.task)
         case Prior():
             remember_prior(state, message, cfg)
         case PriorList():
@@ -194,8 +198,10 @@ def observe(state: State, pyramid: Pyramid, cfg: Config) -> None:
 
 
 def take_task(state: State, task: Task) -> None:
-    """From now on only a prior for this task counts; labels stay until it is in force."""
-    state.task, state.waited_ticks = task, 0
+    """From now on only a prior for this task counts; labels stay until it is in force. An older task changes nothing:
+    a late joiner may get tasks out of order."""
+    if state.task is None or task.stamp_ns >= state.task.stamp_ns:
+        state.task, state.waited_ticks = task, 0
 
 
 def remember_prior(state: State, prior: Prior, cfg: Config) -> None:
@@ -437,7 +443,10 @@ def explain(state: State, request: PosteriorRequest, cfg: Config) -> PosteriorRe
 
 
 def _requests(state: State, cfg: Config) -> Iterator[Message]:
-    """Ask for what is missing and not asked for yet."""
+    """Ask for what is missing and not asked for yet; first, for the task that was given before this process began."""
+    if not state.asked_task:
+        state.asked_task = True
+        yield TaskRequest(robot=state.robot)
     if state.follower.needs_snapshot and not state.asked_snapshot:
         state.asked_snapshot = True
         yield SnapshotRequest(robot=state.robot)

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from schemas.codec import Message
 from schemas.features import TextRequest
 from schemas.places import SnapshotRequest
-from schemas.priors import PriorRequest
+from schemas.priors import PriorRequest, TaskRequest
 from schemas.regions import PosteriorReply, PosteriorRequest, RegionDelta
 from schemas.topics import (
     PLACE_DELTA,
@@ -17,12 +17,18 @@ from schemas.topics import (
     REGION_DELTA,
     REGION_SNAPSHOT,
     TASK,
+    TASK_IN_FORCE,
     TEXT,
 )
 from services.runtime.service import Ask, Identity, Output, Service
 from services.segmenter import core
 
-QUESTIONS = {SnapshotRequest: PLACE_SNAPSHOT, TextRequest: TEXT, PriorRequest: PRIORS}
+QUESTIONS = {
+    SnapshotRequest: PLACE_SNAPSHOT,
+    TextRequest: TEXT,
+    PriorRequest: PRIORS,
+    TaskRequest: TASK_IN_FORCE,
+}
 
 
 def init(cfg: core.Config, identity: Identity) -> core.State:
@@ -55,7 +61,7 @@ SERVICE = Service(
     step=step,
     reads=(PLACE_DELTA, PYRAMID, TASK, PRIOR),
     writes=(REGION_DELTA,),
-    asks=(PLACE_SNAPSHOT, TEXT, PRIORS),
+    asks=(PLACE_SNAPSHOT, TEXT, PRIORS, TASK_IN_FORCE),
     answers={REGION_SNAPSHOT: answer_snapshot, POSTERIOR: answer_posterior},
     tick_s=0.5,
 )
