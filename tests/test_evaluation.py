@@ -127,6 +127,7 @@ def test_variations_are_seeded_valid_and_differ():
     for one in found[1:]:
         one.check()
         assert [region.name for region in one.regions] == NAMES
+        assert one.regions[0].phrases[0] == first.regions[0].phrases[0]
         assert set(one.regions[0].phrases) <= set(first.regions[0].phrases)
 
 

@@ -39,12 +39,13 @@ def perturbed(prior: Prior, seed: int, strength: float) -> Prior:
     """Another prior that might have been written for the same task; a stand-in for another generation of a language
     model, which would choose other words and other figures.
 
-    Each region's phrases are drawn again from its own, with replacement, and so are its objects: those not drawn fall
-    to the region's least P(o | r). Then existence, containment and adjacency get normal noise of standard deviation
-    `strength` on their logits; existence sums to one again, adjacency stays symmetric.
+    Each region keeps its first phrase, its name; its others are drawn again from its own, with replacement, and so are
+    its objects: those not drawn fall to the region's least P(o | r). Then existence, containment and adjacency get
+    normal noise of standard deviation `strength` on their logits; existence sums to one again, adjacency stays
+    symmetric.
     """
     rng = np.random.default_rng(seed)
-    phrases = [[region.phrases[i] for i in sorted(_draw(rng, len(region.phrases)))] for region in prior.regions]
+    phrases = [_redrawn(rng, region.phrases) for region in prior.regions]
     containment = prior.containment.astype(float)
     for row in containment:
         listed = np.flatnonzero(row > row.min()) if len(row) else np.zeros(0, int)
@@ -122,6 +123,10 @@ def _changed(
 
 def _draw(rng: np.random.Generator, count: int) -> np.ndarray:
     return rng.integers(0, count, count) if count else np.zeros(0, int)
+
+
+def _redrawn(rng: np.random.Generator, phrases: list[str]) -> list[str]:
+    return [phrases[0], *(phrases[1 + i] for i in sorted(_draw(rng, len(phrases) - 1)))]
 
 
 def _noisy(rng: np.random.Generator, probabilities: np.ndarray, strength: float) -> np.ndarray:
