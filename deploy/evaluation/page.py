@@ -30,7 +30,7 @@ table { border-collapse: collapse; margin: .6rem 0 1.2rem; font-variant-numeric:
 th, td { padding: .22rem .5rem; text-align: right; border-bottom: 1px solid #eef0f3; vertical-align: top; }
 td:first-child { white-space: nowrap; } th { vertical-align: bottom; }
 th:first-child, td:first-child { text-align: left; } th { color: #4b525c; font-weight: 600; }
-td.about { text-align: left; color: #6b7280; } small { color: #6b7280; }
+td.about { text-align: left; color: #6b7280; } small { color: #6b7280; font-weight: 400; white-space: nowrap; }
 .pictures { display: grid; grid-template-columns: repeat(auto-fill, minmax(560px, 1fr)); gap: .8rem; }
 .pictures img { width: 100%; border: 1px solid #d0d5db; } svg text { font: 12px system-ui, sans-serif; }
 .plots { display: flex; flex-wrap: wrap; gap: 1rem; } details { margin: .3rem 0; } .matrix td { min-width: 3rem; }
@@ -72,7 +72,7 @@ def _table(results: Results, methods: Sequence[Method], sequence: str) -> str:
         cells = []
         for key in KEYS:
             mean, sd = results.mean(method.name, key, sequence), results.sd(method.name, key, sequence)
-            shown = "–" if math.isnan(mean) else f"{mean:.3f}" + (f"<br><small>± {sd:.3f}</small>" if sd else "")
+            shown = "–" if math.isnan(mean) else f"{mean:.3f}" + (f"<br><small>±{sd:.3f}</small>" if sd else "")
             cells.append(f"<td>{f'<b>{shown}</b>' if mean == best[key] else shown}</td>")
         rows.append(f"<tr><td>{escape(method.name)}</td>{''.join(cells)}</tr>")
     return f"<table><tr><th>method</th>{head}</tr>{''.join(rows)}</table>"
