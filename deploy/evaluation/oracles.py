@@ -3,7 +3,7 @@
 import msgspec
 import numpy as np
 
-from deploy.evaluation.metrics import NO_REGION, GroundTruth
+from deploy.evaluation.metrics import GroundTruth
 from schemas.features import Pyramid
 from services.geometry import transform
 
@@ -63,9 +63,3 @@ def top_layer(pyramid: Pyramid) -> Pyramid:
     """Only the largest crops, which show nearly the whole image."""
     layers = pyramid.layers
     return with_crops(pyramid, layers == layers.max(initial=0))
-
-
-def shown_share(pyramids: tuple[Pyramid, ...], truth: GroundTruth) -> float:
-    """Share of the viewed points that lie in a true region: how much the feature oracle can know."""
-    regions = [truth.region_of(viewed_points(pyramid)[1]) != NO_REGION for pyramid in pyramids]
-    return float(np.concatenate(regions).mean()) if regions else 0.0
