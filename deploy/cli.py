@@ -1,6 +1,7 @@
 """The command line: `prior-sg`."""
 
 import argparse
+import contextlib
 import json
 import os
 import signal
@@ -42,9 +43,16 @@ def _add_bus(parser: argparse.ArgumentParser, robot: bool = True) -> None:
         parser.add_argument("--robot", default="robot1", help="name of the robot (default: %(default)s)")
 
 
+def _at_least_one(text: str) -> int:
+    number = int(text)
+    if number < 1:
+        raise argparse.ArgumentTypeError("must be at least 1")
+    return number
+
+
 def _add_run_options(parser: argparse.ArgumentParser) -> None:
     _add_bus(parser)
-    parser.add_argument("--workers", type=int, default=1, help="feature workers (default: %(default)s)")
+    parser.add_argument("--workers", type=_at_least_one, default=1, help="feature workers (default: %(default)s)")
     parser.add_argument(
         "--speed", type=float, default=0.0, help="replay speed; 0 = as fast as the pipeline drains (default)"
     )
@@ -181,6 +189,7 @@ def cmd_run(arguments: argparse.Namespace) -> int:
 
     if not Path(arguments.source).exists():
         raise UserError(f"{arguments.source} does not exist")
+    truth = report.truth_of(arguments.source)  # also finds out at once whether the source is of a known layout
     job = Job(
         source=arguments.source,
         out=arguments.out,
@@ -199,12 +208,14 @@ def cmd_run(arguments: argparse.Namespace) -> int:
         ),
     )
     result = run(job, console)
-    report.write(result, job.out, report.truth_of(arguments.source), console)
+    report.write(result, job.out, truth, console)
     return 0
 
 
 def cmd_up(arguments: argparse.Namespace) -> int:
     """Services and a router until Ctrl-C."""
+    from deploy import report
+    from deploy.run import check_settings, make_folder
     from deploy.supervisor import Supervisor
     from services.registry import BY_NAME, SERVICES
     from services.runtime.zenoh_bus import open_router
@@ -213,9 +224,15 @@ def cmd_up(arguments: argparse.Namespace) -> int:
     for name in names:
         if name not in BY_NAME:
             raise UserError(f"there is no service {name!r}; known: {', '.join(BY_NAME)}")
-    arguments.out.mkdir(parents=True, exist_ok=True)
-    settings = [*arguments.set, f"scene_store.path={arguments.out / 'scene.sqlite'}", f"ingest.speed={arguments.speed}"]
-    settings += [f"ingest.source={arguments.source}"] if arguments.source else []
+    make_folder(arguments.out)
+    settings = [f"scene_store.path={arguments.out / 'scene.sqlite'}", f"ingest.speed={arguments.speed}"]
+    if arguments.source:
+        report.truth_of(arguments.source)  # finds out at once whether the source is of a known layout
+        settings.append(f"ingest.source={arguments.source}")
+    settings += arguments.set
+    check_settings(arguments.config, settings)
+    if arguments.no_router:
+        _client(arguments.connect).bus.close()  # finds out at once whether a router is there
     stop_router = (lambda: None) if arguments.no_router else open_router(arguments.connect)
     supervisor = Supervisor(arguments.connect, arguments.robot, arguments.out / "logs", settings, arguments.config)
     try:
@@ -237,7 +254,7 @@ def cmd_up(arguments: argparse.Namespace) -> int:
 def cmd_task(arguments: argparse.Namespace) -> int:
     """Switch the task and wait for the new regions."""
     from deploy import report
-    from schemas.codec import decode
+    from schemas.codec import DecodeError, decode
     from schemas.priors import PriorRequest, Task
     from schemas.regions import RegionDelta
     from schemas.scene import SceneRequest
@@ -260,15 +277,19 @@ def cmd_task(arguments: argparse.Namespace) -> int:
         if not reply.priors:
             raise UserError(reply.reason)
         digest = reply.priors[0].digest()
+        note = reply.priors[0].provenance.note
         changed = threading.Event()
-        started_s = time.monotonic()
+        started_s, given_ns = time.monotonic(), time.time_ns()
 
         def see(sample: Any) -> None:
-            delta = decode(RegionDelta, sample.payload)
-            if delta.prior_digest == digest and delta.task == arguments.task:
-                changed.set()
+            """A delta sent after the task was given; the history may hold older ones of the same task."""
+            with contextlib.suppress(DecodeError):
+                delta = decode(RegionDelta, sample.payload)
+                if sample.sent_ns > given_ns and delta.prior_digest == digest and delta.task == arguments.task:
+                    changed.set()
 
         client.listen(REGION_DELTA, arguments.robot, see)
+        console.print(f"prior: {note}")
         client.publish(TASK, task)
         if not changed.wait(arguments.timeout):
             raise UserError(f"no regions for the new task within {arguments.timeout:.0f} s; see `prior-sg health`")
@@ -318,6 +339,7 @@ def cmd_record(arguments: argparse.Namespace) -> int:
             with console.status("recording; Ctrl-C stops") as status:
                 while time.monotonic() < end_s:
                     time.sleep(0.2)
+                    recorder.check()
                     total = sum(recorder.counts.values())
                     status.update(f"recording: {total} messages; Ctrl-C stops")
         except KeyboardInterrupt:
@@ -462,13 +484,9 @@ def main(argv: list[str] | None = None) -> int:
     arguments = build_parser().parse_args(argv)
     if arguments.command == "serve":
         return serve.run(arguments)
+    from deploy.report import ExportError
     from deploy.run import RunError
     from deploy.supervisor import ChildFailed
-    from services.ingest.sources import SourceError
-    from services.runtime.bus import BusError
-    from services.runtime.config import ConfigError
-    from services.runtime.record import LogError
-    from services.runtime.service import ServiceError
 
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, signal.default_int_handler)  # ended by a supervisor: as tidy as Ctrl-C
@@ -477,7 +495,7 @@ def main(argv: list[str] | None = None) -> int:
     except BrokenPipeError:  # the reader of a pipe has left
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
-    except (UserError, RunError, ChildFailed, BusError, ConfigError, LogError, SourceError, ServiceError) as error:
+    except (UserError, RunError, ExportError, ChildFailed, *serve.HOPELESS) as error:
         print(f"prior-sg: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:

@@ -13,9 +13,10 @@ from schemas.status import Consumed
 from schemas.topics import TOPICS, Topic
 from services.registry import SERVICES
 from services.runtime.bus import Sample
-from services.runtime.record import LogWriter
+from services.runtime.record import LogError, LogWriter
 
 FLUSH_S = 1.0
+TICKING = {service.name for service in SERVICES if service.tick_s is not None}
 Tap = Callable[[Sample, Message], None]
 
 
@@ -29,6 +30,7 @@ class Recorder:
         self.counts: Counter[str] = Counter()
         self.malformed: Counter[str] = Counter()
         self.attachments: dict[str, tuple[str, bytes]] = {}  # name: media type and content, written at the end
+        self.error: LogError | None = None
         self._queue: queue.SimpleQueue[Sample | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._write, name="recorder")
         self._thread.start()
@@ -37,27 +39,37 @@ class Recorder:
                 client.listen(topic, "*", self._queue.put)
 
     def close(self) -> None:
-        """Write what has arrived, then finish the file."""
+        """Write what has arrived, then finish the file. Raises LogError when something could not be written."""
         self._queue.put(None)
         self._thread.join()
+        self.check()
         for name, (media_type, data) in self.attachments.items():
             self._log.attach(name, media_type, data)
         self._log.close()
 
+    def check(self) -> None:
+        """Raise LogError when writing has failed."""
+        if self.error is not None:
+            raise self.error
+
     def _write(self) -> None:
-        flushed_s = time.monotonic()
+        """Until the end, or until the log cannot be written (a full disk); the taps go on seeing what arrives."""
         while True:
             try:
-                sample = self._queue.get(timeout=FLUSH_S)
+                sample = self._next()
+                if sample is None:
+                    return
+                self._add(sample)
+            except LogError as error:
+                self.error = self.error or error
+
+    def _next(self) -> Sample | None:
+        while True:
+            try:
+                return self._queue.get(timeout=FLUSH_S)
             except queue.Empty:
-                self._log.flush()
-                continue
-            if sample is None:
-                return
-            self._add(sample)
-            if time.monotonic() - flushed_s > FLUSH_S:
-                self._log.flush()
-                flushed_s = time.monotonic()
+                if self.error is None:
+                    self._log.flush()
 
     def _add(self, sample: Sample) -> None:
         """Record what is valid; what is not never reached any service's state either."""
@@ -67,12 +79,12 @@ class Recorder:
             self.malformed[sample.topic.name] += 1
             return
         self.counts[sample.topic.name] += 1
-        if sample.writer:
+        for tap in self.taps:
+            tap(sample, message)
+        if sample.writer and self.error is None:
             self._log.add(
                 sample.topic, sample.key, sample.payload, sample.writer, sample.sequence, sample.sent_ns, time.time_ns()
             )
-        for tap in self.taps:
-            tap(sample, message)
 
 
 class Settling:
@@ -85,12 +97,16 @@ class Settling:
         ]
         self._published: dict[tuple[str, str, str], int] = {}  # newest by topic, key, writer
         self._consumed: dict[tuple[str, str, str], int] = {}  # newest by service, key, writer
+        self._due: dict[str, bool] = {}  # services that work on their ticks: whether one has yet to follow an input
         self.changed_s = time.monotonic()
 
     def __call__(self, sample: Sample, message: Message) -> None:
         """See one recorded message."""
         match message:
+            case Consumed(topic="Tick"):
+                self._due[message.service] = False
             case Consumed() if message.writer:
+                self._due[message.service] = message.service in TICKING
                 name = (message.service, message.key, message.writer)
                 self._consumed[name] = max(message.sequence, self._consumed.get(name, -1))
             case _ if sample.topic.name in self._topics and sample.writer:
@@ -105,4 +121,4 @@ class Settling:
             for service, read in self._readers
             if read == topic
         )
-        return not behind and time.monotonic() - self.changed_s > quiet_s
+        return not behind and not any(self._due.values()) and time.monotonic() - self.changed_s > quiet_s

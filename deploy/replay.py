@@ -49,9 +49,11 @@ def lives(journal: list[Consumed], service: str) -> list[Life]:
     for entry in sorted((e for e in journal if e.service == service), key=lambda e: (e.instance, e.order)):
         if entry.topic == "START":
             found[entry.instance] = Life(service, entry.instance, decode(Started, entry.inline))
+        elif entry.instance not in found:  # its start was not recorded: it cannot be replayed
+            continue
         elif entry.topic == "STOP":
             found[entry.instance].ended_cleanly = True
-        elif entry.instance in found:
+        else:
             found[entry.instance].inputs.append(entry)
     return sorted(found.values(), key=lambda life: life.started.epoch)
 
@@ -158,6 +160,11 @@ def _differences(path: str, before: Any, after: Any, tolerance: float) -> Iterat
     elif isinstance(before, np.ndarray):
         if before.shape != after.shape:
             yield f"{path}: shape {before.shape} became {after.shape}"
+        elif before.dtype != after.dtype:
+            yield f"{path}: {before.dtype} became {after.dtype}"
+        elif before.dtype.kind != "f":
+            if not np.array_equal(before, after):
+                yield f"{path}: {np.count_nonzero(before != after)} entries differ"
         elif not np.allclose(before, after, rtol=tolerance, atol=tolerance):
             worst = np.abs(np.asarray(before, float) - np.asarray(after, float)).max()
             yield f"{path}: differs by up to {worst:.3g}"
@@ -191,6 +198,8 @@ def undisturbed(log: Log) -> Any:
 
 def open_log(path: Path, service: str) -> Log:
     """Read what a replay of the service needs. Raises LogError when the log holds nothing of it."""
+    if BY_NAME[service].drive is not None:
+        raise LogError(f"{service} reads its source, not the bus: there is nothing to replay")
     log = Log(path, BY_NAME[service])
     if not log.lives:
         raise LogError(f"{path} holds no journal of {service}; was it running while the log was recorded?")

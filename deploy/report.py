@@ -20,7 +20,12 @@ from services.prior_gateway.library import environments
 from services.registry import BY_NAME
 from services.runtime.record import attachments
 
+SUFFIXES = {"json": (".json",), "spark-dsg": (".json", ".sparkdsg"), "png": (".png",)}
 MAIN_METRICS = ("f1_s", "f1_g", "miou_s", "miou_g", "miou_s_penalised", "accuracy")
+
+
+class ExportError(Exception):
+    """The file cannot be written as asked; the message says what to do."""
 
 
 def truth_of(source: str) -> dict[str, Any] | None:
@@ -68,6 +73,15 @@ def write(result: Result, out: Path, truth: dict[str, Any] | None, console: Cons
 
 def export(scene: Scene, voxels: VoxelMap | None, kind: str, path: Path, truth: dict[str, Any] | None = None) -> None:
     """Write one file: `json`, `spark-dsg` or `png`."""
+    if path.suffix not in SUFFIXES[kind]:
+        raise ExportError(f"{kind} is written to a file ending in {' or '.join(SUFFIXES[kind])}; got {path}")
+    try:
+        _write(scene, voxels, kind, path, truth)
+    except OSError as error:
+        raise ExportError(f"cannot write {path} ({error.strerror}); choose another file with --out") from error
+
+
+def _write(scene: Scene, voxels: VoxelMap | None, kind: str, path: Path, truth: dict[str, Any] | None) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     if kind == "json":
         path.write_text(json.dumps(scene_json(scene), indent=1))

@@ -15,6 +15,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn
 from deploy.client import Client
 from deploy.inprocess import InProcess
 from deploy.recorder import Recorder, Settling
+from deploy.serve import resolved_config
 from deploy.supervisor import Supervisor
 from schemas.codec import DecodeError, Message, decode, encode
 from schemas.features import Pyramid
@@ -109,18 +110,33 @@ class Counts:
         return f"{len(self.keyframes)} keyframes, {len(self.pyramids)} encoded, {repeated} repeated, {missing} missing"
 
 
+def make_folder(path: Path) -> None:
+    """Create the output folder. Raises RunError."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RunError(f"cannot write to {path} ({error.strerror}); choose another folder with --out") from error
+
+
+def check_settings(config: str, settings: list[str]) -> None:
+    """Resolve the config of every service now, so that a wrong setting is told before anything starts."""
+    for service in SERVICES:
+        resolved_config(service, config, settings)
+
+
 def run(job: Job, console: Console) -> Result:
     """Run one source to its end. Raises RunError, BusError, ChildFailed; KeyboardInterrupt ends it early, cleanly."""
-    job.out.mkdir(parents=True, exist_ok=True)
+    make_folder(job.out)
     database = job.out / "scene.sqlite"
     for leftover in job.out.glob("scene.sqlite*"):
         leftover.unlink()
     settings = [
-        *job.settings,
         f"scene_store.path={database}",
         f"ingest.source={job.source}",
         f"ingest.speed={job.speed}",
+        *job.settings,
     ]
+    check_settings(job.config, settings)
     logs = job.out / "logs"
     if job.in_process:
         services = InProcess(job.robot, logs, settings, job.config)
@@ -240,8 +256,12 @@ class Run:
                 progress.console.print("interrupted: writing what there is")
                 return
             if time.monotonic() - max(moved_s, self.settling.changed_s) > STALL_AFTER_S:
-                where = self.supervisor.log_folder
-                raise RunError(f"nothing has moved for {STALL_AFTER_S:.0f} s; see the logs in {where}")
+                said = f"nothing has moved for {STALL_AFTER_S:.0f} s; see the logs in {self.supervisor.log_folder}"
+                if not finished:
+                    raise RunError(said)
+                progress.console.print(f"{said}; writing what there is")
+                return
+            self.recorder.check()
             time.sleep(POLL_S)
 
 

@@ -11,6 +11,7 @@ import time
 import uuid
 from typing import Any
 
+from services.ingest.sources import SourceError
 from services.registry import BY_NAME
 from services.runtime.bus import BusError
 from services.runtime.config import (
@@ -24,11 +25,13 @@ from services.runtime.config import (
 )
 from services.runtime.host import Host
 from services.runtime.logs import start_logging
+from services.runtime.record import LogError
 from services.runtime.service import Identity, Service, ServiceError
 from services.runtime.zenoh_bus import ZenohBus
 
 log = logging.getLogger(__name__)
 PARENT_CHECK_S = 1.0
+HOPELESS = (ConfigError, BusError, ServiceError, SourceError, LogError)  # their messages say what to do
 EXIT_HOPELESS = 2  # starting again would fail again
 
 
@@ -86,7 +89,7 @@ def run(arguments: argparse.Namespace) -> int:
 
             asyncio.set_event_loop_policy(uvloop.EventLoopPolicy())
         asyncio.run(serve(arguments, instance))
-    except (ConfigError, BusError, ServiceError) as error:
+    except HOPELESS as error:
         log.error(str(error))
         return EXIT_HOPELESS
     except Exception:

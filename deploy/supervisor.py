@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+import uuid
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -42,11 +43,12 @@ class Child:
     def start(self) -> None:
         """Start the process; its log is appended to."""
         command = [sys.executable, "-m", "deploy.serve", self.service, "--parent", str(os.getpid()), *self.arguments]
-        suffix = f"-r{self.restarts}" if self.restarts else ""
+        # Unique on the bus: another robot, host or run may have a process of the same short name.
+        instance = f"{self.instance}-{uuid.uuid4().hex[:6]}"
         environment = os.environ | {name: str(self.threads) for name in THREAD_VARIABLES}
         with self.log_path.open("ab") as log:
             self.process = subprocess.Popen(
-                [*command, "--instance", f"{self.instance}{suffix}"],
+                [*command, "--instance", instance],
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=log,
@@ -117,7 +119,8 @@ class Supervisor:
                     raise ChildFailed(f"{child.instance} does not run: {child.last_words()} (log: {child.log_path})")
                 delay_s = min(RESTART_DELAY_S * 2 ** (child.deaths - 1), MAX_RESTART_DELAY_S)
                 child.process, child.restart_at_s = None, now_s + delay_s
-                events.append(f"{child.instance} ended ({_reason(code)}), restarting")
+                why = f": {child.last_words()}" if code > 0 else ""
+                events.append(f"{child.instance} ended ({_reason(code)}){why}; restarting")
         return events
 
     def stop(self) -> None:

@@ -32,7 +32,7 @@ class Follower(Generic[D]):
     def __init__(self, epoch: int = -1, revision: int = -1, waiting_limit: int = 4096) -> None:
         self.epoch, self.revision = epoch, revision
         self.needs_snapshot = False
-        self._waiting: dict[int, D] = {}
+        self._waiting: dict[tuple[int, int], D] = {}  # by epoch and revision
         self._waiting_limit = waiting_limit
 
     def verdict(self, delta: D) -> Verdict:
@@ -45,23 +45,15 @@ class Follower(Generic[D]):
 
     def take(self, delta: D) -> list[D]:
         """The deltas to apply now, in order: none for a repeat or a gap, several when a gap closes."""
-        match self.verdict(delta):
-            case "stale":
-                if delta.snapshot:
-                    self.needs_snapshot = False
-                return []
-            case "gap":
-                self.needs_snapshot = True
-                if len(self._waiting) < self._waiting_limit:
-                    self._waiting[delta.revision] = delta
-                return []
-        if delta.epoch > self.epoch and not delta.snapshot:
-            self._waiting = {r: d for r, d in self._waiting.items() if d.epoch == delta.epoch}
-        ready = [delta]
-        self.epoch, self.revision = delta.epoch, delta.revision
-        while (following := self._waiting.pop(self.revision + 1, None)) is not None and following.epoch == self.epoch:
+        verdict = self.verdict(delta)
+        ready = [delta] if verdict == "apply" else []
+        if verdict == "gap" and len(self._waiting) < self._waiting_limit:
+            self._waiting[delta.epoch, delta.revision] = delta
+        if ready:
+            self.epoch, self.revision = delta.epoch, delta.revision
+        while (following := self._waiting.pop((self.epoch, self.revision + 1), None)) is not None:
             ready.append(following)
             self.revision = following.revision
-        self._waiting = {r: d for r, d in self._waiting.items() if d.epoch == self.epoch and r > self.revision}
+        self._waiting = {name: kept for name, kept in self._waiting.items() if name > (self.epoch, self.revision)}
         self.needs_snapshot = bool(self._waiting)
         return ready

@@ -13,13 +13,13 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
 from schemas.codec import encode
-from schemas.frames import Intrinsics, Keyframe
+from schemas.frames import ArchiveReply, Intrinsics, Keyframe
 from schemas.places import MapRequest, PlaceDelta, SnapshotRequest
 from schemas.topics import PLACE_DELTA, PLACE_SNAPSHOT, VOXEL_MAP
 from services.geometry import inside_polygon, pose_from_quaternion
 from services.place_graph import core, distance, links, service
 from services.place_graph.grid import BLOCK, FAR_D2, FREE, OCCUPIED, UNKNOWN_D2, UNOBSERVED, Block, Box, VoxelGrid
-from services.runtime.service import Identity
+from services.runtime.service import Ask, Identity
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 CAMERA = Intrinsics(120, 120, 60.0, 60.0, 59.5, 59.5)
@@ -108,7 +108,7 @@ def start(cfg: core.Config = CFG) -> core.State:
 def play(state: core.State, frames: list[Keyframe], cfg: core.Config = CFG) -> list[PlaceDelta]:
     deltas = []
     for frame in frames:
-        for topic, delta in service.step(state, frame, cfg):
+        for topic, delta in (output for output in service.step(state, frame, cfg) if not isinstance(output, Ask)):
             assert topic is PLACE_DELTA
             deltas.append(delta)
     return deltas
@@ -517,3 +517,24 @@ def test_rooms_of_a_home_are_joined_by_their_doorways_only():
     assert 100 <= len(places.place_ids) <= 600
     told = read(deltas)
     assert sorted(told.places) == places.place_ids.tolist() and len(told.edges) == len(places.edges)
+
+
+def test_a_process_that_joins_in_mid_stream_fetches_the_missed_keyframes_page_by_page():
+    frames = ROOM_WALK
+    state = service.init(CFG, Identity("r", "p", 2))
+    archive, asked = {frame.frame_id: frame for frame in frames}, []
+
+    def feed(message):
+        for output in list(service.step(state, message, CFG)):
+            if isinstance(output, Ask):
+                request = output.request
+                asked.append((request.first_frame_id, request.end_frame_id))
+                wanted = range(request.first_frame_id, request.end_frame_id)
+                page = [archive[number] for number in sorted(archive) if number in wanted][:2]
+                feed(ArchiveReply(robot="r", oldest_frame_id=0, keyframes=page))
+
+    for frame in frames[4:]:
+        feed(frame)
+    last = frames[4].frame_id
+    assert asked[0] == (0, last) and [end for _, end in asked] == [last] * len(asked) and len(asked) == 3
+    assert sorted(state.cameras_m) == sorted(archive)

@@ -6,13 +6,14 @@ from collections.abc import Awaitable, Iterator
 from typing import Protocol
 
 from schemas.codec import Message
-from schemas.status import JobDone
+from schemas.status import JobDone, Tick
 from schemas.topics import ARCHIVE, CAMERA_STATE, ENCODE, INGEST_STATE, KEYFRAME
 from services.ingest import core
 from services.ingest.sources import Source, SourceError, open_source
 from services.runtime.service import Identity, Output, Service
 
 log = logging.getLogger(__name__)
+PROGRESS_S = 1.0
 
 
 class Port(Protocol):
@@ -49,6 +50,8 @@ def step(state: core.State, message: Message, cfg: core.Config) -> Iterator[Outp
             yield from core.encoded(state, message)
         case core.EndOfSource():
             yield from core.end(state)
+        case Tick():  # the topic keeps no history: whoever comes late, or missed the last word, hears it again
+            yield core.progress(state)
 
 
 async def drive(port: Port, cfg: core.Config) -> None:
@@ -117,4 +120,5 @@ SERVICE = Service(
     writes=(KEYFRAME, CAMERA_STATE, INGEST_STATE, ENCODE),
     answers={ARCHIVE: core.archived},
     drive=drive,
+    tick_s=PROGRESS_S,
 )

@@ -70,6 +70,7 @@ class State:
     published: Published = field(default_factory=Published)
     cameras_m: dict[int, tuple[float, float, float]] = field(default_factory=dict)  # of the keyframes seen, by frame id
     rejected: int = 0  # keyframes that could not be used
+    joined_frame_id: int = 0  # first keyframe heard live; earlier ones come from the archive
     revision: int = -1
     stamp_ns: int = 0
     frame_id: int = -1

@@ -6,11 +6,11 @@ import cv2
 import numpy as np
 
 from schemas.codec import Message
-from schemas.frames import Keyframe
+from schemas.frames import ArchiveReply, ArchiveRequest, Keyframe
 from schemas.places import MapRequest, PlaceDelta, SnapshotRequest, VoxelMap
-from schemas.topics import KEYFRAME, PLACE_DELTA, PLACE_SNAPSHOT, VOXEL_MAP
+from schemas.topics import ARCHIVE, KEYFRAME, PLACE_DELTA, PLACE_SNAPSHOT, VOXEL_MAP
 from services.place_graph import core
-from services.runtime.service import Identity, Output, Service
+from services.runtime.service import Ask, Identity, Output, Service
 
 
 def init(cfg: core.Config, identity: Identity) -> core.State:
@@ -19,14 +19,30 @@ def init(cfg: core.Config, identity: Identity) -> core.State:
 
 
 def step(state: core.State, message: Message, cfg: core.Config) -> Iterator[Output]:
-    """One keyframe gives one delta, with or without changes; a repeated keyframe gives nothing."""
+    """One keyframe gives one delta, with or without changes; a repeated keyframe gives nothing. A process that joins in
+    mid-stream fetches what it has missed from the archive, page by page."""
     match message:
-        case Keyframe() if message.frame_id not in state.cameras_m:
-            depth_m = depth_of(message) if core.within_reach(message, cfg) else None
-            delta = (
-                core.reject(state, message, cfg) if depth_m is None else core.integrate(state, message, depth_m, cfg)
-            )
-            yield PLACE_DELTA, delta
+        case Keyframe():
+            if not state.cameras_m and message.frame_id > 0:
+                state.joined_frame_id = message.frame_id
+                yield _ask_archive(state.robot, 0, message.frame_id)
+            yield from _map(state, message, cfg)
+        case ArchiveReply():
+            for keyframe in message.keyframes:
+                yield from _map(state, keyframe, cfg)
+            if message.keyframes:
+                yield _ask_archive(state.robot, message.keyframes[-1].frame_id + 1, state.joined_frame_id)
+
+
+def _ask_archive(robot: str, first_frame_id: int, end_frame_id: int) -> Ask:
+    return Ask(ARCHIVE, ArchiveRequest(robot=robot, first_frame_id=first_frame_id, end_frame_id=end_frame_id))
+
+
+def _map(state: core.State, keyframe: Keyframe, cfg: core.Config) -> Iterator[Output]:
+    if keyframe.frame_id not in state.cameras_m:
+        depth_m = depth_of(keyframe) if core.within_reach(keyframe, cfg) else None
+        delta = core.reject(state, keyframe, cfg) if depth_m is None else core.integrate(state, keyframe, depth_m, cfg)
+        yield PLACE_DELTA, delta
 
 
 def depth_of(keyframe: Keyframe) -> np.ndarray | None:
@@ -58,5 +74,6 @@ SERVICE = Service(
     step=step,
     reads=(KEYFRAME,),
     writes=(PLACE_DELTA,),
+    asks=(ARCHIVE,),
     answers={PLACE_SNAPSHOT: _snapshot, VOXEL_MAP: _voxel_map},
 )

@@ -20,11 +20,13 @@ class Progress:
 
     def reader(self, instance: str, topics: list[str]) -> None:
         """A process says what it reads."""
-        self._reads[instance] = topics
+        self._reads[instance] = list(topics)
         self._dead.discard(instance)
 
     def consumed(self, instance: str, topic: str, sequence: int) -> None:
-        """A process has finished with a message."""
+        """A process has finished with a message, which also shows that it reads the topic; -1 = another writer's."""
+        if topic not in self._reads.setdefault(instance, []):
+            self._reads[instance].append(topic)
         self._consumed[instance, topic] = max(sequence, self._consumed.get((instance, topic), -1))
 
     def alive(self, instance: str, alive: bool) -> None:

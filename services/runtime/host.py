@@ -108,6 +108,7 @@ class Host:
                 done, pending = await asyncio.wait(pending, return_when=asyncio.FIRST_COMPLETED)
                 for task in done:
                     task.result()
+            await self._on_thread(self._journal, "STOP")  # only of an orderly end
         finally:
             for task in (*tasks, stop):
                 task.cancel()
@@ -122,7 +123,6 @@ class Host:
     async def _leave(self) -> None:
         for pool in self._pools.values():
             pool.close()
-        await self._on_thread(self._journal, "STOP")
         await self._on_thread(self.service.close, self._state)
         await self._on_thread(self.bus.close)
         self._thread.shutdown(wait=False)
@@ -215,11 +215,13 @@ class Host:
 
     def _handle_reply(self, reply: Reply) -> None:
         query = reply.ask.query
-        self._asks.pop((query.name, encode(reply.ask.request)), None)
         message = self._decoded(query.reply, reply.payload, query.name, query.key, "")
-        if message is not None:
-            self._step(message)
-            self._journal(query.name, inline=reply.payload)
+        if message is None:
+            self._loop.call_soon_threadsafe(self._loop.call_later, ASK_RETRY_S, self._call_again, reply.ask)
+            return
+        self._asks.pop((query.name, encode(reply.ask.request)), None)
+        self._step(message)
+        self._journal(query.name, inline=reply.payload)
 
     def _handle_question(self, question: Question) -> None:
         query = question.query
@@ -228,7 +230,13 @@ class Host:
             question.request.refuse(f"the request is not a valid {query.request.__name__}")
             return
         self.inbox.of(query.name).consumed += 1
-        question.request.reply(encode(self.service.answers[query](self._state, request, self.cfg)))
+        try:
+            answer = encode(self.service.answers[query](self._state, request, self.cfg))
+        except Exception as error:  # an answer changes no state: a question it cannot take must not end the service
+            log.exception("question not answered", extra={"query": query.name})
+            question.request.refuse(f"{query.name}: {error}")
+            return
+        question.request.reply(answer)
 
     def _handle_work(self, work: Work) -> None:
         job = self.service.job
@@ -239,7 +247,12 @@ class Host:
             work.request.refuse("malformed")
             return
         self.inbox.of(job.name).consumed += 1
-        self._step(message)
+        try:
+            self._step(message)
+        except Exception as error:  # jobs are independent of each other: one that cannot be done ends no worker
+            log.exception("job failed", extra={"topic": job.name, "frame_id": getattr(message, "frame_id", -1)})
+            work.request.refuse(f"failed: {error}")
+            return
         self._journal(job.name, frame_id=getattr(message, "frame_id", -1))
         work.request.reply(b"done")
 
@@ -355,8 +368,9 @@ class Host:
             entry = decode(Consumed, sample.payload)
             if entry.topic == "START":
                 self._progress.reader(entry.instance, decode(Started, entry.inline).reads)
-            elif entry.writer == self.writer:
-                self._progress.consumed(entry.instance, entry.topic, entry.sequence)
+            else:
+                own = entry.writer == self.writer
+                self._progress.consumed(entry.instance, entry.topic, entry.sequence if own else -1)
         except DecodeError as error:
             self.inbox.of(JOURNAL.name).malformed += 1
             log.warning("malformed message dropped", extra={"topic": JOURNAL.name, "why": str(error)[:200]})

@@ -18,7 +18,7 @@ from services.runtime.bus import Answer, Bus
 log = logging.getLogger(__name__)
 
 CREDITS = 2
-MAX_ATTEMPTS = 8
+MAX_ATTEMPTS = 4
 BUSY_RETRY_S = 0.05
 QUARANTINE_S = 1.0
 MAX_QUARANTINE_S = 30.0
@@ -66,11 +66,12 @@ class Dispatcher:
         worker = self.workers.setdefault(name, Worker())
         worker.alive, worker.not_before_s, worker.hangs = True, 0.0, 0
 
-    def worker_down(self, name: str) -> None:
-        """A worker is gone: its jobs go to the front of the line, oldest first."""
+    def worker_down(self, name: str) -> list[Job]:
+        """A worker is gone: its jobs go to the front of the line, oldest first. Returns those given up."""
         worker = self.workers.pop(name, None)
-        if worker is not None:
-            self.line.extendleft(reversed(worker.running.values()))
+        held = list(worker.running.values()) if worker is not None else []
+        self.line.extendleft(reversed([job for job in held if job.attempts < MAX_ATTEMPTS]))
+        return [job for job in held if job.attempts >= MAX_ATTEMPTS]
 
     def assign(self, now_s: float) -> list[tuple[str, Job]]:
         """Who is to start what now."""
@@ -117,9 +118,9 @@ class Dispatcher:
         self.line.appendleft(job)
         return None
 
-    def next_time_s(self) -> float | None:
+    def next_time_s(self, now_s: float) -> float | None:
         """When a waiting worker may be tried again."""
-        times = [worker.not_before_s for worker in self.workers.values() if worker.not_before_s]
+        times = [worker.not_before_s for worker in self.workers.values() if worker.not_before_s > now_s]
         return min(times) if times and self.line else None
 
     def _credits_of(self, worker: Worker) -> int:
@@ -172,8 +173,14 @@ class JobPool:
 
     def _worker_changed(self, key: str, alive: bool) -> None:
         name = key.rsplit("/", 1)[-1]
+        given_up: list[Job] = []
         with self._lock:
-            (self._dispatcher.worker_up if alive else self._dispatcher.worker_down)(name)
+            if alive:
+                self._dispatcher.worker_up(name)
+            else:
+                given_up = self._dispatcher.worker_down(name)
+        for job in given_up:
+            self._on_done(job.id, name, job.attempts, "its workers died")
         log.info("worker joined" if alive else "worker left", extra={"worker": name, "topic": self._topic.name})
         self._send()
 
@@ -201,7 +208,7 @@ class JobPool:
         self._send()
 
     def _set_timer(self) -> None:
-        when_s = self._dispatcher.next_time_s()
+        when_s = self._dispatcher.next_time_s(self._clock_s())
         if when_s is None or self._timer is not None:
             return
         self._timer = threading.Timer(max(0.01, when_s - self._clock_s()), self._timer_fired)

@@ -8,6 +8,7 @@ deltas.
 import contextlib
 import json
 import logging
+import re
 import socket
 import threading
 import time
@@ -36,6 +37,7 @@ log = logging.getLogger(__name__)
 HEARTBEAT_S = 0.3
 CLOSE_TIMEOUT_S = 3.0
 LEASE_MS = 2000
+ENDPOINT = re.compile(r"(\w+)/(.+):(\d+)")
 
 
 def client_config(endpoint: str) -> zenoh.Config:
@@ -81,14 +83,19 @@ def open_router(endpoint: str) -> Callable[[], None]:
     try:
         session = zenoh.open(router_config(endpoint))
     except zenoh.ZError as error:
-        raise BusError(f"no router can listen on {endpoint} ({error}); choose another with --connect") from error
+        raise BusError(
+            f"no router can listen on {endpoint} (is another `prior-sg up` or `run` running?); "
+            "choose another with --connect"
+        ) from error
     return lambda: _close_within(session, CLOSE_TIMEOUT_S)
 
 
 def free_endpoint(wanted: str) -> str:
     """The endpoint wanted, or one on a free port of the same host when its port is 0 or taken."""
-    protocol, address = wanted.split("/", 1)
-    host, port = address.rsplit(":", 1)
+    match = ENDPOINT.fullmatch(wanted)
+    if match is None:
+        raise BusError(f"--connect takes PROTOCOL/HOST:PORT, for example tcp/127.0.0.1:7447; got {wanted!r}")
+    protocol, host, port = match.groups()
     for candidate in (int(port), 0):
         with socket.socket() as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
