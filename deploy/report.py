@@ -35,7 +35,7 @@ def truth_of(source: str) -> dict[str, Any] | None:
 
 def region_table(scene: Scene) -> Table:
     """One row per region, largest first."""
-    table = Table("id", "label", "places", "area m²", "probability", title=f"{scene.task} ({scene.environment})")
+    table = Table("id", "label", "places", "footprint m²", "probability", title=f"{scene.task} ({scene.environment})")
     for column in table.columns[2:]:
         column.justify = "right"
     for region in sorted(scene.regions, key=lambda region: -region.area_m2):
