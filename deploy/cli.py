@@ -8,6 +8,7 @@ import signal
 import sys
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -60,6 +61,9 @@ def _add_run_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--set", action="append", default=[], metavar="SERVICE.FIELD=VALUE", help="one setting")
 
 
+Command = Callable[[str, str, str], argparse.ArgumentParser]
+
+
 def build_parser() -> argparse.ArgumentParser:
     """All commands with their options."""
     parser = argparse.ArgumentParser(
@@ -72,6 +76,14 @@ def build_parser() -> argparse.ArgumentParser:
     def command(name: str, summary: str, example: str) -> argparse.ArgumentParser:
         return commands.add_parser(name, help=summary, description=summary, **_example(example))
 
+    _add_jobs(command)
+    _add_live(command)
+    _add_tools(command)
+    return parser
+
+
+def _add_jobs(command: Command) -> None:
+    """The main job, on the sample and on a source of the user's."""
     demo = command("demo", "run everything on the sample home and score the result", "prior-sg demo --workers 2")
     demo.add_argument("--out", type=Path, default=Path("out/demo"), help="folder for the results")
     demo.add_argument("--task", default=DEMO_TASK, help="what the robot is to do (default: %(default)s)")
@@ -87,7 +99,7 @@ def build_parser() -> argparse.ArgumentParser:
     run = command(
         "run",
         "turn a recording into a scene graph",
-        'prior-sg run recordings/home --environment "residential home" --task "serve drinks to guests" --out out/home',
+        'prior-sg run deploy/sample/home.mcap --environment "residential home" --task "serve drinks to guests"',
     )
     run.add_argument("source", help="a folder in a known layout (docs/sources.md) or an MCAP log")
     run.add_argument("--environment", required=True, help="what kind of place it is, in plain words")
@@ -97,6 +109,9 @@ def build_parser() -> argparse.ArgumentParser:
     run.add_argument("--in-process", action="store_true", help="all services in this process, for debugging")
     _add_run_options(run)
 
+
+def _add_live(command: Command) -> None:
+    """Services that stay, and what is done to them while they run."""
     up = command("up", "start services and a router, until Ctrl-C", "prior-sg up segmenter scene_store")
     up.add_argument("services", nargs="*", help="services to start; default: all")
     up.add_argument("--source", default="", help="what ingest reads; default: nothing")
@@ -114,6 +129,9 @@ def build_parser() -> argparse.ArgumentParser:
     task.add_argument("--timeout", type=float, default=60.0, help="seconds to wait for the new regions")
     _add_bus(task)
 
+
+def _add_tools(command: Command) -> None:
+    """What is done with results, logs and the system itself."""
     export = command("export", "write the scene graph as a file", "prior-sg export --format spark-dsg --out dsg.json")
     export.add_argument("--format", choices=("json", "spark-dsg", "png"), default="json")
     export.add_argument("--out", type=Path, required=True, help="the file to write")
@@ -154,7 +172,6 @@ def build_parser() -> argparse.ArgumentParser:
 
     priors = command("priors", "list the curated priors", "prior-sg priors list")
     priors.add_argument("action", choices=("list",))
-    return parser
 
 
 def _client(connect: str) -> "Client":
