@@ -129,6 +129,17 @@ def _add_live(command: Command) -> None:
     task.add_argument("--timeout", type=float, default=60.0, help="seconds to wait for the new regions")
     _add_bus(task)
 
+    poses = command(
+        "pose-update",
+        "correct the poses of keyframes, as after a loop closure",
+        "prior-sg pose-update optimised/trajectory.csv",
+    )
+    poses.add_argument(
+        "file", type=Path, help="CSV with the columns frame, stamp_ns, x_m y_m z_m qx qy qz qw: world_from_camera"
+    )
+    poses.add_argument("--timeout", type=float, default=60.0, help="seconds to wait for the corrected map")
+    _add_bus(poses)
+
 
 def _add_tools(command: Command) -> None:
     """What is done with results, logs and the system itself."""
@@ -314,6 +325,58 @@ def cmd_task(arguments: argparse.Namespace) -> int:
         time.sleep(0.5)
         console.print(report.region_table(client.ask(SCENE, SceneRequest(robot=arguments.robot))))
         console.print(f"regions for {arguments.task!r} after {seconds:.2f} s")
+    return 0
+
+
+def cmd_pose_update(arguments: argparse.Namespace) -> int:
+    """Post corrected poses and wait until the map stands corrected."""
+    import numpy as np
+
+    from schemas.codec import DecodeError, decode
+    from schemas.frames import PoseUpdate
+    from schemas.status import Consumed
+    from schemas.topics import JOURNAL, POSE_UPDATE
+    from services.ingest.sources import SourceError
+    from services.ingest.sources.dataset import read_corrections
+
+    try:
+        corrections = read_corrections(arguments.file)
+    except SourceError as error:
+        raise UserError(str(error)) from error
+    poses = {
+        frame_id: pose
+        for correction in corrections
+        for frame_id, pose in zip(correction.frame_ids.tolist(), correction.world_from_camera, strict=True)
+    }
+    if not poses:
+        raise UserError(f"{arguments.file} holds no poses")
+    with _client(arguments.connect) as client:
+        if "place_graph" not in client.alive().values():
+            raise UserError("no place_graph is running to take the poses; start it with `prior-sg up`")
+        update = PoseUpdate(
+            robot=arguments.robot,
+            epoch=time.time_ns(),
+            revision=0,
+            stamp_ns=time.time_ns(),
+            frame_ids=np.array(list(poses), np.int64),
+            world_from_camera=np.stack(list(poses.values())),
+        )
+        corrected = threading.Event()
+
+        def see(sample: Any) -> None:
+            with contextlib.suppress(DecodeError):
+                entry = decode(Consumed, sample.payload)
+                if (entry.service, entry.topic, entry.writer) == ("place_graph", POSE_UPDATE.name, client.writer):
+                    corrected.set()
+
+        client.listen(JOURNAL, arguments.robot, see)
+        started_s = time.monotonic()
+        client.publish(POSE_UPDATE, update)
+        if not corrected.wait(arguments.timeout):
+            raise UserError(f"the map took no poses within {arguments.timeout:.0f} s; see `prior-sg health`")
+        console.print(
+            f"{len(poses)} poses taken by the map of {arguments.robot} in {time.monotonic() - started_s:.2f} s"
+        )
     return 0
 
 
@@ -508,7 +571,7 @@ def main(argv: list[str] | None = None) -> int:
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, signal.default_int_handler)  # ended by a supervisor: as tidy as Ctrl-C
     try:
-        return globals()[f"cmd_{arguments.command}"](arguments)
+        return globals()[f"cmd_{arguments.command.replace('-', '_')}"](arguments)
     except BrokenPipeError:  # the reader of a pipe has left
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1

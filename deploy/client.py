@@ -20,7 +20,7 @@ class Client:
 
     def __init__(self, bus: Bus) -> None:
         self.bus = bus
-        self._writer = f"client/{uuid.uuid4().hex[:8]}/{time.time_ns()}"
+        self.writer = f"client/{uuid.uuid4().hex[:8]}/{time.time_ns()}"
         self._sequences: dict[str, int] = {}
         self._alive: dict[str, str] = {}
         self._watching = False
@@ -38,7 +38,7 @@ class Client:
         key = topic.key_of(message)
         sequence = self._sequences.get(key, 0)
         self._sequences[key] = sequence + 1
-        self.bus.put(topic, key, encode(message), pack_header(self._writer, sequence, time.time_ns()))
+        self.bus.put(topic, key, encode(message), pack_header(self.writer, sequence, time.time_ns()))
 
     def listen(self, topic: Topic, robot: str, on_sample: Callable[[Sample], None]) -> None:
         """Receive samples on a foreign thread."""

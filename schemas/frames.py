@@ -65,6 +65,28 @@ class Keyframe(Message, frozen=True, kw_only=True):
             raise ValueError("depth_scale_m must be positive")
 
 
+class PoseUpdate(Message, frozen=True, kw_only=True):
+    """Better poses of keyframes already seen, as a loop closure or an external SLAM gives them.
+
+    Each named keyframe stands corrected from now on; all others keep the pose they have. A keyframe may be named before
+    it arrives. Per epoch the revision rises; a repeat is ignored.
+    """
+
+    robot: str
+    epoch: int  # new at every start of the writer
+    revision: int  # rises per update of this writer, from 0
+    stamp_ns: int  # when the correction was made
+    frame_ids: Annotated[np.ndarray, Shape("int64", "frame")]
+    world_from_camera: Annotated[np.ndarray, Shape("float64", "frame", 4, 4)]
+
+    def check(self) -> None:
+        check_pose(self.world_from_camera)
+        if (self.frame_ids < 0).any():
+            raise ValueError("frame_ids: a number is negative")
+        if len(np.unique(self.frame_ids)) != len(self.frame_ids):
+            raise ValueError("frame_ids: a number repeats")
+
+
 class CameraState(Message, frozen=True, kw_only=True):
     """Where the camera is now, also between keyframes."""
 

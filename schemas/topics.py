@@ -13,7 +13,7 @@ from typing import Literal
 
 from schemas.codec import Message
 from schemas.features import Pyramid, TextEmbeddings, TextRequest
-from schemas.frames import ArchiveReply, ArchiveRequest, CameraState, IngestState, Keyframe
+from schemas.frames import ArchiveReply, ArchiveRequest, CameraState, IngestState, Keyframe, PoseUpdate
 from schemas.places import MapRequest, PlaceDelta, SnapshotRequest, VoxelMap
 from schemas.priors import Prior, PriorList, PriorRequest, Task, TaskInForce, TaskRequest
 from schemas.regions import PosteriorReply, PosteriorRequest, RegionDelta
@@ -63,6 +63,7 @@ class Query:
 
 
 KEYFRAME = Topic("KEYFRAME", Keyframe, f"{ROOT}/{{robot}}/keyframe", "every", 2, recorded=True, cache=32)
+POSE_UPDATE = Topic("POSE_UPDATE", PoseUpdate, f"{ROOT}/{{robot}}/pose_update", "every", 0.01, recorded=True, cache=16)
 CAMERA_STATE = Topic("CAMERA_STATE", CameraState, f"{ROOT}/{{robot}}/camera", "latest", 30, recorded=False)
 INGEST_STATE = Topic("INGEST_STATE", IngestState, f"{ROOT}/{{robot}}/ingest", "latest", 5, recorded=False)
 PLACE_DELTA = Topic("PLACE_DELTA", PlaceDelta, f"{ROOT}/{{robot}}/places", "every", 2, recorded=True, cache=256)
@@ -76,6 +77,7 @@ JOURNAL = Topic("JOURNAL", Consumed, f"{ROOT}/{{robot}}/journal", "every", 20, r
 
 TOPICS = (
     KEYFRAME,
+    POSE_UPDATE,
     CAMERA_STATE,
     INGEST_STATE,
     PLACE_DELTA,

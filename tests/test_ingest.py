@@ -11,12 +11,12 @@ from scipy.spatial.transform import Rotation
 
 from deploy.sample import PackError, bare_jpeg, pack
 from schemas.codec import decode, encode
-from schemas.frames import ArchiveRequest, Intrinsics, Keyframe
+from schemas.frames import ArchiveRequest, Intrinsics, Keyframe, PoseUpdate
 from schemas.status import JobDone
-from schemas.topics import CAMERA_STATE, ENCODE, INGEST_STATE, KEYFRAME
+from schemas.topics import ARCHIVE, CAMERA_STATE, ENCODE, INGEST_STATE, KEYFRAME, POSE_UPDATE
 from services.geometry import back_project, inverse, pose_from_quaternion, project, transform
 from services.ingest import core
-from services.ingest.core import BadFrame, Config, EndOfSource, RawFrame
+from services.ingest.core import BadFrame, Config, Correction, EndOfSource, RawFrame
 from services.ingest.service import SERVICE, drive, step
 from services.ingest.sources import SourceError, open_source
 from services.ingest.sources.base import levelling
@@ -628,3 +628,75 @@ def test_scipy_reads_the_same_quaternions():
     for quaternion in np.random.default_rng(0).normal(size=(20, 4)):
         expected = Rotation.from_quat(quaternion).as_matrix()
         np.testing.assert_allclose(pose_from_quaternion(np.zeros(3), quaternion)[:3, :3], expected, atol=1e-12)
+
+
+# Corrected poses.
+
+
+HEAD = "frame,stamp_ns,x_m,y_m,z_m,qx,qy,qz,qw\n"
+
+
+def test_a_dataset_delivers_its_corrections_between_the_frames_they_came_between(tmp_path):
+    folder = dataset_folder(tmp_path / "d", [f"{i},{i}000,{i},0,1,0,0,0,1" for i in range(3)])
+    rows = "0,1500,7,0,1,0,0,0,1\n1,1500,8,0,1,0,0,0,1\n1,9000,9,0,1,0,0,0,1\n"
+    (folder / "pose_updates.csv").write_text(HEAD + rows)
+    source = open_source(folder, floor_m=0.5)
+    seen = [event.frame_ids.tolist() if isinstance(event, Correction) else event.frame_id for event in source.events()]
+    assert seen == [0, 1, [0, 1], 2, [1]]
+    assert [frame.frame_id for frame in source] == [0, 1, 2]
+    first = next(event for event in source.events() if isinstance(event, Correction))
+    assert first.world_from_camera[:, :3, 3].tolist() == [[7, 0, 0.5], [8, 0, 0.5]]
+
+
+def test_corrections_that_make_no_sense_are_one_sentence(tmp_path):
+    folder = dataset_folder(tmp_path / "d", [f"{i},{i}000,{i},0,1,0,0,0,1" for i in range(3)])
+    for rows, complaint in (("0,1,x,0,1,0,0,0,1\n", "malformed"), ("0,1,1,0,1,0,0,0,0\n", "not finite")):
+        (folder / "pose_updates.csv").write_text(HEAD + rows)
+        with pytest.raises(SourceError, match=complaint):
+            open_source(folder)
+
+
+def test_a_correction_is_published_and_the_ring_follows_it():
+    state = SERVICE.init(Config(every_frame=True), Identity("tiago", "ingest-1", 5))
+    feed(state, [frame(i, i) for i in range(3)], Config(every_frame=True))
+    correction = Correction(
+        stamp_ns=7, frame_ids=np.array([1, 9]), world_from_camera=np.stack((pose(0.5, 3.0), pose(4.0)))
+    )
+    ((topic, update),) = feed(state, [correction], Config())
+    assert (topic, update.robot, update.epoch, update.revision, update.stamp_ns) == (POSE_UPDATE, "tiago", 5, 0, 7)
+    assert feed(state, [decode(PoseUpdate, encode(update))], Config()) == []
+    poses = [
+        k.world_from_camera for k in SERVICE.answers[ARCHIVE](state, ArchiveRequest(robot="tiago"), Config()).keyframes
+    ]
+    np.testing.assert_array_equal(poses, [pose(), pose(0.5, 3.0), pose()])
+
+
+def test_a_log_replays_its_pose_updates_where_they_were(tmp_path):
+    log = LogWriter(tmp_path / "log.mcap")
+    update = PoseUpdate(
+        robot="tiago", epoch=1, revision=0, stamp_ns=10**18, frame_ids=np.array([0]), world_from_camera=pose(2)[None]
+    )
+    state = empty_state()
+    outputs = feed(state, [frame(i, i) for i in range(0, 9, 3)], Config())
+    keyframes = [(topic, message) for topic, message in outputs if topic is KEYFRAME]
+    for sequence, (topic, message) in enumerate([*keyframes[:2], (POSE_UPDATE, update), *keyframes[2:]]):
+        log.add(topic, topic.key_of(message), encode(message), "w/1/1", sequence, 0, 0)
+    log.close()
+    events = list(open_source(tmp_path / "log.mcap").events())
+    assert [type(event) for event in events] == [RawFrame, RawFrame, Correction, RawFrame]
+    assert events[2].frame_ids.tolist() == [0]
+
+
+@pytest.mark.parametrize("fault", ["negative", "repeats", "mirrors", "not a number"])
+def test_pose_updates_that_cannot_be_true_are_refused(fault):
+    ids, poses = np.array([1, 2]), np.stack((pose(), pose()))
+    if fault == "negative":
+        ids[0] = -1
+    elif fault == "repeats":
+        ids[1] = 1
+    elif fault == "mirrors":
+        poses[0, 0, 0] = -1
+    else:
+        poses[1, 0, 3] = np.nan
+    with pytest.raises(ValueError):
+        PoseUpdate(robot="r", epoch=0, revision=0, stamp_ns=0, frame_ids=ids, world_from_camera=poses)

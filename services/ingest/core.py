@@ -10,11 +10,12 @@ import math
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import msgspec
 import numpy as np
 
-from schemas.codec import Message
+from schemas.codec import Message, Shape
 from schemas.frames import (
     ArchiveReply,
     ArchiveRequest,
@@ -23,10 +24,11 @@ from schemas.frames import (
     Intrinsics,
     Keyframe,
     Pose,
+    PoseUpdate,
     check_pose,
 )
 from schemas.status import JobDone
-from schemas.topics import CAMERA_STATE, ENCODE, INGEST_STATE, KEYFRAME, Topic
+from schemas.topics import CAMERA_STATE, ENCODE, INGEST_STATE, KEYFRAME, POSE_UPDATE, Topic
 from services.geometry import inverse, rotation_angle_rad
 
 Written = tuple[Topic, Message]
@@ -83,6 +85,17 @@ class BadFrame(Message, frozen=True, kw_only=True):
     total: int
 
 
+class Correction(Message, frozen=True, kw_only=True):
+    """Corrected poses that a source carries; fields as in PoseUpdate."""
+
+    stamp_ns: int
+    frame_ids: Annotated[np.ndarray, Shape("int64", "frame")]
+    world_from_camera: Annotated[np.ndarray, Shape("float64", "frame", 4, 4)]
+
+    def check(self) -> None:
+        check_pose(self.world_from_camera)
+
+
 class EndOfSource(Message, frozen=True, kw_only=True):
     """Every frame of the source has been handed over."""
 
@@ -106,6 +119,7 @@ class State:
     """Progress of one source."""
 
     robot: str
+    epoch: int = 0
     last: View | None = None  # newest frame believed
     jumped: View | None = None  # frame refused because its pose jumped, if that was the newest frame
     keyframe: View | None = None  # newest keyframe
@@ -114,6 +128,7 @@ class State:
     rejected: int = 0
     keyframes: int = 0
     encoded: int = 0
+    corrections: int = 0  # pose updates published
     encoding: set[int] = field(default_factory=set)  # numbers of keyframes whose job is not done
     ended: bool = False
     archive: deque[Keyframe] = field(default_factory=deque)
@@ -185,6 +200,31 @@ def encoded(state: State, done: JobDone) -> Iterator[Written]:
         state.encoding.remove(done.frame_id)
         state.encoded += not done.error
         yield progress(state)
+
+
+def announce(state: State, correction: Correction) -> Iterator[Written]:
+    """Publish corrected poses of the source; the ring follows when the update comes back, as anybody's does."""
+    yield (
+        POSE_UPDATE,
+        PoseUpdate(
+            robot=state.robot,
+            epoch=state.epoch,
+            revision=state.corrections,
+            stamp_ns=correction.stamp_ns,
+            frame_ids=correction.frame_ids,
+            world_from_camera=correction.world_from_camera,
+        ),
+    )
+    state.corrections += 1
+
+
+def correct(state: State, update: PoseUpdate) -> None:
+    """Give archived keyframes their corrected poses, so that whoever fetches them later maps them where they are."""
+    poses = dict(zip(update.frame_ids.tolist(), update.world_from_camera, strict=True))
+    for position, keyframe in enumerate(state.archive):
+        if keyframe.frame_id in poses:
+            pose = np.array(poses[keyframe.frame_id])
+            state.archive[position] = msgspec.structs.replace(keyframe, world_from_camera=pose)
 
 
 def end(state: State) -> Iterator[Written]:

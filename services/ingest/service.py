@@ -6,8 +6,9 @@ from collections.abc import Awaitable, Iterator
 from typing import Protocol
 
 from schemas.codec import Message
+from schemas.frames import PoseUpdate
 from schemas.status import JobDone, Tick
-from schemas.topics import ARCHIVE, CAMERA_STATE, ENCODE, INGEST_STATE, KEYFRAME
+from schemas.topics import ARCHIVE, CAMERA_STATE, ENCODE, INGEST_STATE, KEYFRAME, POSE_UPDATE
 from services.ingest import core
 from services.ingest.sources import Source, SourceError, open_source
 from services.runtime.service import Identity, Output, Service
@@ -30,11 +31,11 @@ class Port(Protocol):
 
 def init(cfg: core.Config, identity: Identity) -> core.State:
     """An empty state."""
-    return core.State(robot=identity.robot)
+    return core.State(robot=identity.robot, epoch=identity.epoch)
 
 
 def step(state: core.State, message: Message, cfg: core.Config) -> Iterator[Output]:
-    """Take one frame, one finished job, or the end of the source."""
+    """Take one frame, one finished job, corrected poses, or the end of the source."""
     match message:
         case core.RawFrame():
             reason = core.refusal(state, message, cfg)
@@ -48,6 +49,10 @@ def step(state: core.State, message: Message, cfg: core.Config) -> Iterator[Outp
             yield from core.lose(state, message)
         case JobDone():
             yield from core.encoded(state, message)
+        case core.Correction():
+            yield from core.announce(state, message)
+        case PoseUpdate():
+            core.correct(state, message)
         case core.EndOfSource():
             yield from core.end(state)
         case Tick():  # the topic keeps no history: whoever comes late, or missed the last word, hears it again
@@ -61,13 +66,13 @@ async def drive(port: Port, cfg: core.Config) -> None:
         return
     source = await asyncio.to_thread(_open, cfg)
     log.info("reading", extra={"source": cfg.source, "layout": source.layout, "frames": source.total})
-    frames = iter(source)
+    events = source.events()
     pace = Pace(cfg.speed)
-    while (frame := await asyncio.to_thread(next, frames, None)) is not None:
-        waiting = pace.until_due(frame) if cfg.speed > 0 else port.room(cfg.window)
+    while (event := await asyncio.to_thread(next, events, None)) is not None:
+        waiting = pace.until_due(event) if cfg.speed > 0 else port.room(cfg.window)
         if await _stopped_while(port, waiting):
             return
-        await port.consume(frame)
+        await port.consume(event)
     await port.consume(core.EndOfSource())
 
 
@@ -78,8 +83,8 @@ class Pace:
         self.speed = speed
         self._origin: tuple[float, int] | None = None  # loop time in seconds, stamp in nanoseconds
 
-    async def until_due(self, frame: core.RawFrame | core.BadFrame) -> None:
-        """Return when the frame is due; frames that could not be read, or come late, are due at once."""
+    async def until_due(self, frame: core.RawFrame | core.BadFrame | core.Correction) -> None:
+        """Return when the frame is due; all else, and frames that come late, are due at once."""
         if not isinstance(frame, core.RawFrame):
             return
         now_s = asyncio.get_running_loop().time()
@@ -117,7 +122,8 @@ SERVICE = Service(
     config=core.Config,
     init=init,
     step=step,
-    writes=(KEYFRAME, CAMERA_STATE, INGEST_STATE, ENCODE),
+    reads=(POSE_UPDATE,),
+    writes=(KEYFRAME, POSE_UPDATE, CAMERA_STATE, INGEST_STATE, ENCODE),
     answers={ARCHIVE: core.archived},
     drive=drive,
     tick_s=PROGRESS_S,

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import msgspec
 import numpy as np
 
-from schemas.frames import Keyframe
+from schemas.frames import Keyframe, PoseUpdate
 from schemas.places import PlaceDelta, VoxelMap
 from services.place_graph import distance, places, tsdf
 from services.place_graph.graph import Changes, PlaceGraph, Rules
@@ -69,6 +69,7 @@ class State:
     grid: VoxelGrid = field(default_factory=VoxelGrid)
     published: Published = field(default_factory=Published)
     cameras_m: dict[int, tuple[float, float, float]] = field(default_factory=dict)  # of the keyframes seen, by frame id
+    corrected: dict[int, np.ndarray] = field(default_factory=dict)  # newest pose given to a frame by an update
     rejected: int = 0  # keyframes that could not be used
     joined_frame_id: int = 0  # first keyframe heard live; earlier ones come from the archive
     revision: int = -1
@@ -90,9 +91,17 @@ def empty(robot: str, epoch: int, cfg: Config) -> State:
 
 def integrate(state: State, keyframe: Keyframe, depth_m: np.ndarray, cfg: Config) -> PlaceDelta:
     """Fuse one keyframe with its decoded depth (h, w), metres, 0 = none, and return what changed in the place graph."""
+    if (pose := state.corrected.get(keyframe.frame_id)) is not None:
+        keyframe = msgspec.structs.replace(keyframe, world_from_camera=pose)
     changed = fuse(state, keyframe, depth_m, cfg)
     changes = refresh(state, changed, cfg) if changed is not None else Changes()
     return _publish(state, keyframe, changes, cfg)
+
+
+def correct(state: State, update: PoseUpdate) -> None:
+    """Take over corrected poses of keyframes that are still to come."""
+    poses = zip(update.frame_ids.tolist(), np.array(update.world_from_camera), strict=True)
+    state.corrected.update({i: pose for i, pose in poses if i not in state.cameras_m})
 
 
 def reject(state: State, keyframe: Keyframe, cfg: Config) -> PlaceDelta:

@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 
 from schemas.codec import Message
-from schemas.frames import ArchiveReply, ArchiveRequest, Keyframe
+from schemas.frames import ArchiveReply, ArchiveRequest, Keyframe, PoseUpdate
 from schemas.places import MapRequest, PlaceDelta, SnapshotRequest, VoxelMap
-from schemas.topics import ARCHIVE, KEYFRAME, PLACE_DELTA, PLACE_SNAPSHOT, VOXEL_MAP
+from schemas.topics import ARCHIVE, KEYFRAME, PLACE_DELTA, PLACE_SNAPSHOT, POSE_UPDATE, VOXEL_MAP
 from services.place_graph import core
 from services.runtime.service import Ask, Identity, Output, Service
 
@@ -27,6 +27,8 @@ def step(state: core.State, message: Message, cfg: core.Config) -> Iterator[Outp
                 state.joined_frame_id = message.frame_id
                 yield _ask_archive(state.robot, 0, message.frame_id)
             yield from _map(state, message, cfg)
+        case PoseUpdate():
+            core.correct(state, message)
         case ArchiveReply():
             for keyframe in message.keyframes:
                 yield from _map(state, keyframe, cfg)
@@ -72,7 +74,7 @@ SERVICE = Service(
     config=core.Config,
     init=init,
     step=step,
-    reads=(KEYFRAME,),
+    reads=(KEYFRAME, POSE_UPDATE),
     writes=(PLACE_DELTA,),
     asks=(ARCHIVE,),
     answers={PLACE_SNAPSHOT: _snapshot, VOXEL_MAP: _voxel_map},

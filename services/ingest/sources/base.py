@@ -14,7 +14,7 @@ import numpy as np
 
 from schemas.frames import Intrinsics
 from services.geometry import pose_from_quaternion
-from services.ingest.core import BadFrame, RawFrame
+from services.ingest.core import BadFrame, Correction, RawFrame
 from services.ingest.sources.images import ImageError, image_size
 
 UP = (0.0, 0.0, 1.0)
@@ -41,9 +41,23 @@ class Source:
     total: int
     frames: Callable[[], Iterator[RawFrame | BadFrame]]
     ground_truth: dict[str, Any] | None = None  # content of regions.json
+    corrections: Callable[[], Iterator[Correction]] = lambda: iter(())  # corrected poses, stamps not falling
 
     def __iter__(self) -> Iterator[RawFrame | BadFrame]:
         return self.frames()
+
+    def events(self) -> Iterator[RawFrame | BadFrame | Correction]:
+        """Frames, with each correction before the first frame of a later stamp, or at the end."""
+        corrections = self.corrections()
+        waiting = next(corrections, None)
+        for frame in self.frames():
+            while waiting is not None and isinstance(frame, RawFrame) and waiting.stamp_ns < frame.stamp_ns:
+                yield waiting
+                waiting = next(corrections, None)
+            yield frame
+        if waiting is not None:
+            yield waiting
+        yield from corrections
 
 
 @dataclass(frozen=True)

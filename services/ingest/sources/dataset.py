@@ -3,16 +3,19 @@
 camera.json       width height fx fy cx cy (pixels), depth_scale_m (metres per unit)
 trajectory.csv    frame, stamp_ns, x_m y_m z_m qx qy qz qw: world_from_camera, world z up
 color/NNNNNN.jpg  or .png; depth/NNNNNN.png with 16 bits, 0 = no measurement
+pose_updates.csv  corrected poses, where they exist: stamp_ns (when the correction was made) and the columns of the
+                  trajectory; rows that follow each other with one stamp are one correction
 regions.json      ground truth, where it exists
 """
 
 import csv
 from collections.abc import Iterator, Sequence
+from itertools import groupby
 from pathlib import Path
 
 import numpy as np
 
-from services.ingest.core import BadFrame, RawFrame
+from services.ingest.core import BadFrame, Correction, RawFrame
 from services.ingest.sources.base import (
     CAMERA,
     REGIONS,
@@ -28,7 +31,7 @@ from services.ingest.sources.base import (
     read_json,
 )
 
-TRAJECTORY = "trajectory.csv"
+TRAJECTORY, POSE_UPDATES = "trajectory.csv", "pose_updates.csv"
 LOOKS = f"{CAMERA} and {TRAJECTORY} (dataset folder)"
 COLUMNS = ("frame", "stamp_ns", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
 
@@ -48,8 +51,36 @@ def load(path: Path, world_up: Sequence[float] = (), floor_m: float = 0.0) -> So
     except (KeyError, TypeError, ValueError) as error:
         raise SourceError(f"{path / CAMERA} is not a camera: {error!r}") from error
     rig = Rig(intrinsics, depth_scale_m, len(rows), levelling(world_up or UP, floor_m))
+    corrections = read_corrections(path / POSE_UPDATES, rig.world_from_source) if (path / POSE_UPDATES).exists() else []
     ground_truth = read_json(path / REGIONS) if (path / REGIONS).is_file() else None
-    return Source("dataset", path, intrinsics, len(rows), lambda: _frames(path, rig, rows), ground_truth)
+    return Source(
+        layout="dataset",
+        path=path,
+        intrinsics=intrinsics,
+        total=len(rows),
+        frames=lambda: _frames(path, rig, rows),
+        ground_truth=ground_truth,
+        corrections=lambda: iter(corrections),
+    )
+
+
+def read_corrections(path: Path, world_from_source: np.ndarray | None = None) -> list[Correction]:
+    """Corrected poses of a CSV file with the columns of a trajectory, one correction per stamp. Raises SourceError."""
+    corrections = []
+    for stamp, rows in groupby(_rows(path), key=lambda row: row["stamp_ns"]):
+        try:
+            posed = [_posed(row) for row in rows]
+            poses = np.stack([pose for _, _, pose in posed])
+            corrections.append(
+                Correction(
+                    stamp_ns=int(stamp),
+                    frame_ids=np.array([frame_id for frame_id, _, _ in posed], np.int64),
+                    world_from_camera=poses if world_from_source is None else world_from_source @ poses,
+                )
+            )
+        except ValueError as error:
+            raise SourceError(f"{path}, stamp {stamp}: {error}") from error
+    return sorted(corrections, key=lambda correction: correction.stamp_ns)
 
 
 def _frames(path: Path, rig: Rig, rows: list[dict[str, str]]) -> Iterator[RawFrame | BadFrame]:
