@@ -74,7 +74,21 @@ def test_random_deltas_equal_the_literal_graph():
         np.testing.assert_array_equal(values, [literal.places[place] for place in sorted(literal.places)])
         found = dict(zip(map(tuple, graph.ids[graph.edges].tolist()), graph.clearances_m.tolist(), strict=True))
         assert found == literal.edges
-        assert set(step.removed.tolist()) == set(before.ids.tolist()) - set(graph.ids.tolist())
+        assert set(before.ids[step.removed].tolist()) == set(before.ids.tolist()) - set(graph.ids.tolist())
+        untold = {int(place) for place in graph.ids[~step.touched]}
+        assert all(neighbours(before, place) == neighbours(graph, place) for place in untold)
+
+
+def neighbours(graph, place):
+    """Ids of the neighbours of a place by brute force, checked against the compressed table."""
+    row = int(graph.rows(np.array([place]))[0])
+    found = {*graph.edges[graph.edges[:, 0] == row, 1].tolist(), *graph.edges[graph.edges[:, 1] == row, 0].tolist()}
+    near = graph.adjacency
+    at = slice(near.starts[row], near.starts[row + 1])
+    assert sorted(found) == sorted(near.neighbours[at].tolist())
+    for other, edge in zip(near.neighbours[at].tolist(), near.edges[at].tolist(), strict=True):
+        assert set(graph.edges[edge].tolist()) == {row, other}
+    return set(graph.ids[sorted(found)].tolist())
 
 
 def test_only_real_changes_count_as_moved():

@@ -17,10 +17,11 @@ from schemas.priors import Prior, PriorList, PriorRequest, Task, TaskInForce, Ta
 from schemas.regions import ExpertVote, PosteriorReply, PosteriorRequest, Region, RegionDelta
 from schemas.status import Tick
 from services.deltas import Follower
-from services.segmenter import descriptors, publication, regions, swap
+from services.segmenter import descriptors, geometry, publication, regions, swap
 from services.segmenter.balance import BalanceConfig, label_bias
 from services.segmenter.experts import REGISTRY, Vote
-from services.segmenter.experts.context import Context, standardised
+from services.segmenter.experts.context import Context, ObjectSettings, ObjectView, standardised
+from services.segmenter.geometry import GeometryConfig
 from services.segmenter.graph import PlaceGraph, Step, apply
 
 UNLABELLED = -1
@@ -33,8 +34,10 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
     kernel: descriptors.KernelConfig = msgspec.field(default_factory=descriptors.KernelConfig)
     default_query_radius_m: float = 0.75  # r_Q until a prior is in force (paper)
     experts: dict[str, float] = msgspec.field(  # names, with their reliabilities lambda (paper)
-        default_factory=lambda: {"visual": 4.0, "environment": 0.1}
+        default_factory=lambda: {"visual": 4.0, "geometric": 1.0, "object": 1.0, "environment": 0.1}
     )
+    geometry: GeometryConfig = msgspec.field(default_factory=GeometryConfig)
+    objects: ObjectSettings = msgspec.field(default_factory=ObjectSettings)
     beta: float = 2.0  # weight of the pairwise term (paper)
     edge_decay_m: float = 2.0  # w_dist = exp(-length / edge_decay_m)
     edge_sum: float = 3.0  # sum of w_dist at a place, whatever the graph's density and scale; 0 = w_dist as it is
@@ -82,7 +85,11 @@ class Places:
     similarity: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))  # (place, label) standardised
     unary: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))  # (place, label)
     known: np.ndarray = field(default_factory=lambda: np.zeros(0))  # c_vis T / (T + T_half)
+    inclination_rad: np.ndarray = field(default_factory=lambda: np.zeros(0))  # of the local surface
+    support: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    anisotropy: np.ndarray = field(default_factory=lambda: np.zeros(0))
     stale: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=bool))  # similarity is to be computed again
+    reshaped: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=bool))  # and so is the local surface
 
     def realigned(self, step: Step) -> "Places":
         """The same beliefs on the rows of the next graph; new places have none."""
@@ -93,12 +100,17 @@ class Places:
             similarity=np.zeros((len(old), self.similarity.shape[1])),
             unary=np.zeros((len(old), self.unary.shape[1])),
             known=np.zeros(len(old)),
+            inclination_rad=np.zeros(len(old)),
+            support=np.zeros(len(old)),
+            anisotropy=np.zeros(len(old)),
             stale=step.moved.copy(),
+            reshaped=np.zeros(len(old), dtype=bool),
         )
         before = step.previous[old]
-        for name in ("labels", "regions", "similarity", "unary", "known"):
+        for name in ("labels", "regions", "similarity", "unary", "known", "inclination_rad", "support", "anisotropy"):
             getattr(after, name)[old] = getattr(self, name)[before]
         after.stale[old] |= self.stale[before]
+        after.reshaped[old] |= self.reshaped[before]
         return after
 
 
@@ -116,6 +128,7 @@ class State:
     evidence: descriptors.Evidence = field(default_factory=descriptors.Evidence)
     query_radius_m: float = 0.0
     places: Places = field(default_factory=Places)
+    objects: ObjectView = field(default_factory=ObjectView)
     task: Task | None = None
     priors: dict[str, Prior] = field(default_factory=dict)  # by digest, latest arrival last
     texts: dict[tuple[str, ...], TextEmbeddings] = field(default_factory=dict)  # by concepts
@@ -172,9 +185,10 @@ def follow_places(state: State, delta: PlaceDelta, cfg: Config) -> None:
     for ready in state.follower.take(delta):
         replaces = ready.snapshot or ready.epoch != state.graph_epoch
         step = apply(state.graph, ready, replaces)
-        state.graph, state.graph_epoch = step.graph, ready.epoch
         state.places = state.places.realigned(step)
-        state.evidence.remove(step.removed.tolist())
+        state.places.reshaped |= geometry.disturbed(state.graph, step, cfg.geometry.neighbourhood_m)
+        state.evidence.remove(state.graph.ids[step.removed].tolist())
+        state.graph, state.graph_epoch = step.graph, ready.epoch
         _reintegrate(state, np.flatnonzero(step.moved), cfg)
         state.stamp_ns = max(state.stamp_ns, ready.stamp_ns)
         state.dirty = True
@@ -280,6 +294,13 @@ def votes(state: State, rows: np.ndarray, cfg: Config) -> dict[str, Vote]:
         similarity=state.places.similarity[rows],
         frames=state.evidence.frames[state.evidence.of(state.graph.ids[rows].tolist())],
         bias=state.bias,
+        positions_m=state.graph.positions_m[rows],
+        radii_m=state.graph.radii_m[rows],
+        inclination_rad=state.places.inclination_rad[rows],
+        support=state.places.support[rows],
+        anisotropy=state.places.anisotropy[rows],
+        objects=state.objects,
+        object_settings=cfg.objects,
     )
     floor = np.log(cfg.probability_floor)
     answers = {name: REGISTRY[name](context) for name in cfg.experts}
@@ -296,9 +317,23 @@ def compare(state: State) -> None:
     state.places.stale[rows] = False
 
 
+def reshape(state: State, cfg: Config) -> None:
+    """Local surface of the places around which the graph changed."""
+    places, rows = state.places, np.flatnonzero(state.places.reshaped)
+    shape = geometry.shape_of(state.graph, rows, cfg.geometry)
+    places.inclination_rad[rows], places.support[rows], places.anisotropy[rows] = shape
+    places.reshaped[rows] = False
+
+
+def see_objects(state: State, objects: ObjectView) -> None:
+    """From now on these are the objects of the map."""
+    state.objects, state.dirty = objects, True
+
+
 def evaluate_experts(state: State, cfg: Config) -> None:
     """Unary potentials of all places (eqs. product_of_experts, unary_potential), after the map's bias is known."""
     assert state.alignment is not None
+    reshape(state, cfg)
     compare(state)
     places, prior, slots = state.places, state.alignment.prior, state.evidence.of(state.graph.ids.tolist())
     scores = state.alignment.text.temperature * places.similarity[state.evidence.frames[slots] > 0]

@@ -10,6 +10,8 @@ import numpy as np
 
 from services.segmenter.experts.context import Context
 from services.segmenter.experts.environment import environment
+from services.segmenter.experts.geometric import geometric
+from services.segmenter.experts.object import objects
 from services.segmenter.experts.visual import visual
 
 Vote = tuple[np.ndarray, np.ndarray]
@@ -17,5 +19,7 @@ Expert = Callable[[Context], Vote]
 
 REGISTRY: dict[str, Expert] = {
     "visual": visual,
+    "geometric": geometric,
+    "object": objects,
     "environment": environment,
 }

@@ -1,11 +1,31 @@
 """What experts may look at."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
+import msgspec
 import numpy as np
 
 from schemas.features import TextEmbeddings
 from schemas.priors import Prior
+
+
+@dataclass(frozen=True)
+class ObjectView:
+    """The objects of the map, each as a belief over the prior's objects."""
+
+    positions_m: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))  # (object, 3) world
+    concepts: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))  # (object, concept) P(c | o), rows sum to 1
+
+
+class ObjectSettings(msgspec.Struct, frozen=True, kw_only=True):
+    """How far an object speaks for the places around it; the paper leaves these values open."""
+
+    decay_m: float = 1.0  # gamma_obj: distance at which its word counts 1 / e
+    reach_m: float = 3.0  # d_max: distance beyond which it counts nothing
+
+    def __post_init__(self) -> None:
+        if not (self.decay_m > 0 and self.reach_m > 0):
+            raise ValueError("decay_m and reach_m must be positive")
 
 
 @dataclass(frozen=True)
@@ -17,6 +37,13 @@ class Context:
     similarity: np.ndarray  # (place, label) standardised, from `standardised`; any number where never observed
     frames: np.ndarray  # (place,) keyframes that observed the place
     bias: np.ndarray  # (label,) added to the visual scores, see services.segmenter.balance
+    positions_m: np.ndarray  # (place, 3) world
+    radii_m: np.ndarray  # (place,) distance to the nearest obstacle
+    inclination_rad: np.ndarray  # (place,) of the local surface against the horizontal, see services.segmenter.geometry
+    support: np.ndarray  # (place,) in [0, 1): how many places form that surface
+    anisotropy: np.ndarray  # (place,) in [0, 1]: how flat or straight it is
+    objects: ObjectView = field(default_factory=ObjectView)  # of the whole map
+    object_settings: ObjectSettings = field(default_factory=ObjectSettings)
 
 
 def standardised(descriptors: np.ndarray, text: TextEmbeddings) -> np.ndarray:
