@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from msgspec.structs import replace as replace_struct
 from rich.console import Console
 from segmenter_world import DIM, ROBOT, ROOM_M, SPACE, place_delta, place_grid, prior, text, walk
 
@@ -84,6 +85,28 @@ def test_oracles_see_what_pictures_do_not_show(case, kind):
     unseeing = blind(case)
     assert score(methods.ours(Config()), unseeing)["accuracy"] < 0.7
     assert score(methods.oracle(Config(), kind), unseeing)["accuracy"] > 0.9
+
+
+def test_the_object_oracle_counts_the_boxes_that_were_seen(case, tmp_path):
+    boxes = [
+        {"label": "oven", "min_m": [1.0, 1.0, 0.5], "max_m": [1.2, 1.2, 0.7]},
+        {"label": "bed", "min_m": [5.0, 1.0, 0.5], "max_m": [7.0, 3.0, 0.7]},
+        {"label": "bed", "min_m": [6.0, 1.0, 2.5], "max_m": [7.0, 3.0, 2.7]},  # nothing was seen there
+        {"label": "lamp", "min_m": [5.0, 1.0, 0.5], "max_m": [7.0, 3.0, 0.7]},  # not in the prior
+    ]
+    assert oracles.read_objects(tmp_path) == ()
+    (tmp_path / "objects.json").write_text(json.dumps({"objects": boxes}))
+    objects = oracles.read_objects(tmp_path)
+    occupied = np.array([[5, 5, 3], [30, 10, 3]], np.int16)
+    voxels = replace_struct(case.perception.voxels, occupied=occupied)
+    found = oracles.seen_objects(objects, case.prior, voxels)
+    np.testing.assert_allclose(found.positions_m, [[1.1, 1.1, 0.6], [6.0, 2.0, 0.6]])
+    assert found.concepts.tolist() == [[1.0, 0.0], [0.0, 1.0]]
+    told = replace_struct(case.prior, containment=np.array([[0.9, 0.05], [0.05, 0.9]], np.float32))
+    unseeing = blind(replace(case, prior=told, objects=objects))
+    unseeing = replace(unseeing, perception=replace(unseeing.perception, voxels=voxels))
+    assert score(methods.ours(Config()), unseeing)["accuracy"] < 0.7
+    assert score(methods.oracle(Config(), "objects"), unseeing)["accuracy"] > 0.9
 
 
 def test_a_crop_of_the_feature_oracle_carries_the_room_it_shows(case):

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 DEFAULT_TASK = "real-estate listing"
 TABLE_COLUMNS = 100  # narrower terminals wrap lines, which is better than cells cut short
 SWEEP_KINDS = ("crop", "encoder", "radius")
-ORACLE_KINDS = ("features", "places", "prior")
+ORACLE_KINDS = ("features", "places", "objects", "prior")
 SHOWN = {  # keys with their column titles
     "f1_s": "F1_S",
     "f1_g": "F1_G",
@@ -124,6 +124,7 @@ def chosen_methods(arguments: argparse.Namespace, layers: "Layers") -> "list[Met
 
 def chosen_datasets(paths: Sequence[Path], environments: Sequence[str], task: str) -> "list[Dataset]":
     """Datasets with truth and prior; the vocabulary is the ground truth's. Raises EvaluationError or SourceError."""
+    from deploy.evaluation.oracles import read_objects
     from deploy.evaluation.perception import EvaluationError, ground_truth, sequence_name
     from deploy.evaluation.priors import library_prior
     from deploy.evaluation.runner import Dataset
@@ -139,7 +140,7 @@ def chosen_datasets(paths: Sequence[Path], environments: Sequence[str], task: st
         if any(dataset.name == name for dataset in datasets):
             raise EvaluationError(f"two datasets are called {name}; rename one, for tables go by name")
         prior = library_prior(environment, task, list(dict.fromkeys(region.label for region in truth.regions)))
-        datasets.append(Dataset(name, path, truth, prior))
+        datasets.append(Dataset(name, path, truth, prior, read_objects(path)))
     return datasets
 
 

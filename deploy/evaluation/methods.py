@@ -26,7 +26,7 @@ from schemas.status import Tick
 from services.registry import BY_NAME
 from services.runtime.service import Ask, Identity
 from services.scene_store import core as store
-from services.segmenter.core import Config, State, region_concepts
+from services.segmenter.core import Config, State, region_concepts, see_objects
 from services.segmenter.experts import REGISTRY
 
 OURS = "ours"
@@ -48,6 +48,7 @@ class Case:
     perception: Perception
     prior: Prior
     truth: GroundTruth
+    objects: tuple[oracles.TrueObject, ...] = ()  # empty where the ground truth names none
 
 
 @dataclass(frozen=True)
@@ -177,6 +178,9 @@ def oracle(config: Config, name: str) -> Method:
     elif name == "features":
         variant = Variant(config, pyramids=lambda case: _true_pyramids(case, config.object_phrases))
         about = "crops carry the text embedding of the true region that most of their points lie in"
+    elif name == "objects":
+        variant = Variant(config, seen=_see_true_objects)
+        about = "the objects are those of the ground truth that the robot has seen; as ours where it names none"
     else:
         variant = Variant(config, seen=lambda case, state: _see_truth(case, state, config.object_phrases))
         about = "places carry the text embedding of their true region"
@@ -201,6 +205,11 @@ def _see_truth(case: Case, state: State, object_phrases: int) -> None:
     for slot, region in zip(slots.tolist(), case.truth.region_of(state.graph.positions_m).tolist(), strict=True):
         if evidence.frames[slot] and labels.get(region) in concepts:
             evidence.sums[slot] = concepts[labels[region]]
+
+
+def _see_true_objects(case: Case, state: State) -> None:
+    if case.objects:
+        see_objects(state, oracles.seen_objects(case.objects, case.prior, case.perception.voxels))
 
 
 def sweep(config: Config, kind: str) -> list[Method]:

@@ -1,13 +1,54 @@
-"""Perfect features, for finding out how much of an error is the encoder's: the true region's text instead of pixels."""
+"""Perfect parts, for finding out how much of an error is whose: the true region's text instead of pixels, and the
+true objects instead of detected ones."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
 
 import msgspec
 import numpy as np
 
 from deploy.evaluation.metrics import GroundTruth
 from schemas.features import Pyramid
+from schemas.places import VoxelMap
+from schemas.priors import Prior
 from services.geometry import transform
+from services.segmenter.experts.context import ObjectView
 
 NOISE = 0.5  # length of the noise added to the unit embedding of a region
+
+
+@dataclass(frozen=True)
+class TrueObject:
+    """One object of the ground truth: an axis-aligned box in the world."""
+
+    label: str
+    min_m: np.ndarray  # (3,)
+    max_m: np.ndarray  # (3,)
+
+
+def read_objects(path: Path) -> tuple[TrueObject, ...]:
+    """The objects of an `objects.json` in a dataset's folder; none where there is no such file."""
+    file = path / "objects.json"
+    if not file.exists():
+        return ()
+    boxes = json.loads(file.read_text())["objects"]
+    return tuple(TrueObject(str(b["label"]), np.array(b["min_m"], float), np.array(b["max_m"], float)) for b in boxes)
+
+
+def seen_objects(objects: tuple[TrueObject, ...], prior: Prior, voxels: VoxelMap) -> ObjectView:
+    """The objects that the prior names and the robot has seen, that is, whose box holds an occupied voxel's centre."""
+    names = [item.name for item in prior.objects]
+    occupied_m = (voxels.occupied + 0.5) * voxels.voxel_m
+    known = [item for item in objects if item.label in names]
+    margin_m = voxels.voxel_m / 2
+    seen = [
+        item
+        for item in known
+        if ((occupied_m >= item.min_m - margin_m) & (occupied_m <= item.max_m + margin_m)).all(axis=1).any()
+    ]
+    concepts = np.eye(len(names))[[names.index(item.label) for item in seen]].reshape(-1, len(names))
+    return ObjectView(np.array([(item.min_m + item.max_m) / 2 for item in seen]).reshape(-1, 3), concepts)
 
 
 def true_features(

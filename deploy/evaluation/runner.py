@@ -11,6 +11,7 @@ import numpy as np
 
 from deploy.evaluation.methods import Case, Method
 from deploy.evaluation.metrics import SCORES, GroundTruth, Reliability, assign, evaluate, reliability
+from deploy.evaluation.oracles import TrueObject
 from deploy.evaluation.perception import Perception, Report
 from deploy.evaluation.priors import variations
 from schemas.features import TextEmbeddings
@@ -32,6 +33,7 @@ class Dataset:
     path: Path
     truth: GroundTruth
     prior: Prior  # the library's
+    objects: tuple[TrueObject, ...] = ()  # of the ground truth, where it names them
 
 
 @dataclass(frozen=True)
@@ -114,7 +116,7 @@ def run(
                 perceptions[key] = perceive(sequence.path, method.features)
                 perceiving_s.setdefault(sequence.name, perceptions[key].seconds)
             for index, prior in enumerate(variations(sequence.prior, priors, strength)):
-                outcome, picture = judge(method, Case(perceptions[key], prior, sequence.truth), index)
+                outcome, picture = judge(method, Case(perceptions[key], prior, sequence.truth, sequence.objects), index)
                 outcomes.append(outcome)
                 pictures += [picture] if index == 0 else []
         report(sequence.name, len(methods), len(methods))

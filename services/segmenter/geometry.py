@@ -100,7 +100,7 @@ def _moments(starts, neighbours, lengths_m, positions_m, rows, limit_m):  # noqa
 
 
 @njit(cache=True, nogil=True)
-def _reach(starts, neighbours, lengths_m, rows, limit_m):  # noqa: ANN001, ANN202, PLR0917
+def _reach(starts, neighbours, lengths_m, rows, limit_m):  # noqa: ANN001, ANN202
     distances_m = np.full(len(starts) - 1, np.inf)
     return np.array(_settle(starts, neighbours, lengths_m, rows, limit_m, distances_m), np.int64)
 
