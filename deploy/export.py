@@ -4,8 +4,10 @@
 
     robot, stamp_ns, environment, task, prior_digest, embedding_space
     labels        [label]                         columns of every posterior
-    regions       [{id, label, probability, area_m2, position_m [x, y, z], places [id], adjacent [region id]}]
-    places        [{id, position_m [x, y, z], radius_m, region, label, posterior {label: p}, unknown}]
+    regions       [{id, label, parent, probability, unknown, predicted, area_m2, position_m [x, y, z], hull_m [[x, y]],
+                    places [id], objects [id], adjacent [region id],
+                    transitions [{region, edge [place id inside, outside], position_m, clearance_m, door}]}]
+    places        [{id, position_m [x, y, z], radius_m, region, label, posterior {label: p}, unknown, predicted}]
     edges         [{a, b, clearance_m}]           between places
     trajectory_m  [[x, y, z]]                     camera centres in order of time
 
@@ -16,6 +18,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import spark_dsg
 
@@ -35,6 +38,7 @@ def scene_json(scene: Scene) -> dict[str, Any]:
     names = {region.id: region.label for region in scene.regions}
     adjacent = _adjacent(scene)
     members = _members(scene)
+    predicted = set(scene.predicted_ids.tolist())
     return {
         "robot": scene.robot,
         "stamp_ns": scene.stamp_ns,
@@ -47,15 +51,21 @@ def scene_json(scene: Scene) -> dict[str, Any]:
             {
                 "id": region.id,
                 "label": region.label,
+                "parent": region.parent,
                 "probability": _short(region.probability),
+                "unknown": _short(region.unknown),
+                "predicted": region.predicted,
                 "area_m2": _short(region.area_m2),
                 "position_m": _short(region.position_m),
+                "hull_m": _short(region.hull_m),
                 "places": scene.place_ids[members[region.id]].tolist(),
+                "objects": region.object_ids,
+                "transitions": [msgspec.to_builtins(way) for way in region.transitions],
                 "adjacent": sorted(b if a == region.id else a for a, b in adjacent if region.id in (a, b)),
             }
             for region in scene.regions
         ],
-        "places": [_place_json(scene, row, names) for row in range(len(scene.place_ids))],
+        "places": [_place_json(scene, row, names, predicted) for row in range(len(scene.place_ids))],
         "edges": [
             {"a": a, "b": b, "clearance_m": _short(clearance_m)}
             for (a, b), clearance_m in zip(scene.edges.tolist(), scene.clearances_m, strict=True)
@@ -64,7 +74,7 @@ def scene_json(scene: Scene) -> dict[str, Any]:
     }
 
 
-def _place_json(scene: Scene, row: int, names: dict[int, str]) -> dict[str, Any]:
+def _place_json(scene: Scene, row: int, names: dict[int, str], predicted: set[int]) -> dict[str, Any]:
     region = int(scene.place_regions[row])
     posterior = scene.posteriors[row]
     return {
@@ -75,6 +85,7 @@ def _place_json(scene: Scene, row: int, names: dict[int, str]) -> dict[str, Any]
         "label": names.get(region),
         "posterior": dict(zip(scene.labels, _short(posterior), strict=True)) if posterior.any() else None,
         "unknown": _short(scene.unknown[row]),
+        "predicted": int(scene.place_ids[row]) in predicted,
     }
 
 

@@ -1,11 +1,23 @@
 """Regions and the label belief of each place, as deltas."""
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 import msgspec
 import numpy as np
 
 from schemas.codec import Message, Shape
+
+_NO_IDS = msgspec.field(default_factory=lambda: np.zeros(0, np.int64))
+
+
+class Transition(msgspec.Struct, frozen=True, kw_only=True):
+    """One way from a region into another: edges of the place graph that cross the border side by side."""
+
+    region: int  # on the other side
+    edge: tuple[int, int]  # place ids of the widest of these edges, inside and outside
+    position_m: tuple[float, float, float]  # middle of that edge, world
+    clearance_m: float  # smallest obstacle distance along it: half the width of the way
+    door: bool  # narrow, as doorways are
 
 
 class Region(msgspec.Struct, frozen=True, kw_only=True):
@@ -17,6 +29,26 @@ class Region(msgspec.Struct, frozen=True, kw_only=True):
     probability: float  # mean posterior of the label over its places
     position_m: tuple[float, float, float]  # mean of its places
     area_m2: float  # footprint of its places' spheres, seen from above
+    unknown: float = 0.0  # mean over its places
+    predicted: bool = False  # more than half of its places are predicted, see RegionDelta.predicted_ids
+    hull_m: list[tuple[float, float]] = []  # convex outline of that footprint, x and y, counter-clockwise
+    neighbour_ids: list[int] = []  # regions that an edge of the place graph leads to
+    transitions: list[Transition] = []  # the ways there
+    object_ids: list[int] = []  # objects that stand in it
+    parent: str = ""  # zone above the label, as the prior names it
+
+
+EventKind = Literal["appeared", "split", "merged", "relabelled", "removed"]
+
+
+class RegionEvent(msgspec.Struct, frozen=True, kw_only=True):
+    """What became of one region in one update."""
+
+    kind: EventKind
+    region: int
+    label: str  # the former one of regions that are gone
+    other: int = -1  # split: the region it was part of; merged: the region that took most of its places
+    former_label: str = ""  # relabelled: what it was
 
 
 class RegionDelta(Message, frozen=True, kw_only=True):
@@ -43,6 +75,9 @@ class RegionDelta(Message, frozen=True, kw_only=True):
     unknown: Annotated[np.ndarray, Shape("float16", "place")]  # mass outside the prior's regions, or unobserved
     removed_place_ids: Annotated[np.ndarray, Shape("int64", "removed_place")]
     energy: float
+    predicted_ids: Annotated[np.ndarray, Shape("int64", "predicted")] = _NO_IDS  # those of `place_ids` whose label
+    # rests on their surroundings: seen from afar, barely or never
+    events: list[RegionEvent] = []  # since the previous revision
 
     def check(self) -> None:
         if self.posteriors.shape[1] != len(self.labels):
@@ -65,8 +100,20 @@ class ExpertVote(msgspec.Struct, frozen=True, kw_only=True):
     log_probabilities: list[float]  # one per label
 
 
+class NeighbourPull(msgspec.Struct, frozen=True, kw_only=True):
+    """What one neighbour of a place does for its own label: any other costs the place `weight` times the prior's cost
+    of that pair."""
+
+    place_id: int
+    label: str
+    weight: float  # w_dist of the edge
+
+
 class PosteriorReply(Message, frozen=True, kw_only=True):
-    """Each expert's vote on a place; `found` is false when there is no such place."""
+    """Each expert's vote on a place; `found` is false when there is no such place.
+
+    The energy of a label at this place, its neighbours' given, is unary + pull.
+    """
 
     robot: str
     place_id: int
@@ -78,3 +125,11 @@ class PosteriorReply(Message, frozen=True, kw_only=True):
     votes: list[ExpertVote] = []
     frames: int = 0  # keyframes that saw the place
     trust: float = 0.0  # sum of their trust
+    position_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    region: int = -1
+    pull: list[float] = []  # one per label: pairwise cost against the neighbours
+    neighbours: list[NeighbourPull] = []
+    unknown: float = 1.0
+    predicted: bool = False
+    temperature: float = 1.0  # posterior = softmax(-(unary + pull) / temperature)
+    inclination_rad: float = 0.0  # of the local surface

@@ -2,10 +2,13 @@
 
 from typing import Annotated
 
+import msgspec
 import numpy as np
 
 from schemas.codec import Message, Shape
 from schemas.regions import Region
+
+_NO_IDS = msgspec.field(default_factory=lambda: np.zeros(0, np.int64))
 
 
 class SceneRevision(Message, frozen=True, kw_only=True):
@@ -47,3 +50,4 @@ class Scene(Message, frozen=True, kw_only=True):
     edges: Annotated[np.ndarray, Shape("int64", "edge", 2)]
     clearances_m: Annotated[np.ndarray, Shape("float32", "edge")]
     trajectory: Annotated[np.ndarray, Shape("float32", "frame", 3)]  # camera centres of the keyframes, world
+    predicted_ids: Annotated[np.ndarray, Shape("int64", "predicted")] = _NO_IDS  # places whose label is a prediction

@@ -86,7 +86,21 @@ GOLDEN: list[Message] = [
         labels=["kitchen"],
         regions=[
             regions.Region(
-                id=4, label="kitchen", place_count=1, probability=0.5, position_m=(1.0, 2.0, 3.0), area_m2=4.0
+                id=4,
+                label="kitchen",
+                place_count=1,
+                probability=0.5,
+                position_m=(1.0, 2.0, 3.0),
+                area_m2=4.0,
+                unknown=0.5,
+                predicted=True,
+                hull_m=[(0.0, 0.0), (1.0, 0.0), (0.0, 1.0)],
+                neighbour_ids=[5],
+                transitions=[
+                    regions.Transition(region=5, edge=(1, 2), position_m=(0.5, 0.0, 1.0), clearance_m=0.4, door=True)
+                ],
+                object_ids=[9],
+                parent="day zone",
             )
         ],
         removed_ids=np.array([3]),
@@ -96,6 +110,8 @@ GOLDEN: list[Message] = [
         unknown=np.array([0.25], FLOAT16),
         removed_place_ids=np.array([8]),
         energy=-1.5,
+        predicted_ids=np.array([1]),
+        events=[regions.RegionEvent(kind="split", region=4, label="kitchen", other=5, former_label="hall")],
     ),
     status.Consumed(
         robot="r", service="s", instance="i", order=1, topic="T", frame_id=2, writer="w", sequence=3, inline=b"x"

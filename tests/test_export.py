@@ -90,16 +90,23 @@ def test_json_by_hand():
         "label": "kitchen",
         "posterior": {"hall": 0.125, "kitchen": 0.75, "office": 0.125},
         "unknown": 0.25,
+        "predicted": False,
     }
     assert data["places"][4]["region"] is data["places"][4]["label"] is data["places"][4]["posterior"] is None
     kitchen, hall, other = data["regions"]
     assert kitchen == {
         "id": 4,
         "label": "kitchen",
+        "parent": "",
         "probability": 0.875,
+        "unknown": 0.0,
+        "predicted": False,
         "area_m2": 6.25,
         "position_m": [1.0, 2.0, 1.5],
+        "hull_m": [],
         "places": [10, 13],
+        "objects": [],
+        "transitions": [],
         "adjacent": [7],
     }
     assert hall["adjacent"] == [4] and other["places"] == other["adjacent"] == []

@@ -8,6 +8,7 @@ import sys
 import time
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -383,6 +384,48 @@ def test_nothing_received_is_kept_alive():
     list(service.step(store.state, message, store.cfg))
     posterior = store.state.robots[ROBOT].graph.beliefs[1].posterior
     assert not np.shares_memory(posterior, message.posteriors)
+
+
+def test_everything_a_region_tells_survives_a_restart(tmp_path):
+    way = Transition(region=8, edge=(1, 2), position_m=(0.5, 0.0, 1.0), clearance_m=0.4, door=True)
+    region = Region(
+        id=4,
+        label=LABELS[0],
+        place_count=2,
+        probability=0.75,
+        position_m=(0.1, 0.0, 1.0),
+        area_m2=2.5,
+        unknown=0.5,
+        predicted=True,
+        hull_m=[(0.0, 0.0), (1.0, 0.0), (0.0, 1.0)],
+        neighbour_ids=[8],
+        transitions=[way],
+        object_ids=[3],
+        parent="day zone",
+    )
+    beliefs = [(1, 4, [1, 0, 0], 0), (2, 4, [1, 0, 0], 0.5)]
+    store = Store(tmp_path / "scene.sqlite")
+    store.feed(place_delta(0, [(1, 0, 0, 1, 0.5), (2, 1, 0, 1, 0.5)]))
+    store.feed(msgspec.structs.replace(region_delta(0, beliefs, predicted_ids=np.array([2])), regions=[region]))
+    for scene in (store.scene(), store.reopened().scene()):
+        assert scene.regions == [region]
+        assert scene.predicted_ids.tolist() == [2]
+
+
+def test_a_file_of_the_former_layout_is_upgraded(tmp_path):
+    path = tmp_path / "scene.sqlite"
+    store = Store(path)
+    store.feed(place_delta(0, [(1, 0, 0, 1, 0.5)]), region_delta(0, [(1, 4, [1, 0, 0], 0)], [(4, LABELS[0], 1)]))
+    before = store.scene()
+    service.close(store.state)
+    with sqlite3.connect(path) as sql:
+        sql.execute("ALTER TABLE regions DROP COLUMN message")
+        sql.execute("ALTER TABLE beliefs DROP COLUMN predicted")
+        sql.execute("PRAGMA user_version = 1")
+    again = Store(path)
+    assert encode(again.scene()) == encode(before)
+    again.feed(region_delta(1, [(1, 4, [0, 1, 0], 0.5)], predicted_ids=np.array([1])))
+    assert again.reopened().scene().predicted_ids.tolist() == [1]
 
 
 def write_text(path):

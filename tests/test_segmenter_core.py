@@ -1,5 +1,6 @@
 """The whole segmenter on a small world: right regions, lasting ids, task switch, deltas, questions, replay."""
 
+import msgspec
 import numpy as np
 import pytest
 from segmenter_world import (
@@ -20,6 +21,7 @@ from segmenter_world import (
 
 from schemas.codec import decode, encode
 from schemas.features import TextRequest
+from schemas.frames import PoseUpdate
 from schemas.places import SnapshotRequest
 from schemas.priors import PriorList, PriorRequest, RegionPrior, TaskInForce
 from schemas.regions import PosteriorRequest, RegionDelta
@@ -35,6 +37,7 @@ from schemas.topics import (
 )
 from services.runtime.service import Ask, Identity
 from services.segmenter import core
+from services.segmenter.experts.context import ObjectView
 from services.segmenter.service import SERVICE
 
 CFG = core.Config()
@@ -313,6 +316,121 @@ def test_following_the_deltas_equals_the_snapshot():
     assert len(run.deltas) > 10
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_what_is_kept_up_to_date_equals_what_is_found_afresh(seed):
+    """After any history, asking every expert again and describing every region again changes nothing."""
+    rng = np.random.default_rng(seed)
+    cfg = core.Config(balance=core.BalanceConfig(tolerance=0.0))
+    positions, edges, frames = world()
+    run = Run(cfg=cfg).feed(task(), prior(ROOMS), place_delta(positions, edges))
+    oven = ObjectView(ids=np.array([3]), positions_m=np.array([(2.0, 2.0, 1.0)]), concepts=np.array([(1.0, 0.0)]))
+    none = np.zeros(0, dtype=np.int64)
+    for revision, frame in enumerate(frames[::2], start=1):
+        alive = run.state.graph.ids
+        removed = rng.choice(alive, 2, replace=False) if revision % 3 == 0 else none
+        merged = rng.choice(np.setdiff1d(alive, removed), (1, 2), replace=False) if revision % 4 == 0 else none
+        back = np.arange(len(positions)) if revision % 7 == 0 else none
+        if revision == 5:
+            core.see_objects(run.state, oven, cfg)
+        fields = {"removed_ids": removed, "merged_ids": merged.reshape(-1, 2), "place_ids": back, "revision": revision}
+        run.feed(place_delta(positions[back], edges if len(back) else edges[:0], **fields), frame)
+    run.feed(TICK)
+    state, places = run.state, run.state.places
+    columns = ("labels", "regions", "unary", "posteriors", "inclination_rad", "support", "anisotropy")
+    kept = {name: getattr(places, name).copy() for name in columns}
+    before, beliefs = dict(run.reader.regions), dict(run.reader.beliefs)
+    places.stale[:] = places.reshaped[:] = places.doubtful[:] = places.unbelieved[:] = True
+    state.weights = core.edge_weights(state.graph, cfg)
+    core.evaluate_experts(state, True, cfg)
+    core.believe(state, cfg)
+    for name, column in kept.items():
+        np.testing.assert_allclose(getattr(state.places, name), column, atol=1e-5, err_msg=name)
+    core.publish(state, [], True, cfg)
+    assert {number: (region.neighbour_ids, region.object_ids) for number, region in state.regions.items()} == {
+        number: (region.neighbour_ids, region.object_ids) for number, region in before.items()
+    }
+    assert state.regions == before
+    fresh = Reader()
+    fresh.apply(SERVICE.answers[REGION_SNAPSHOT](state, SnapshotRequest(robot=ROBOT), cfg))
+    assert fresh.beliefs.keys() == beliefs.keys()
+    for place, (region, posterior, unknown) in beliefs.items():
+        assert fresh.beliefs[place][0] == region
+        np.testing.assert_allclose(fresh.beliefs[place][1], posterior, atol=cfg.posterior_change + 1e-3)
+        assert fresh.beliefs[place][2] == pytest.approx(unknown, abs=cfg.posterior_change + 1e-3)
+    assert any(region.object_ids == [3] for region in before.values())
+
+
+def test_corrected_poses_equal_poses_known_from_the_start():
+    """A third of the frames arrive 2 m off and are corrected, some before they come, some after."""
+    positions, edges, frames = world()
+    clean = Run().feed(place_delta(positions, edges), task(), prior(ROOMS), *frames, TICK)
+    wrong = frames[::3]
+    update = PoseUpdate(
+        robot=ROBOT,
+        epoch=1,
+        revision=0,
+        stamp_ns=1,
+        frame_ids=np.array([frame.frame_id for frame in wrong]),
+        world_from_camera=np.stack([frame.world_from_camera for frame in wrong]),
+    )
+    shift = np.eye(4)
+    shift[0, 3] = 2.0
+    shifted = [msgspec.structs.replace(frame, world_from_camera=shift @ frame.world_from_camera) for frame in wrong]
+    rest = [frame for frame in frames if frame.frame_id % 3]
+    for order in ((*shifted, *rest, update), (update, *rest, *shifted), (*shifted[:5], update, *rest, *shifted[5:])):
+        run = Run().feed(place_delta(positions, edges), task(), prior(ROOMS), *order, TICK)
+        slots = [one.state.evidence.of(list(range(len(positions)))) for one in (clean, run)]
+        for name in ("sums", "trust", "frames"):
+            found = [getattr(one.state.evidence, name)[slot] for one, slot in zip((clean, run), slots, strict=True)]
+            np.testing.assert_allclose(*found, atol=1e-3, err_msg=name)
+        assert run.labels() == clean.labels()
+    disturbed = Run().feed(place_delta(positions, edges), task(), prior(ROOMS), *shifted, *rest, TICK)
+    assert not np.allclose(disturbed.state.evidence.trust, clean.state.evidence.trust, atol=0.1)
+    deltas = len(run.deltas)
+    run.feed(update, TICK)  # a repeat
+    assert len(run.deltas) == deltas
+
+
+def test_events_tell_what_became_of_the_regions():
+    run, positions = finished()
+    told = [event for delta in run.deltas for event in delta.events]
+    alive = set()
+    for event in told:
+        if event.kind in ("appeared", "split"):
+            assert event.region not in alive
+            alive.add(event.region)
+        elif event.kind in ("merged", "removed"):
+            alive.remove(event.region)
+    assert alive == set(run.reader.regions)
+    gone = np.flatnonzero(positions[:, 0] >= 8.0)
+    bedroom = next(region.id for region in run.reader.regions.values() if region.label == "bedroom")
+    run.feed(no_places(revision=1, removed_ids=gone), TICK)
+    assert ("removed", bedroom) in [(event.kind, event.region) for event in run.deltas[-1].events]
+    run.concepts = np.array([(1.0, 1.0, 0.0), (0.0, 0.0, 1.0)])
+    run.feed(task("find a bed"), prior(["day zone", "night zone"], "find a bed"), TICK)
+    kinds = {event.kind for delta in run.deltas[-2:] for event in delta.events}
+    assert "relabelled" in kinds or "merged" in kinds
+
+
+def test_regions_know_their_doors_and_barely_seen_places_are_predicted():
+    positions, edges, frames = world()
+    lonely = np.vstack((positions, [(30.0, 30.0, 1.0)])).astype(np.float32)
+    run = Run().feed(place_delta(lonely, edges), task(), prior(ROOMS), *frames, TICK)
+    by_label = {region.label: region for region in run.reader.regions.values() if region.place_count > 1}
+    kitchen, hall = by_label["kitchen"], by_label["hall"]
+    assert kitchen.neighbour_ids == [hall.id] and sorted(hall.neighbour_ids) == sorted(
+        [kitchen.id, by_label["bedroom"].id]
+    )
+    assert [way.door for way in kitchen.transitions] == [True]
+    assert abs(kitchen.transitions[0].position_m[0] - 4.0) <= 0.5 and kitchen.transitions[0].clearance_m == 0.4
+    assert run.deltas[-1].predicted_ids.tolist() or any(delta.predicted_ids.tolist() for delta in run.deltas)
+    fresh = SERVICE.answers[REGION_SNAPSHOT](run.state, SnapshotRequest(robot=ROBOT), CFG)
+    trust = run.state.evidence.trust[run.state.evidence.of(fresh.place_ids.tolist())]
+    assert fresh.predicted_ids.tolist() == fresh.place_ids[trust < CFG.predicted_trust].tolist()
+    assert len(positions) in fresh.predicted_ids.tolist() and len(fresh.predicted_ids) < len(positions) / 2
+    assert not kitchen.predicted
+
+
 def test_snapshot_before_anything_is_empty_and_the_first_delta_follows_it():
     whole = SERVICE.answers[REGION_SNAPSHOT](Run().state, SnapshotRequest(robot=ROBOT), CFG)
     assert whole.snapshot and whole.revision == -1 and not whole.regions
@@ -334,6 +452,14 @@ def test_posterior_explains_the_label():
     assert [vote.expert for vote in reply.votes] == ["visual", "geometric", "object", "environment"]
     assert reply.votes[0].weight == pytest.approx(4.0 * reply.votes[0].confidence)
     np.testing.assert_allclose(reply.posterior, run.reader.beliefs[5][1], atol=0.02)
+    likelihoods = np.exp(-(np.array(reply.unary) + reply.pull) / reply.temperature)
+    np.testing.assert_allclose(reply.posterior, likelihoods / likelihoods.sum(), atol=1e-9)
+    pull = [
+        sum(near.weight * run.state.alignment.pairwise[column, ROOMS.index(near.label)] for near in reply.neighbours)
+        for column in range(3)
+    ]
+    np.testing.assert_allclose(reply.pull, pull, atol=1e-9)
+    assert reply.region == run.reader.beliefs[5][0] and not reply.predicted
     assert not SERVICE.answers[POSTERIOR](run.state, PosteriorRequest(robot=ROBOT, place_id=777), CFG).found
 
 
@@ -348,7 +474,7 @@ def test_pairwise_costs_by_hand(clearance_m, factor):
     positions = np.array([(0.0, 0.0, 1.0), (1.0, 0.0, 1.0)])
     cfg = core.Config(edge_clearance_m=clearance_m, edge_sum=0.0)
     run = Run(cfg=cfg).feed(place_delta(positions, np.array([(0, 1)])), task(), prior(ROOMS[:2]))
-    mrf = core.field_of(run.state, cfg)
+    mrf = core.field_of(run.state)
     assert mrf.weights[0] * mrf.pairwise[0, 1] == pytest.approx(1.46049 * factor, abs=1e-4)
     assert mrf.pairwise[0, 0] == 0
 

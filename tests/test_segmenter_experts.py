@@ -136,7 +136,7 @@ def test_region_of_concept_by_hand():
 
 def with_objects(positions_m, concepts):
     base = context([(0.6, 0.8)] * 3, [1] * 3)
-    view = ObjectView(positions_m=np.array(positions_m), concepts=np.array(concepts))
+    view = ObjectView(ids=np.arange(len(concepts)), positions_m=np.array(positions_m), concepts=np.array(concepts))
     return context(
         [(0.6, 0.8)] * 3,
         [1] * 3,

@@ -42,6 +42,7 @@ class Belief(NamedTuple):
     region: int
     posterior: np.ndarray  # (label,) float16
     unknown: float
+    predicted: bool = False
 
 
 class Sighting(NamedTuple):
@@ -151,8 +152,9 @@ def apply_regions(graph: Graph, delta: RegionDelta) -> Changes:
         graph.regions[entry.id] = entry
         changes.regions.add(entry.id)
     columns = (delta.place_ids.tolist(), delta.place_regions.tolist(), delta.posteriors, delta.unknown.tolist())
+    predicted = set(delta.predicted_ids.tolist())
     for place, region, posterior, unknown in zip(*columns, strict=True):
-        graph.beliefs[place] = Belief(region, posterior.copy(), unknown)
+        graph.beliefs[place] = Belief(region, posterior.copy(), unknown, place in predicted)
         changes.beliefs.add(place)
     graph.alignment = Alignment(
         delta.prior_digest, delta.environment, delta.task, delta.space, tuple(delta.labels), delta.energy
@@ -222,6 +224,9 @@ def scene(graph: Graph) -> Scene:
         edges=_rows(edges, 2, np.int64),
         clearances_m=np.array([graph.edges[edge] for edge in edges], np.float32),
         trajectory=_rows(cameras, 3, np.float32),
+        predicted_ids=np.array(
+            [place for place, belief in zip(ids, beliefs, strict=True) if belief.predicted], np.int64
+        ),
     )
 
 

@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import msgspec
 import numpy as np
 
 from schemas.codec import encode
@@ -19,7 +20,7 @@ from services.runtime.service import ServiceError
 from services.scene_store import core
 
 APPLICATION_ID = 0x70736753  # "psgS", in the header of the file
-LAYOUT_VERSION = 1
+LAYOUT_VERSION = 2
 
 LAYOUT = """
 CREATE TABLE robots (id INTEGER PRIMARY KEY, name TEXT NOT NULL UNIQUE);
@@ -44,11 +45,11 @@ CREATE TABLE alignments (
 CREATE TABLE regions (
     robot INTEGER NOT NULL REFERENCES robots, id INTEGER NOT NULL,
     label TEXT NOT NULL, place_count INTEGER NOT NULL, probability REAL NOT NULL,
-    x_m REAL NOT NULL, y_m REAL NOT NULL, z_m REAL NOT NULL, area_m2 REAL NOT NULL,
+    x_m REAL NOT NULL, y_m REAL NOT NULL, z_m REAL NOT NULL, area_m2 REAL NOT NULL, message BLOB,
     PRIMARY KEY (robot, id)) WITHOUT ROWID;
 CREATE TABLE beliefs (
     robot INTEGER NOT NULL REFERENCES robots, place INTEGER NOT NULL,
-    region INTEGER NOT NULL, posterior BLOB NOT NULL, unknown REAL NOT NULL,
+    region INTEGER NOT NULL, posterior BLOB NOT NULL, unknown REAL NOT NULL, predicted INTEGER NOT NULL DEFAULT 0,
     PRIMARY KEY (robot, place)) WITHOUT ROWID;
 CREATE TABLE tasks (
     robot INTEGER NOT NULL REFERENCES robots, stamp_ns INTEGER NOT NULL,
@@ -62,6 +63,11 @@ CREATE TABLE revisions (
     stamp_ns INTEGER NOT NULL, places INTEGER NOT NULL, edges INTEGER NOT NULL, regions INTEGER NOT NULL,
     PRIMARY KEY (robot, revision)) WITHOUT ROWID;
 """
+
+UPGRADES = {  # statements that bring a file of the version before to this one
+    2: "ALTER TABLE regions ADD COLUMN message BLOB;"
+    "ALTER TABLE beliefs ADD COLUMN predicted INTEGER NOT NULL DEFAULT 0;"
+}
 
 
 class StoreError(ServiceError):
@@ -105,7 +111,7 @@ class Database:
         run(f"PRAGMA busy_timeout = {cfg.busy_timeout_ms}")
         kind, version = (run(f"PRAGMA {name}").fetchone()[0] for name in ("application_id", "user_version"))
         empty = run("SELECT count(*) FROM sqlite_schema").fetchone()[0] == 0
-        if not empty and (kind, version) != (APPLICATION_ID, LAYOUT_VERSION):
+        if not empty and (kind != APPLICATION_ID or not 1 <= version <= LAYOUT_VERSION):
             found = (
                 f"layout {version}, this program needs {LAYOUT_VERSION}" if kind == APPLICATION_ID else "other content"
             )
@@ -119,6 +125,8 @@ class Database:
                 f"BEGIN IMMEDIATE; {LAYOUT} PRAGMA application_id = {APPLICATION_ID};"
                 f"PRAGMA user_version = {LAYOUT_VERSION}; COMMIT;"
             )
+        for newer in range(version + 1, LAYOUT_VERSION + 1) if not empty else ():
+            self._sql.executescript(f"BEGIN IMMEDIATE; {UPGRADES[newer]} PRAGMA user_version = {newer}; COMMIT;")
         fault = run("PRAGMA quick_check(1)").fetchone()[0]
         if fault != "ok":
             raise sqlite3.DatabaseError(f"it is damaged: {' '.join(fault.split())}")
@@ -157,8 +165,8 @@ class Database:
             "prior_digest, environment, task, space, labels, energy FROM alignments", robot
         ):
             graph.alignment = core.Alignment(digest, environment, task, space, tuple(json.loads(labels)), energy)
-        for region, label, count, probability, x, y, z, area_m2 in self._select(
-            "id, label, place_count, probability, x_m, y_m, z_m, area_m2 FROM regions", robot
+        for region, label, count, probability, x, y, z, area_m2, message in self._select(
+            "id, label, place_count, probability, x_m, y_m, z_m, area_m2, message FROM regions", robot
         ):
             graph.regions[region] = Region(
                 id=region,
@@ -168,8 +176,12 @@ class Database:
                 position_m=(x, y, z),
                 area_m2=area_m2,
             )
-        for place, region, posterior, unknown in self._select("place, region, posterior, unknown FROM beliefs", robot):
-            graph.beliefs[place] = core.Belief(region, np.frombuffer(posterior, "<f2"), unknown)
+            if message is not None:  # it holds everything; the columns are for whoever reads the file with SQL
+                graph.regions[region] = msgspec.msgpack.decode(message, type=Region)
+        for place, region, posterior, unknown, predicted in self._select(
+            "place, region, posterior, unknown, predicted FROM beliefs", robot
+        ):
+            graph.beliefs[place] = core.Belief(region, np.frombuffer(posterior, "<f2"), unknown, bool(predicted))
 
     def _select(self, what: str, robot: int, order: str = "1") -> Iterator[tuple]:
         return self._sql.execute(f"SELECT {what} WHERE robot = ? ORDER BY {order}", (robot,))
@@ -218,11 +230,18 @@ class Database:
             regions = (graph.regions[region] for region in sorted(changes.regions & graph.regions.keys()))
             self._put(
                 "regions",
-                ((robot, r.id, r.label, r.place_count, r.probability, *r.position_m, r.area_m2) for r in regions),
+                (
+                    (
+                        *(robot, r.id, r.label, r.place_count, r.probability, *r.position_m, r.area_m2),
+                        msgspec.msgpack.encode(r),
+                    )
+                    for r in regions
+                ),
             )
             beliefs = ((place, graph.beliefs[place]) for place in sorted(changes.beliefs & graph.beliefs.keys()))
             self._put(
-                "beliefs", ((robot, p, b.region, b.posterior.astype("<f2").tobytes(), b.unknown) for p, b in beliefs)
+                "beliefs",
+                ((robot, p, b.region, b.posterior.astype("<f2").tobytes(), b.unknown, b.predicted) for p, b in beliefs),
             )
             self._put_cursor(robot, "region", graph.region_cursor, graph)
 

@@ -18,6 +18,8 @@ class BalanceConfig(msgspec.Struct, frozen=True, kw_only=True):
     limit: float = 0.7  # greatest bias, in natural logarithms: odds at most double. 0 = no correction (paper)
     half_places: float = 100.0  # observed places at which half of the correction is in force: first rooms are no sample
     existence_share: float = 0.75  # of P(r | E0) in the expected proportions; the rest is uniform
+    patience: float = 0.2  # share of the map to be seen anew before the bias is computed again, unless idle
+    tolerance: float = 0.01  # smaller changes of the bias are not worth asking the experts again
 
     def __post_init__(self) -> None:
         if not (self.limit >= 0 and self.half_places > 0 and 0 <= self.existence_share <= 1):

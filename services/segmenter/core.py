@@ -9,22 +9,33 @@ from dataclasses import dataclass, field
 
 import msgspec
 import numpy as np
+from scipy.spatial import cKDTree
 
 from schemas.codec import Message, copied
 from schemas.features import Pyramid, TextEmbeddings, TextRequest
+from schemas.frames import PoseUpdate
 from schemas.places import PlaceDelta, SnapshotRequest
 from schemas.priors import Prior, PriorList, PriorRequest, Task, TaskInForce, TaskRequest
-from schemas.regions import ExpertVote, PosteriorReply, PosteriorRequest, Region, RegionDelta
+from schemas.regions import (
+    ExpertVote,
+    NeighbourPull,
+    PosteriorReply,
+    PosteriorRequest,
+    Region,
+    RegionDelta,
+    RegionEvent,
+)
 from schemas.status import Tick
 from services.deltas import Follower
-from services.segmenter import descriptors, geometry, publication, regions, swap
+from services.segmenter import beliefs, descriptors, geometry, publication, regions, swap
 from services.segmenter.balance import BalanceConfig, label_bias
 from services.segmenter.experts import REGISTRY, Vote
 from services.segmenter.experts.context import Context, ObjectSettings, ObjectView, standardised
 from services.segmenter.geometry import GeometryConfig
-from services.segmenter.graph import PlaceGraph, Step, apply
+from services.segmenter.graph import PlaceGraph, apply
+from services.segmenter.places import UNLABELLED, Places
 
-UNLABELLED = -1
+BIAS_SAMPLE = 4096  # places that stand for all when the map's bias is computed
 
 
 class Config(msgspec.Struct, frozen=True, kw_only=True):
@@ -45,7 +56,10 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
     probability_floor: float = 1e-6  # least probability in a logarithm, so that every cost is finite
     object_phrases: int = 2  # objects whose phrases join a region's concept, the most discriminative first
     balance: BalanceConfig = msgspec.field(default_factory=BalanceConfig)  # beyond the paper
+    temperature: float = 1.0  # of the posteriors; see services.segmenter.beliefs
     trust_half: float = 0.5  # sum of trust at which half of the unknown mass is left
+    predicted_trust: float = 1.0  # sum of trust below which a place counts as predicted; one close look gives about 2
+    door_clearance_m: float = 0.7  # a way between regions with at most this clearance is a door
     posterior_change: float = 0.01  # smaller changes of a belief are not sent
     footprint_cell_m: float = 0.1  # grid of the regions' areas
     prior_wait_ticks: int = 4  # ticks to wait for a task's prior before asking for it
@@ -57,8 +71,8 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
             raise ValueError(f"no such expert: {', '.join(unknown)}; there are {', '.join(sorted(REGISTRY))}")
         if not (self.beta >= 0 and self.edge_decay_m > 0 and self.edge_sum >= 0):
             raise ValueError("beta, edge_decay_m or edge_sum is out of range")
-        if not (0 < self.probability_floor < 1 and self.trust_half > 0):
-            raise ValueError("probability_floor or trust_half is out of range")
+        if not (0 < self.probability_floor < 1 and self.trust_half > 0 and self.temperature > 0):
+            raise ValueError("probability_floor, trust_half or temperature is out of range")
 
 
 @dataclass(frozen=True)
@@ -77,44 +91,6 @@ class Alignment:
 
 
 @dataclass
-class Places:
-    """What is known and believed of each place, in the order of the graph's rows."""
-
-    labels: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))  # UNLABELLED = not yet
-    regions: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
-    similarity: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))  # (place, label) standardised
-    unary: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))  # (place, label)
-    known: np.ndarray = field(default_factory=lambda: np.zeros(0))  # c_vis T / (T + T_half)
-    inclination_rad: np.ndarray = field(default_factory=lambda: np.zeros(0))  # of the local surface
-    support: np.ndarray = field(default_factory=lambda: np.zeros(0))
-    anisotropy: np.ndarray = field(default_factory=lambda: np.zeros(0))
-    stale: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=bool))  # similarity is to be computed again
-    reshaped: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=bool))  # and so is the local surface
-
-    def realigned(self, step: Step) -> "Places":
-        """The same beliefs on the rows of the next graph; new places have none."""
-        old = step.previous >= 0
-        after = Places(
-            labels=np.full(len(old), UNLABELLED),
-            regions=np.full(len(old), regions.NO_REGION),
-            similarity=np.zeros((len(old), self.similarity.shape[1])),
-            unary=np.zeros((len(old), self.unary.shape[1])),
-            known=np.zeros(len(old)),
-            inclination_rad=np.zeros(len(old)),
-            support=np.zeros(len(old)),
-            anisotropy=np.zeros(len(old)),
-            stale=step.moved.copy(),
-            reshaped=np.zeros(len(old), dtype=bool),
-        )
-        before = step.previous[old]
-        for name in ("labels", "regions", "similarity", "unary", "known", "inclination_rad", "support", "anisotropy"):
-            getattr(after, name)[old] = getattr(self, name)[before]
-        after.stale[old] |= self.stale[before]
-        after.reshaped[old] |= self.reshaped[before]
-        return after
-
-
-@dataclass
 class State:
     """Everything the segmenter remembers."""
 
@@ -124,18 +100,24 @@ class State:
     follower: Follower[PlaceDelta] = field(default_factory=Follower)
     graph_epoch: int = -1
     graph: PlaceGraph = field(default_factory=PlaceGraph)
+    weights: np.ndarray = field(default_factory=lambda: np.zeros(0))  # (edge,) w_dist
     archive: descriptors.Archive = field(default_factory=descriptors.Archive)
     evidence: descriptors.Evidence = field(default_factory=descriptors.Evidence)
     query_radius_m: float = 0.0
-    places: Places = field(default_factory=Places)
+    poses: dict[int, np.ndarray] = field(default_factory=dict)  # corrected world_from_camera by frame id
+    pose_revisions: dict[int, int] = field(default_factory=dict)  # of the newest correction by the epoch of its writer
+    places: Places = field(default_factory=Places.none)
     objects: ObjectView = field(default_factory=ObjectView)
     task: Task | None = None
     priors: dict[str, Prior] = field(default_factory=dict)  # by digest, latest arrival last
     texts: dict[tuple[str, ...], TextEmbeddings] = field(default_factory=dict)  # by concepts
     alignment: Alignment | None = None
     bias: np.ndarray = field(default_factory=lambda: np.zeros(0))  # (label,) of the visual scores in this map
+    compared: int = 0  # places whose similarity was computed, or that left, since the bias was
     next_region_id: int = 0
-    published: publication.View | None = None
+    regions: dict[int, Region] = field(default_factory=dict)
+    disturbed: set[int] = field(default_factory=set)  # regions whose figures are to be computed again
+    ledger: publication.Ledger = field(default_factory=publication.Ledger)
     dirty: bool = False  # something changed since the last solution
     asked_snapshot: bool = False
     asked_text: TextRequest | None = None
@@ -157,6 +139,8 @@ def update(state: State, message: Message, cfg: Config) -> Iterator[Message]:
             follow_places(state, message, cfg)
         case Pyramid():
             observe(state, message, cfg)
+        case PoseUpdate():
+            correct_poses(state, message, cfg)
         case Task():
             take_task(state, message)
         case TaskInForce():
@@ -175,7 +159,7 @@ def update(state: State, message: Message, cfg: Config) -> Iterator[Message]:
     switched = align(state, cfg)
     yield from _requests(state, cfg)
     if switched or (state.dirty and isinstance(message, Pyramid | Tick)):
-        yield from _segment(state, switched, cfg)
+        yield from _segment(state, switched, isinstance(message, Tick), cfg)
 
 
 def follow_places(state: State, delta: PlaceDelta, cfg: Config) -> None:
@@ -185,10 +169,18 @@ def follow_places(state: State, delta: PlaceDelta, cfg: Config) -> None:
     for ready in state.follower.take(delta):
         replaces = ready.snapshot or ready.epoch != state.graph_epoch
         step = apply(state.graph, ready, replaces)
+        before, state.graph, state.graph_epoch = state.graph, step.graph, ready.epoch
+        state.disturbed.update(state.places.regions[step.removed].tolist())
+        state.ledger.forget(state.places.slots[step.removed])
+        state.compared += len(step.removed)
+        state.evidence.remove(before.ids[step.removed].tolist())
         state.places = state.places.realigned(step)
-        state.places.reshaped |= geometry.disturbed(state.graph, step, cfg.geometry.neighbourhood_m)
-        state.evidence.remove(state.graph.ids[step.removed].tolist())
-        state.graph, state.graph_epoch = step.graph, ready.epoch
+        state.places.reshaped |= geometry.disturbed(before, step, cfg.geometry.neighbourhood_m)
+        state.weights = edge_weights(state.graph, cfg)
+        unsettled = with_neighbours(state.graph, step.touched)
+        state.places.unsettled |= unsettled
+        state.places.unbelieved |= unsettled
+        state.places.doubtful |= step.moved
         _reintegrate(state, np.flatnonzero(step.moved), cfg)
         state.stamp_ns = max(state.stamp_ns, ready.stamp_ns)
         state.dirty = True
@@ -199,16 +191,35 @@ def observe(state: State, pyramid: Pyramid, cfg: Config) -> None:
     if pyramid.space != cfg.space:
         state.ignored_pyramids += 1
         return
+    if pyramid.frame_id in state.poses:
+        pyramid = msgspec.structs.replace(pyramid, world_from_camera=state.poses[pyramid.frame_id])
     frame = descriptors.compact(pyramid)
     if not (state.evidence.fits(frame) and state.archive.add(pyramid.frame_id, frame)):
         state.ignored_pyramids += 1
         return
-    seen = descriptors.integrate(
-        state.evidence, frame, _targets(state, np.arange(len(state.graph.ids))), state.query_radius_m, cfg.kernel
-    )
+    targets = descriptors.Targets(state.places.slots, state.graph.positions_m)
+    seen = descriptors.integrate(state.evidence, frame, targets, state.query_radius_m, cfg.kernel)
     state.places.stale[seen] = True
     state.stamp_ns = max(state.stamp_ns, pyramid.stamp_ns)
     state.dirty = True
+
+
+def correct_poses(state: State, poses: PoseUpdate, cfg: Config) -> None:
+    """Re-anchor frames, and integrate afresh the places that they saw from the old pose or see from the new one.
+
+    A frame may be corrected before its pyramid arrives. A repeated update changes nothing.
+    """
+    if poses.revision <= state.pose_revisions.get(poses.epoch, -1):
+        return
+    state.pose_revisions[poses.epoch] = poses.revision
+    affected = np.zeros(len(state.graph.ids), dtype=bool)
+    for frame_id, world_from_camera in zip(poses.frame_ids.tolist(), poses.world_from_camera, strict=True):
+        state.poses[frame_id] = world_from_camera.copy()
+        for frame in state.archive.move(frame_id, world_from_camera) or ():
+            affected[descriptors.visible(frame, state.graph.positions_m, cfg.kernel)] = True
+    if affected.any():
+        _reintegrate(state, np.flatnonzero(affected), cfg)
+        state.dirty = True
 
 
 def take_task(state: State, task: Task) -> None:
@@ -261,11 +272,9 @@ def align(state: State, cfg: Config) -> bool:
     if query_radius_m != state.query_radius_m:
         state.query_radius_m = query_radius_m
         _reintegrate(state, np.arange(len(state.graph.ids)), cfg)
-    state.places.labels[:] = UNLABELLED
-    state.places.similarity = np.zeros((len(state.graph.ids), len(prior.regions)))
-    state.places.unary = np.zeros((len(state.graph.ids), len(prior.regions)))
-    state.bias = np.zeros(len(prior.regions))
-    state.places.stale[:] = True
+    state.places = state.places.relabelled(len(prior.regions))
+    state.bias, state.compared = np.zeros(len(prior.regions)), len(state.graph.ids)
+    state.objects = ObjectView()  # its columns are the former prior's objects
     return True
 
 
@@ -292,7 +301,7 @@ def votes(state: State, rows: np.ndarray, cfg: Config) -> dict[str, Vote]:
         prior=alignment.prior,
         text=alignment.text,
         similarity=state.places.similarity[rows],
-        frames=state.evidence.frames[state.evidence.of(state.graph.ids[rows].tolist())],
+        frames=state.evidence.frames[state.places.slots[rows]],
         bias=state.bias,
         positions_m=state.graph.positions_m[rows],
         radii_m=state.graph.radii_m[rows],
@@ -309,12 +318,13 @@ def votes(state: State, rows: np.ndarray, cfg: Config) -> dict[str, Vote]:
 
 def compare(state: State) -> None:
     """Similarity of the places whose evidence changed with each label."""
-    alignment, evidence, rows = state.alignment, state.evidence, np.flatnonzero(state.places.stale)
+    alignment, places, rows = state.alignment, state.places, np.flatnonzero(state.places.stale)
     assert alignment is not None
-    found = evidence.descriptors(evidence.of(state.graph.ids[rows].tolist()))
+    found = state.evidence.descriptors(places.slots[rows])
     if found.shape[1]:  # after the first pyramid
-        state.places.similarity[rows] = standardised(found, alignment.text)
-    state.places.stale[rows] = False
+        places.similarity[rows] = standardised(found, alignment.text)
+    places.stale[rows], places.doubtful[rows] = False, True
+    state.compared += len(rows)
 
 
 def reshape(state: State, cfg: Config) -> None:
@@ -322,30 +332,51 @@ def reshape(state: State, cfg: Config) -> None:
     places, rows = state.places, np.flatnonzero(state.places.reshaped)
     shape = geometry.shape_of(state.graph, rows, cfg.geometry)
     places.inclination_rad[rows], places.support[rows], places.anisotropy[rows] = shape
-    places.reshaped[rows] = False
+    places.reshaped[rows], places.doubtful[rows] = False, True
 
 
-def see_objects(state: State, objects: ObjectView) -> None:
-    """From now on these are the objects of the map."""
-    state.objects, state.dirty = objects, True
+def see_objects(state: State, view: ObjectView, cfg: Config) -> None:
+    """From now on these are the objects of the map; the places near those that are new, changed or gone ask again."""
+    changed_m = view.changed_m(state.objects)
+    state.objects = view
+    if len(changed_m) and len(state.graph.ids):
+        distances_m, _ = cKDTree(changed_m).query(state.graph.positions_m, distance_upper_bound=cfg.objects.reach_m)
+        near = np.isfinite(distances_m)
+        state.places.doubtful |= near
+        state.disturbed.update(state.places.regions[near].tolist())
+        state.dirty = True
 
 
-def evaluate_experts(state: State, cfg: Config) -> None:
-    """Unary potentials of all places (eqs. product_of_experts, unary_potential), after the map's bias is known."""
+def rebalance(state: State, idle: bool, cfg: Config) -> None:
+    """The map's bias, after enough of the map was seen anew or when idle; everybody asks again when it has moved."""
     assert state.alignment is not None
+    places, prior = state.places, state.alignment.prior
+    seen = np.flatnonzero(state.evidence.frames[places.slots] > 0)
+    if not state.compared or not (idle or state.compared > cfg.balance.patience * len(seen)):
+        return
+    sample = seen[:: max(len(seen) // BIAS_SAMPLE, 1)]
+    scores = state.alignment.text.temperature * places.similarity[sample]
+    bias = label_bias(scores, np.array([region.existence for region in prior.regions]), cfg.balance)
+    state.compared = 0
+    if np.abs(bias - state.bias).max(initial=0.0) > cfg.balance.tolerance:
+        state.bias = bias
+        places.doubtful[seen] = True
+
+
+def evaluate_experts(state: State, idle: bool, cfg: Config) -> None:
+    """Unary potentials wherever an expert may have changed its mind (eqs. product_of_experts, unary_potential)."""
     reshape(state, cfg)
     compare(state)
-    places, prior, slots = state.places, state.alignment.prior, state.evidence.of(state.graph.ids.tolist())
-    scores = state.alignment.text.temperature * places.similarity[state.evidence.frames[slots] > 0]
-    existence = np.array([region.existence for region in prior.regions])
-    state.bias = label_bias(scores, existence, cfg.balance)
-    answers = votes(state, np.arange(len(slots)), cfg)
-    places.unary = np.zeros((len(slots), len(existence)))
+    rebalance(state, idle, cfg)
+    places, rows = state.places, np.flatnonzero(state.places.doubtful)
+    answers = votes(state, rows, cfg)
+    unary = np.zeros((len(rows), places.unary.shape[1]))
     for name, (log_probabilities, confidence) in answers.items():
-        places.unary -= (confidence * cfg.experts[name])[:, None] * log_probabilities
-    trust = state.evidence.trust[slots]
-    sight = answers["visual"][1] if "visual" in answers else np.zeros(len(slots))
-    places.known = sight * trust / (trust + cfg.trust_half)
+        unary -= (confidence * cfg.experts[name])[:, None] * log_probabilities
+    changed = rows[(unary != places.unary[rows]).any(axis=1)]
+    places.unary[rows] = unary
+    places.sight[rows] = answers["visual"][1] if "visual" in answers else 0.0
+    places.doubtful[rows], places.unbelieved[rows], places.unsettled[changed] = False, True, True
 
 
 def edge_weights(graph: PlaceGraph, cfg: Config) -> np.ndarray:
@@ -355,8 +386,7 @@ def edge_weights(graph: PlaceGraph, cfg: Config) -> np.ndarray:
     neighbours about as firmly in a dense graph of small rooms as in a sparse one of large halls.
     """
     first, second = graph.edges.T
-    lengths_m = np.linalg.norm(graph.positions_m[first] - graph.positions_m[second], axis=1)
-    weights = np.exp(-lengths_m / cfg.edge_decay_m)
+    weights = np.exp(-graph.lengths_m / cfg.edge_decay_m)
     if cfg.edge_sum > 0:
         weights = np.maximum(weights, np.finfo(float).tiny)
         sums = np.bincount(graph.edges.reshape(-1), np.repeat(weights, 2), minlength=len(graph.ids))
@@ -366,103 +396,180 @@ def edge_weights(graph: PlaceGraph, cfg: Config) -> np.ndarray:
     return weights
 
 
-def field_of(state: State, cfg: Config) -> swap.Field:
+def field_of(state: State) -> swap.Field:
     """The Markov random field over the place graph (eqs. mrf_energy, pairwise_potential)."""
     assert state.alignment is not None
-    return swap.Field(state.places.unary, state.graph.edges, edge_weights(state.graph, cfg), state.alignment.pairwise)
+    return swap.Field(state.places.unary, state.graph.edges, state.weights, state.alignment.pairwise)
 
 
-def _segment(state: State, switched: bool, cfg: Config) -> Iterator[RegionDelta]:
-    """Experts, graph cuts, connected components; then the difference to what was published."""
+def _segment(state: State, switched: bool, idle: bool, cfg: Config) -> Iterator[RegionDelta]:
+    """Experts, graph cuts, beliefs, connected components; then the difference to what was published."""
     if state.alignment is None:
         return
-    places = state.places
-    evaluate_experts(state, cfg)
-    mrf = field_of(state, cfg)
-    start = np.where(places.labels == UNLABELLED, places.unary.argmin(axis=1), places.labels)
-    places.labels = swap.minimise(mrf, start)
-    component = regions.components(places.labels, mrf.edges)
-    places.regions, state.next_region_id = regions.track(component, places.regions, state.next_region_id)
+    evaluate_experts(state, idle or switched, cfg)
+    settle(state)
+    changes = partition(state)
+    believe(state, cfg)
+    delta = publish(state, changes, switched or state.ledger.source is None, cfg)
     state.dirty = False
-    view = _view(state, mrf, cfg)
-    complete = switched or state.published is None
-    state.published, delta = publication.difference(state.published, view, complete, cfg.posterior_change)
     if delta is not None:
         yield delta
 
 
-def _view(state: State, mrf: swap.Field, cfg: Config) -> publication.View:
-    """Everything a follower is to know, as it stands now."""
+def settle(state: State) -> None:
+    """Better labels around the places whose costs changed; new places begin with their own cheapest."""
+    places = state.places
+    start = np.where(places.labels == UNLABELLED, places.unary.argmin(axis=1), places.labels)
+    labels = swap.minimise(field_of(state), start) if places.unsettled.any() else start
+    places.unbelieved |= with_neighbours(state.graph, labels != places.labels)
+    places.labels = labels
+    places.unsettled[:] = False
+
+
+def partition(state: State) -> list[RegionEvent]:
+    """Regions of the labels as they are, with ids that last; returns what became of whom."""
     assert state.alignment is not None
-    assert state.task is not None
-    places, labels = state.places, state.alignment.labels
-    costs = swap.conditional_costs(mrf, places.labels)
-    posteriors = np.exp(costs.min(axis=1, keepdims=True) - costs)
-    posteriors /= posteriors.sum(axis=1, keepdims=True)
-    return publication.View(
+    places, names = state.places, state.alignment.labels
+    previous = places.regions
+    component = regions.components(places.labels, state.graph.edges)
+    places.regions, state.next_region_id = regions.track(component, previous, state.next_region_id)
+    moved = places.regions != previous
+    beside = with_neighbours(state.graph, moved)  # lists of neighbours name a region that came, went or grew
+    state.disturbed.update(previous[moved].tolist(), places.regions[beside].tolist())
+    _, first = np.unique(places.regions, return_index=True)
+    labels = {int(places.regions[row]): names[places.labels[row]] for row in first.tolist()}
+    before = {region.id: region.label for region in state.regions.values()}
+    if not moved.any() and labels == before:
+        return []
+    return regions.events(previous, places.regions, before, labels)
+
+
+def believe(state: State, cfg: Config) -> None:
+    """Posteriors of the places whose costs, or whose neighbours' labels, changed."""
+    assert state.alignment is not None
+    places, rows = state.places, np.flatnonzero(state.places.unbelieved)
+    costs = beliefs.conditional_costs(field_of(state), state.graph.adjacency, places.labels, rows)
+    places.posteriors[rows] = beliefs.posteriors(costs, cfg.temperature)
+    state.disturbed.update(places.regions[rows].tolist())
+
+
+def publish(state: State, events: list[RegionEvent], everything: bool, cfg: Config) -> RegionDelta | None:
+    """What followers do not know yet; with `everything`, all."""
+    assert state.alignment is not None
+    places, prior = state.places, state.alignment.prior
+    state.regions = _described(state, everything, cfg)
+    fresh = np.arange(len(places.labels)) if everything else np.flatnonzero(places.unbelieved)
+    places.unbelieved[:] = False
+    state.disturbed.clear()
+    source = publication.Source(
         robot=state.robot,
         epoch=state.epoch,
-        revision=-1 if state.published is None else state.published.revision,
         stamp_ns=state.stamp_ns,
         prior_digest=state.alignment.digest,
-        environment=state.alignment.prior.environment,
-        task=state.alignment.prior.task,
+        environment=prior.environment,
+        task=prior.task,
         space=cfg.space if len(state.archive) else "",
-        labels=labels,
-        regions=_regions(state, posteriors, cfg),
-        place_ids=state.graph.ids,
-        place_regions=places.regions,
-        posteriors=posteriors.astype(np.float16),
-        unknown=(1.0 - places.known).astype(np.float16),
-        energy=swap.energy(mrf, places.labels),
+        labels=tuple(state.alignment.labels),
+        energy=swap.energy(field_of(state), places.labels),
+    )
+    return state.ledger.tell(
+        source,
+        places.slots[fresh],
+        _beliefs(state, fresh, cfg),
+        state.regions,
+        events,
+        everything=everything,
+        tolerance=cfg.posterior_change,
     )
 
 
-def _regions(state: State, posteriors: np.ndarray, cfg: Config) -> dict[int, Region]:
-    """One Region per id; figures are rounded, so that a region is sent again only when they visibly change."""
-    assert state.alignment is not None
-    graph, places, names = state.graph, state.places, state.alignment.labels
-    order = np.argsort(places.regions, kind="stable")
+def _beliefs(state: State, rows: np.ndarray, cfg: Config) -> publication.Beliefs:
+    """What is believed of some places, as it travels."""
+    places = state.places
+    return publication.Beliefs(
+        place_ids=state.graph.ids[rows],
+        regions=places.regions[rows],
+        posteriors=places.posteriors[rows].astype(np.float16),
+        unknown=(1.0 - known_mass(state, rows, cfg)).astype(np.float16),
+        predicted=state.evidence.trust[places.slots[rows]] < cfg.predicted_trust,
+    )
+
+
+def known_mass(state: State, rows: np.ndarray, cfg: Config) -> np.ndarray:
+    """Share (row,) of a place's belief that rests on something seen and known: c_vis T / (T + T_half)."""
+    trust = state.evidence.trust[state.places.slots[rows]]
+    return state.places.sight[rows] * trust / (trust + cfg.trust_half)
+
+
+def _described(state: State, everything: bool, cfg: Config) -> dict[int, Region]:
+    """All regions; figures of those that were disturbed are computed again, and rounded, so that a region is sent again
+    only when they visibly change.
+    """
+    graph, places = state.graph, state.places
+    wanted = np.zeros(state.next_region_id + 1, dtype=bool)  # the last is NO_REGION's
+    wanted[list(state.disturbed)] = True
+    wanted |= everything
+    rows = np.flatnonzero(wanted[places.regions])
+    order = rows[np.argsort(places.regions[rows], kind="stable")]
     ids, starts = np.unique(places.regions[order], return_index=True)
-    found = {}
-    for region_id, rows in zip(ids.tolist(), np.split(order, starts[1:]), strict=False):
-        label = int(places.labels[rows[0]])
-        x, y, z = graph.positions_m[rows].mean(axis=0).tolist()
-        found[region_id] = Region(
-            id=region_id,
-            label=names[label],
-            place_count=len(rows),
-            probability=round(float(posteriors[rows, label].mean()), 2),
-            position_m=(round(x, 2), round(y, 2), round(z, 2)),
-            area_m2=round(regions.footprint_m2(graph.positions_m[rows], graph.radii_m[rows], cfg.footprint_cell_m), 2),
+    border = regions.border(graph, places.regions, set(ids.tolist()), cfg.door_clearance_m)
+    objects = regions.members(state.objects, graph.positions_m, places.regions, rows)
+    found = {} if everything else {number: region for number, region in state.regions.items() if not wanted[number]}
+    for number, members in zip(ids.tolist(), np.split(order, starts[1:]), strict=False):
+        region = _region(state, members, cfg)
+        found[number] = msgspec.structs.replace(
+            region,
+            neighbour_ids=border.neighbours.get(number, []),
+            transitions=border.transitions.get(number, []),
+            object_ids=objects.get(number, []),
         )
     return found
 
 
+def _region(state: State, rows: np.ndarray, cfg: Config) -> Region:
+    """What the places `rows` of one region say of it."""
+    assert state.alignment is not None
+    graph, places, label = state.graph, state.places, int(state.places.labels[rows[0]])
+    x, y, z = graph.positions_m[rows].mean(axis=0).tolist()
+    predicted = state.evidence.trust[places.slots[rows]] < cfg.predicted_trust
+    return Region(
+        id=int(places.regions[rows[0]]),
+        label=state.alignment.labels[label],
+        place_count=len(rows),
+        probability=round(float(places.posteriors[rows, label].mean()), 2),
+        position_m=(round(x, 2), round(y, 2), round(z, 2)),
+        area_m2=round(regions.footprint_m2(graph.positions_m[rows], graph.radii_m[rows], cfg.footprint_cell_m), 2),
+        unknown=round(1.0 - float(known_mass(state, rows, cfg).mean()), 2),
+        predicted=bool(predicted.mean() > 0.5),
+        hull_m=regions.hull_m(graph.positions_m[rows], graph.radii_m[rows]),
+        parent=state.alignment.prior.regions[label].parent,
+    )
+
+
 def snapshot(state: State) -> RegionDelta:
     """Everything published so far, as one delta."""
-    if state.published is None:
-        return publication.nothing(state.robot, state.epoch)
-    return publication.complete(state.published)
+    return state.ledger.snapshot(state.robot, state.epoch)
 
 
 def explain(state: State, request: PosteriorRequest, cfg: Config) -> PosteriorReply:
-    """Each expert's vote on one place, as it was when the labels were last found."""
+    """Each expert's vote on one place, its neighbours' pull, and what follows, as of the last update."""
     row = int(state.graph.rows(np.array([request.place_id]))[0])
     if row < 0 or state.alignment is None or state.places.labels[row] == UNLABELLED:
         return PosteriorReply(robot=state.robot, place_id=request.place_id, found=False)
-    answers = votes(state, np.array([row]), cfg)
-    costs = swap.conditional_costs(field_of(state, cfg), state.places.labels)[row]
-    posterior = np.exp(costs.min() - costs)
-    slot = state.evidence.slots[request.place_id]
+    places, names, near = state.places, state.alignment.labels, state.graph.adjacency
+    rows, slot = np.array([row]), int(places.slots[row])
+    answers = votes(state, rows, cfg)
+    unary = sum(-cfg.experts[name] * sure[0] * log[0] for name, (log, sure) in answers.items())
+    costs = beliefs.conditional_costs(field_of(state), near, places.labels, rows)
+    arcs = range(near.starts[row], near.starts[row + 1])
     return PosteriorReply(
         robot=state.robot,
         place_id=request.place_id,
         found=True,
-        label=state.alignment.labels[state.places.labels[row]],
-        labels=state.alignment.labels,
-        posterior=(posterior / posterior.sum()).tolist(),
-        unary=sum(-cfg.experts[name] * sure[0] * log[0] for name, (log, sure) in answers.items()).tolist(),
+        label=names[places.labels[row]],
+        labels=names,
+        posterior=beliefs.posteriors(costs, cfg.temperature)[0].tolist(),
+        unary=unary.tolist(),
         votes=[
             ExpertVote(
                 expert=name,
@@ -474,6 +581,21 @@ def explain(state: State, request: PosteriorRequest, cfg: Config) -> PosteriorRe
         ],
         frames=int(state.evidence.frames[slot]),
         trust=float(state.evidence.trust[slot]),
+        position_m=tuple(state.graph.positions_m[row].tolist()),
+        region=int(places.regions[row]),
+        pull=(costs[0] - places.unary[row]).tolist(),
+        neighbours=[
+            NeighbourPull(
+                place_id=int(state.graph.ids[near.neighbours[at]]),
+                label=names[places.labels[near.neighbours[at]]],
+                weight=float(state.weights[near.edges[at]]),
+            )
+            for at in arcs
+        ],
+        unknown=1.0 - float(known_mass(state, rows, cfg)[0]),
+        predicted=bool(state.evidence.trust[slot] < cfg.predicted_trust),
+        temperature=cfg.temperature,
+        inclination_rad=float(places.inclination_rad[row]),
     )
 
 
@@ -504,16 +626,21 @@ def _reintegrate(state: State, rows: np.ndarray, cfg: Config) -> None:
     """Compute the evidence of some places afresh from all stored frames."""
     if not len(rows):
         return
-    state.evidence.add(state.graph.ids[rows].tolist())
-    targets = _targets(state, rows)
+    place_ids = state.graph.ids[rows].tolist()
+    state.evidence.add(place_ids)
+    state.places.slots[rows] = state.evidence.of(place_ids)
+    targets = descriptors.Targets(state.places.slots[rows], state.graph.positions_m[rows])
     descriptors.integrate_all(state.evidence, state.archive, targets, state.query_radius_m, cfg.kernel)
     state.places.stale[rows] = True
 
 
-def _targets(state: State, rows: np.ndarray) -> descriptors.Targets:
-    graph = state.graph
-    slots = state.evidence.of(graph.ids[rows].tolist())
-    return descriptors.Targets(slots, graph.positions_m[rows])
+def with_neighbours(graph: PlaceGraph, mask: np.ndarray) -> np.ndarray:
+    """Mask (place,) grown by one edge."""
+    grown = mask.copy()
+    if mask.any():
+        grown[graph.edges[mask[graph.edges[:, 0]], 1]] = True
+        grown[graph.edges[mask[graph.edges[:, 1]], 0]] = True
+    return grown
 
 
 def _concept_key(concepts: list[list[str]]) -> tuple[str, ...]:

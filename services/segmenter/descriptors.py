@@ -186,15 +186,26 @@ class Archive:
 
     def __init__(self) -> None:
         self.frames: list[Frame] = []
-        self._known: set[int] = set()
+        self._index: dict[int, int] = {}  # by frame id
 
     def add(self, frame_id: int, frame: Frame) -> bool:
         """Keep a frame; False when this id is already here."""
-        if frame_id in self._known:
+        if frame_id in self._index:
             return False
-        self._known.add(frame_id)
+        self._index[frame_id] = len(self.frames)
         self.frames.append(frame)
         return True
+
+    def move(self, frame_id: int, world_from_camera: np.ndarray) -> tuple[Frame, Frame] | None:
+        """Give a frame another pose; returns it before and after, None where it is unknown or stands there already."""
+        index = self._index.get(frame_id)
+        if index is None:
+            return None
+        before, camera_from_world = self.frames[index], inverse(world_from_camera)
+        if np.array_equal(before.camera_from_world, camera_from_world):
+            return None
+        self.frames[index] = before._replace(camera_from_world=camera_from_world)
+        return before, self.frames[index]
 
     def __len__(self) -> int:
         return len(self.frames)

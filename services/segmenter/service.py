@@ -1,4 +1,4 @@
-"""Reads places, pyramids, tasks and priors; writes regions and beliefs."""
+"""Reads places, pyramids, corrected poses, tasks and priors; writes regions and beliefs."""
 
 from collections.abc import Iterator
 
@@ -10,6 +10,7 @@ from schemas.regions import PosteriorReply, PosteriorRequest, RegionDelta
 from schemas.topics import (
     PLACE_DELTA,
     PLACE_SNAPSHOT,
+    POSE_UPDATE,
     POSTERIOR,
     PRIOR,
     PRIORS,
@@ -59,7 +60,7 @@ SERVICE = Service(
     config=core.Config,
     init=init,
     step=step,
-    reads=(PLACE_DELTA, PYRAMID, TASK, PRIOR),
+    reads=(PLACE_DELTA, PYRAMID, POSE_UPDATE, TASK, PRIOR),
     writes=(REGION_DELTA,),
     asks=(PLACE_SNAPSHOT, TEXT, PRIORS, TASK_IN_FORCE),
     answers={REGION_SNAPSHOT: answer_snapshot, POSTERIOR: answer_posterior},

@@ -13,8 +13,20 @@ from schemas.priors import Prior
 class ObjectView:
     """The objects of the map, each as a belief over the prior's objects."""
 
+    ids: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))  # (object,) that last
     positions_m: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))  # (object, 3) world
     concepts: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))  # (object, concept) P(c | o), rows sum to 1
+
+    def changed_m(self, before: "ObjectView") -> np.ndarray:
+        """Where objects (n, 3) are new, gone or different against `before`; of moved ones both positions."""
+        _, here, there = np.intersect1d(self.ids, before.ids, assume_unique=True, return_indices=True)
+        same_columns = self.concepts.shape[1] == before.concepts.shape[1]
+        same = (self.positions_m[here] == before.positions_m[there]).all(axis=1) & same_columns
+        if same_columns:
+            same &= (self.concepts[here] == before.concepts[there]).all(axis=1)
+        kept, was = np.zeros(len(self.ids), dtype=bool), np.zeros(len(before.ids), dtype=bool)
+        kept[here[same]], was[there[same]] = True, True
+        return np.concatenate((self.positions_m[~kept], before.positions_m[~was]))
 
 
 class ObjectSettings(msgspec.Struct, frozen=True, kw_only=True):
