@@ -15,7 +15,7 @@ import pytest
 from schemas.codec import decode, encode
 from schemas.places import PlaceDelta
 from schemas.priors import ObjectPrior, Prior, Provenance, RegionPrior, Task, TaskRequest
-from schemas.regions import Region, RegionDelta
+from schemas.regions import Region, RegionDelta, Transition
 from schemas.scene import SceneRequest
 from schemas.status import Tick
 from schemas.topics import PLACE_SNAPSHOT, REGION_SNAPSHOT, SCENE, SCENE_REVISION
