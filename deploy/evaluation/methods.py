@@ -179,7 +179,7 @@ def oracle(config: Config, name: str) -> Method:
         variant = Variant(config, pyramids=lambda case: _true_pyramids(case, config.object_phrases))
         about = "crops carry the text embedding of the true region that most of their points lie in"
     elif name == "objects":
-        variant = Variant(config, seen=_see_true_objects)
+        variant = Variant(config, seen=lambda case, state: _see_true_objects(case, state, config))
         about = "the objects are those of the ground truth that the robot has seen; as ours where it names none"
     else:
         variant = Variant(config, seen=lambda case, state: _see_truth(case, state, config.object_phrases))
@@ -207,9 +207,9 @@ def _see_truth(case: Case, state: State, object_phrases: int) -> None:
             evidence.sums[slot] = concepts[labels[region]]
 
 
-def _see_true_objects(case: Case, state: State) -> None:
+def _see_true_objects(case: Case, state: State, config: Config) -> None:
     if case.objects:
-        see_objects(state, oracles.seen_objects(case.objects, case.prior, case.perception.voxels))
+        see_objects(state, oracles.seen_objects(case.objects, case.prior, case.perception.voxels), config)
 
 
 def sweep(config: Config, kind: str) -> list[Method]:

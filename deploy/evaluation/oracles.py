@@ -48,7 +48,8 @@ def seen_objects(objects: tuple[TrueObject, ...], prior: Prior, voxels: VoxelMap
         if ((occupied_m >= item.min_m - margin_m) & (occupied_m <= item.max_m + margin_m)).all(axis=1).any()
     ]
     concepts = np.eye(len(names))[[names.index(item.label) for item in seen]].reshape(-1, len(names))
-    return ObjectView(np.array([(item.min_m + item.max_m) / 2 for item in seen]).reshape(-1, 3), concepts)
+    positions_m = np.array([(item.min_m + item.max_m) / 2 for item in seen]).reshape(-1, 3)
+    return ObjectView(ids=np.arange(len(seen)), positions_m=positions_m, concepts=concepts)
 
 
 def true_features(

@@ -265,6 +265,7 @@ def align(state: State, cfg: Config) -> bool:
     text = state.texts.get(_concept_key(region_concepts(prior, cfg.object_phrases)))
     if text is None:
         return False
+    former = state.alignment
     pairwise = -cfg.beta * np.log(np.maximum(prior.adjacency.astype(np.float64), cfg.probability_floor))
     np.fill_diagonal(pairwise, 0.0)
     state.alignment = Alignment(prior=prior, digest=digest, text=text, pairwise=pairwise)
@@ -274,7 +275,8 @@ def align(state: State, cfg: Config) -> bool:
         _reintegrate(state, np.arange(len(state.graph.ids)), cfg)
     state.places = state.places.relabelled(len(prior.regions))
     state.bias, state.compared = np.zeros(len(prior.regions)), len(state.graph.ids)
-    state.objects = ObjectView()  # its columns are the former prior's objects
+    if len(prior.objects) != state.objects.concepts.shape[1] or former is not None:
+        state.objects = ObjectView()  # its columns are the former prior's objects
     return True
 
 
