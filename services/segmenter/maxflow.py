@@ -1,16 +1,23 @@
-"""Minimum cuts: the one function behind which the max-flow library sits (pure)."""
+"""Minimum cuts: the functions behind which the max-flow libraries sit (pure).
+
+Each returns the x in {0, 1}^n that minimises
+
+    sum_i cost_x(i) + sum_(i,j) weights [x_i != x_j]
+
+as bool (n,). `cost_0`, `cost_1` (n,) are finite; `edges` (m, 2) are node numbers and `weights` (m,) are not negative. A
+node is on the sink's side when it takes 1, and pays then the capacity of its edge from the source.
+"""
 
 import maxflow as library
 import numpy as np
+from scipy import sparse
+from scipy.sparse.csgraph import breadth_first_order, maximum_flow
+
+SCIPY_CAPACITY = 2**30  # SciPy counts in 32-bit integers: the capacities that leave the source sum to at most this
 
 
 def binary_minimum(cost_0: np.ndarray, cost_1: np.ndarray, edges: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """The x in {0, 1}^n that minimises sum_i cost_x(i) + sum_(i,j) weights [x_i != x_j], as bool (n,).
-
-    `cost_0`, `cost_1` (n,) are finite; `edges` (m, 2) are node numbers and `weights` (m,) are not negative. Exact: the
-    labelling is a minimum cut (Boykov and Kolmogorov, 2004). A node is on the sink's side when it takes 1, and pays
-    then the capacity of its edge from the source.
-    """
+    """By PyMaxflow (GPL), exact: the labelling is a minimum cut (Boykov and Kolmogorov, 2004)."""
     if not len(cost_0):
         return np.zeros(0, dtype=bool)
     base = np.minimum(cost_0, cost_1)
@@ -22,3 +29,35 @@ def binary_minimum(cost_0: np.ndarray, cost_1: np.ndarray, edges: np.ndarray, we
         graph.add_edges(np.ascontiguousarray(edges[:, 0]), np.ascontiguousarray(edges[:, 1]), capacities, capacities)
     graph.maxflow()
     return graph.get_grid_segments(nodes)
+
+
+def scipy_minimum(cost_0: np.ndarray, cost_1: np.ndarray, edges: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """By SciPy, for those who cannot use the GPL. Costs are rounded to integers, so the sum is least up to that.
+
+    No capacity above the sum of the terminals' on either side can matter, which bounds what rounding costs.
+    """
+    count = len(cost_0)
+    if not count:
+        return np.zeros(0, dtype=bool)
+    lean = np.asarray(cost_1 - cost_0, float)
+    total = min(lean[lean > 0].sum(), -lean[lean < 0].sum())
+    if total == 0.0:
+        return np.full(count, bool(lean.sum() < 0))
+    scale = SCIPY_CAPACITY / total
+    source, sink = count, count + 1
+    fed, drained = np.flatnonzero(lean > 0), np.flatnonzero(lean < 0)
+    tails = np.concatenate((np.full(len(fed), source), drained, edges[:, 0], edges[:, 1]))
+    heads = np.concatenate((fed, np.full(len(drained), sink), edges[:, 1], edges[:, 0]))
+    capacities = np.concatenate((lean[fed], -lean[drained], weights, weights))
+    capacities = np.rint(np.minimum(capacities, total) * scale).astype(np.int32)
+    graph = sparse.csr_matrix((capacities, (tails, heads)), shape=(count + 2, count + 2))
+    left = (graph - maximum_flow(graph, source, sink).flow).tocsr()
+    left.data[left.data < 0] = 0
+    left.eliminate_zeros()
+    from_source = breadth_first_order(left, source, directed=True, return_predecessors=False)
+    takes_1 = np.ones(count + 2, dtype=bool)
+    takes_1[from_source] = False
+    return takes_1[:count]
+
+
+CUTS = {"pymaxflow": binary_minimum, "scipy": scipy_minimum}

@@ -1,0 +1,44 @@
+"""The Markov random field over places, and its energy (paper, Topological Regularization and Graph Cuts; pure).
+
+A field is: `unary` (place, label) costs; `edges` (edge, 2) place rows with `weights` (edge,) >= 0; `pairwise`
+(label, label) costs, symmetric, >= 0, zero diagonal, not necessarily a metric. Its energy is
+
+    E(L) = sum_p unary[p, L(p)] + sum_(u,v) weights[u,v] * pairwise[L(u), L(v)].
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy import sparse
+
+RELATIVE_GAIN = 1e-12  # of the energy's magnitude; a smaller gain is rounding
+
+
+class Field(NamedTuple):
+    """A Markov random field, as the module says."""
+
+    unary: np.ndarray  # (place, label) float64
+    edges: np.ndarray  # (edge, 2) int64
+    weights: np.ndarray  # (edge,) float64
+    pairwise: np.ndarray  # (label, label) float64
+
+
+def energy(field: Field, labels: np.ndarray) -> float:
+    """E(L) (eq. mrf_energy)."""
+    first, second = labels[field.edges[:, 0]], labels[field.edges[:, 1]]
+    unary = field.unary[np.arange(len(labels)), labels].sum()
+    return float(unary + (field.weights * field.pairwise[first, second]).sum())
+
+
+def conditional_costs(field: Field, labels: np.ndarray) -> np.ndarray:
+    """Cost (place, label) of each label at each place while all its neighbours keep theirs."""
+    n = len(labels)
+    rows = np.concatenate((field.edges[:, 0], field.edges[:, 1]))
+    columns = np.concatenate((field.edges[:, 1], field.edges[:, 0]))
+    weights = sparse.csr_matrix((np.tile(field.weights, 2), (rows, columns)), shape=(n, n))
+    return field.unary + weights @ field.pairwise[labels]
+
+
+def least_gain(field: Field) -> float:
+    """The smallest fall of the energy that counts as one."""
+    return RELATIVE_GAIN * (float(np.abs(field.unary).sum()) + 1.0)

@@ -1,0 +1,291 @@
+"""A labelling that follows a changing field at a cost that follows the change (pure).
+
+    solver = Solver()
+    labels = solver.update(field, labels, dirty=rows, expired=clock_says_so)   # at every change of the field
+    labels = solver.drain(expired=clock_says_so)                               # when idle, until `solver.pending` is 0
+
+The caller says which places changed (`dirty`: those with another unary cost, other edges, other weights or a
+neighbour that is gone; new places too), or leaves it to the solver, which then compares the field with the last one.
+Row numbers may change between updates: `previous` says which row each place had (-1: a new place), as
+`graph.Step.previous` does. A place without a label yet has label -1.
+
+The change is solved as a local problem with fixed surroundings, which grows while labels at its border change:
+
+1. Message passing on the changed places and those within `reach` steps proposes labels. Each connected set of places
+   that the proposal labels otherwise is taken if it lowers the energy by itself.
+2. The alpha-beta-swaps that the change can have made profitable are tried, then those that their own changes can have.
+
+Both stop when `expired()` says so; the labels are valid at any time and the energy of the field in hand never rises.
+Once `pending` is 0, no alpha-beta-swap on the whole field lowers the energy (see `moves`), as after a cold solve.
+"""
+
+from collections.abc import Callable
+from typing import Literal
+
+import msgspec
+import numpy as np
+from numba import njit
+
+from services.segmenter import moves
+from services.segmenter.adjacency import Adjacency, adjacency
+from services.segmenter.field import Field, least_gain
+from services.segmenter.maxflow import CUTS
+from services.segmenter.messages import empty_messages, lay_down, run_pass, take_up
+
+Expired = Callable[[], bool]
+
+
+class Settings(msgspec.Struct, frozen=True, kw_only=True):
+    """How hard to try. Chosen on random fields like place graphs; see docs/performance.md."""
+
+    min_cut: Literal["pymaxflow", "scipy"] = "pymaxflow"  # library for large cuts; PyMaxflow is under the GPL
+    compiled_up_to: int = 2_000  # free places in a cut that compiled code solves itself
+    passes: int = 12  # of message passing, there and back counted as two
+    reach: int = 3  # steps from a changed place within which message passing may propose labels
+    chunk: int = 20_000  # visits of places between two looks at the clock
+
+    def __post_init__(self) -> None:
+        if not (self.passes >= 0 and self.reach >= 0 and self.chunk > 0 and self.compiled_up_to >= 0):
+            raise ValueError("passes, reach, chunk or compiled_up_to is out of range")
+
+
+def never() -> bool:
+    """No budget."""
+    return False
+
+
+class Solver:
+    """Labels of the last field, and what is still to be tried on it."""
+
+    def __init__(self, settings: Settings | None = None) -> None:
+        self.settings = settings or Settings()
+        self.labels = np.zeros(0, np.int64)
+        self._field: Field | None = None
+        self._graph: Adjacency = adjacency(0, np.zeros((0, 2)), np.zeros(0))
+        self._unary = np.zeros((0, 0))
+        self._work = moves.empty_work(0, 0, 0)
+        self._waiting = np.zeros(0, np.int64)  # rows around which message passing has yet to propose
+
+    @property
+    def pending(self) -> int:
+        """Places at which a swap is still to be tried, or around which labels are to be proposed."""
+        return 0 if self._field is None else int(self._work.cursor[moves.COUNT]) + len(self._waiting)
+
+    def update(
+        self,
+        field: Field,
+        labels: np.ndarray,
+        expired: Expired = never,
+        *,
+        dirty: np.ndarray | None = None,
+        previous: np.ndarray | None = None,
+    ) -> np.ndarray:
+        """Labels (place,) for `field`, starting from `labels`; see the module."""
+        self.take(field, labels, dirty=dirty, previous=previous)
+        return self.drain(expired)
+
+    def drain(self, expired: Expired = never) -> np.ndarray:
+        """Go on with what is pending; the labels (place,) so far."""
+        if self._field is None:
+            return self.labels.copy()
+        self._propose(expired)
+        settings, arrays = self.settings, (self._graph, self._unary, self._pairwise, self.labels, self._work)
+        cut = CUTS[settings.min_cut]
+        while self._work.cursor[moves.COUNT] and not expired():
+            moves.run_swaps(*arrays, cut, settings.compiled_up_to, settings.chunk, self._least_gain)
+        return self.labels.copy()
+
+    def take(
+        self,
+        field: Field,
+        labels: np.ndarray,
+        *,
+        dirty: np.ndarray | None = None,
+        previous: np.ndarray | None = None,
+    ) -> None:
+        """Only note the change; `drain` does the work."""
+        before, count = self._field, len(field.unary)
+        same_rows = before is not None and previous is None and len(before.unary) == count
+        if before is None or before.unary.shape[1] != field.unary.shape[1]:
+            before, dirty = None, np.arange(count)
+        if before is not None and not np.array_equal(before.pairwise, field.pairwise):
+            dirty = np.arange(count)
+        origin = np.arange(count) if previous is None and same_rows else previous
+        if before is not None and origin is None:
+            raise ValueError("the number of places changed: `previous` must say which row each place had")
+        same_edges = same_rows and before is not None and field.edges is before.edges
+        same_edges = same_edges and before is not None and field.weights is before.weights
+        graph = self._graph if same_edges else adjacency(count, field.edges, field.weights)
+        unary = np.ascontiguousarray(field.unary, dtype=np.float64)
+        if dirty is None:
+            dirty = changed_rows(self._graph, self._unary, graph, unary, origin)
+        elif dirty.dtype == np.bool_:
+            dirty = np.flatnonzero(dirty)
+        waiting = self._waiting
+        if not same_edges:
+            waiting = self._carry(before, origin, count, field, graph)
+        self._graph, self._unary, self._field = graph, unary, field
+        self._pairwise = np.ascontiguousarray(field.pairwise, dtype=np.float64)
+        self.labels = np.array(labels, dtype=np.int64)
+        _label_new(self.labels, graph, unary, self._pairwise)
+        moves.flag_all(dirty, self._work)
+        self._waiting = np.union1d(waiting, dirty).astype(np.int64)
+        self._least_gain = least_gain(field)
+
+    def _carry(
+        self, before: Field | None, origin: np.ndarray | None, count: int, field: Field, graph: Adjacency
+    ) -> np.ndarray:
+        """Scratch space for the new rows with the old flags on them; returns the waiting rows."""
+        old_work = self._work if before is not None else None
+        arcs, label_count = len(graph.neighbours), field.unary.shape[1]
+        self._work = moves.empty_work(count, label_count, arcs)
+        self._messages = empty_messages(count, arcs, field.pairwise, np.float32)
+        if old_work is None or origin is None:
+            return np.zeros(0, np.int64)
+        known = np.flatnonzero(origin >= 0)
+        self._work.pending[known] = old_work.pending[origin[known]]
+        moves.enqueue_all(np.flatnonzero(self._work.pending.any(axis=1)), self._work)
+        waiting = np.zeros(len(old_work.queued), np.bool_)
+        waiting[self._waiting] = True
+        return known[waiting[origin[known]]]
+
+    def _propose(self, expired: Expired) -> None:
+        """Message passing around the waiting places; takes the parts of its proposals that lower the energy."""
+        if not len(self._waiting) or not self.settings.passes:
+            self._waiting = self._waiting[:0]
+            return
+        graph, messages = self._graph, self._messages
+        rows = _ball(self._waiting, self.settings.reach, graph, messages.inside)
+        messages.pairwise[:, : len(self._pairwise)] = self._pairwise
+        take_up(rows, graph, self._unary, self.labels, messages)
+        for number in range(self.settings.passes):
+            if expired():
+                break
+            run_pass(rows, number % 2 == 0, graph, messages, True)
+            if number >= 2 or number == self.settings.passes - 1:
+                _fuse(
+                    rows,
+                    messages.proposed,
+                    self.labels,
+                    graph,
+                    self._unary,
+                    self._pairwise,
+                    self._work,
+                    self._least_gain,
+                )
+        else:
+            self._waiting = self._waiting[:0]
+        lay_down(rows, messages)
+
+
+@njit(cache=True, nogil=True)
+def changed_rows(graph_before, unary_before, graph, unary, origin):  # noqa: ANN001, ANN201
+    """Rows (dirty,) of `graph` that are new, or whose costs, neighbours or weights differ; origin[row] = row before."""
+    places, labels = unary.shape
+    row_now = np.full(len(unary_before), -1, np.int64)
+    for row in range(places):
+        if origin[row] >= 0:
+            row_now[origin[row]] = row
+    dirty = np.empty(places, np.int64)
+    count = 0
+    for row in range(places):
+        old = origin[row]
+        same = old >= 0
+        if same:
+            for label in range(labels):
+                same &= unary[row, label] == unary_before[old, label]
+        if same:
+            first, last = graph_before.starts[old], graph_before.starts[old + 1]
+            same = last - first == graph.starts[row + 1] - graph.starts[row]
+            for arc in range(first, last):
+                same = same and _has_arc(graph, row, row_now[graph_before.neighbours[arc]], graph_before.weights[arc])
+        if not same:
+            dirty[count] = row
+            count += 1
+    return dirty[:count].copy()
+
+
+@njit(cache=True, nogil=True)
+def _has_arc(graph, row, neighbour, weight):  # noqa: ANN001, ANN202
+    for arc in range(graph.starts[row], graph.starts[row + 1]):
+        if graph.neighbours[arc] == neighbour and graph.weights[arc] == weight:
+            return True
+    return False
+
+
+@njit(cache=True, nogil=True)
+def _label_new(labels, graph, unary, pairwise):  # noqa: ANN001, ANN202
+    """Give each place without a label the cheapest one, its labelled neighbours considered."""
+    costs = np.empty(unary.shape[1])
+    for place in range(len(labels)):
+        if labels[place] >= 0:
+            continue
+        costs[:] = unary[place]
+        for arc in range(graph.starts[place], graph.starts[place + 1]):
+            label = labels[graph.neighbours[arc]]
+            if label >= 0:
+                costs += graph.weights[arc] * pairwise[label]
+        labels[place] = np.argmin(costs)
+
+
+@njit(cache=True, nogil=True)
+def _ball(centers, reach, graph, inside):  # noqa: ANN001, ANN202
+    """Rows, ascending, within `reach` steps of `centers`; `inside` is scratch, all False before and after."""
+    found = np.empty(len(inside), np.int64)
+    count = 0
+    for place in centers:
+        if not inside[place]:
+            inside[place] = True
+            found[count] = place
+            count += 1
+    first = 0
+    for _ in range(reach):
+        last = count
+        for index in range(first, last):
+            for arc in range(graph.starts[found[index]], graph.starts[found[index] + 1]):
+                neighbour = graph.neighbours[arc]
+                if not inside[neighbour]:
+                    inside[neighbour] = True
+                    found[count] = neighbour
+                    count += 1
+        first = last
+    for index in range(count):
+        inside[found[index]] = False
+    return np.sort(found[:count])
+
+
+@njit(cache=True, nogil=True)
+def _fuse(rows, proposed, labels, graph, unary, pairwise, work, least_gain):  # noqa: PLR0917, ANN001, ANN202
+    """Take each connected set of places that `proposed` labels otherwise if that alone gains more than `least_gain`.
+
+    Sets that do not touch each other change the energy independently, so each is decided by itself.
+    """
+    costs = np.empty(unary.shape[1])
+    members = np.empty(len(rows), np.int64)
+    former = np.empty(len(rows), np.int64)
+    mark = work.mark
+    for row in rows:
+        mark[row] = 1 if proposed[row] != labels[row] else 0
+    for row in rows:
+        if mark[row] == 0:
+            continue
+        members[0], count, index, gain = row, 1, 0, 0.0
+        mark[row] = 0
+        while index < count:
+            place = members[index]
+            for arc in range(graph.starts[place], graph.starts[place + 1]):
+                neighbour = graph.neighbours[arc]
+                if mark[neighbour] == 1:
+                    mark[neighbour] = 0
+                    members[count] = neighbour
+                    count += 1
+            moves.conditional(place, graph, unary, pairwise, labels, costs)
+            gain += costs[labels[place]] - costs[proposed[place]]
+            former[index] = labels[place]
+            labels[place] = proposed[place]
+            index += 1
+        if gain > least_gain:
+            moves.flag_around(members[:count], graph, work)
+        else:
+            for index in range(count):
+                labels[members[index]] = former[index]
