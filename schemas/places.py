@@ -33,7 +33,10 @@ class PlaceDelta(Message, frozen=True, kw_only=True):
     clearances_m: Annotated[np.ndarray, Shape("float32", "edge")]  # smallest obstacle distance along the edge
     removed_edges: Annotated[np.ndarray, Shape("int64", "removed_edge", 2)]
     camera_m: tuple[float, float, float] | None = None  # camera centre of the keyframe, world; None in snapshots
-    past_frame_ids: Annotated[np.ndarray, Shape("int64", "past")] = _NO_FRAMES  # snapshots: the keyframes so far
+    event: str = ""  # what was wrong with the keyframe or the pose update, one sentence; empty = nothing
+    past_frame_ids: Annotated[np.ndarray, Shape("int64", "past")] = (
+        _NO_FRAMES  # snapshots: all keyframes; else those moved
+    )
     past_cameras_m: Annotated[np.ndarray, Shape("float32", "past", 3)] = _NO_CAMERAS  # and their camera centres
 
 

@@ -4,19 +4,24 @@ Hydra's 3D places (Hughes et al. 2022), kept up to date where the map changed: f
 and the Voronoi diagram around changed voxels, re-extract places there, give them their old ids, and say what differs.
 """
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import msgspec
 import numpy as np
 
 from schemas.frames import Keyframe, PoseUpdate
 from schemas.places import PlaceDelta, VoxelMap
-from services.place_graph import distance, places, tsdf
+from services.place_graph import distance, images, places, tsdf
+from services.place_graph.archive import Archive, Kept, moved
 from services.place_graph.graph import Changes, PlaceGraph, Rules
 from services.place_graph.grid import FREE, OCCUPIED, Box, VoxelGrid
 from services.place_graph.published import Published
+from services.place_graph.track import Bounds, Track
 
 MAX_FIELD_VOXELS = 120  # offsets to the nearest obstacle are kept in 8 bits
+TILE_VOXELS = 128  # side of the windows in which far-flung changes are worked off
 
 
 class Config(msgspec.Struct, frozen=True, kw_only=True):
@@ -27,7 +32,8 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
     surface_voxels: float = 0.5  # a voxel whose signed distance is below this many voxels is an obstacle
     min_range_m: float = 0.2  # nearer measurements are the robot itself or noise
     max_range_m: float = 5.0  # nothing is fused farther from the camera; farther surfaces still clear what lies before
-    max_weight: float = 1e5  # of one voxel's running mean
+    max_weight: float = 1e5  # 1 / m^2 of evidence for one voxel; beyond it, old evidence fades
+    use_constant_weight: bool = False  # weigh measurements alike, instead of by 1 / depth^2 as sensors are precise
     max_distance_m: float = 3.0  # distances end here: half the height of the highest halls (Clio 3.0, habitat 4.5)
     voronoi_min_distance_m: float = 0.3  # the Voronoi diagram ends this close to obstacles
     parent_l1_separation: float = 20.0  # voxels: obstacles farther apart than this (L1) are distinct basis points ...
@@ -40,6 +46,12 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
     freespace_min_clearance_m: float = 0.2  # smallest clearance of such an edge (habitat 0.5, uhumans2 0.2): doorways
     min_component_size: int = 3  # smaller connected parts of the graph are not published
     min_change_m: float = 0.01  # smaller changes of a position, radius or clearance are not published
+    max_speed_m_s: float = 3.0  # of a camera carried or driven indoors; a faster pose is a jump; 0 = believe everything
+    jump_slack_m: float = 1.0  # what stamps and trackers may be wrong by, on top
+    relocalised_after: int = 5  # keyframes that go on from a jump before it is believed ...
+    max_contradiction: float = 0.2  # ... if no more than this share of their depth contradicts the map
+    max_principal_offset: float = 0.2  # share of the image by which the principal point may be off its middle
+    archive_mb: float = 256.0  # compressed depth images kept for pose updates, oldest dropped first
 
     def __post_init__(self) -> None:
         if not 0 < self.voxel_m <= min(self.truncation_m, self.compression_distance_m):
@@ -54,6 +66,24 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
         return length_m / self.voxel_m
 
     @property
+    def fusion(self) -> tsdf.Fusion:
+        """How depth is fused."""
+        return tsdf.Fusion(
+            voxel_m=self.voxel_m,
+            truncation_m=max(self.truncation_m, 2 * self.voxel_m),
+            surface_m=self.surface_voxels * self.voxel_m,
+            min_range_m=self.min_range_m,
+            max_range_m=self.max_range_m,
+            max_weight=self.max_weight,
+            constant_weight=self.use_constant_weight,
+        )
+
+    @property
+    def bounds(self) -> Bounds:
+        """How far the camera gets."""
+        return Bounds(self.max_speed_m_s, self.jump_slack_m)
+
+    @property
     def cell_voxels(self) -> int:
         """Voxels along one side of a compression cell."""
         return max(1, round(self.compression_distance_m / self.voxel_m))
@@ -66,10 +96,14 @@ class State:
     robot: str
     epoch: int
     graph: PlaceGraph
+    archive: Archive
     grid: VoxelGrid = field(default_factory=VoxelGrid)
     published: Published = field(default_factory=Published)
-    cameras_m: dict[int, tuple[float, float, float]] = field(default_factory=dict)  # of the keyframes seen, by frame id
+    track: Track = field(default_factory=Track)
+    cameras_m: dict[int, tuple[float, float, float]] = field(default_factory=dict)  # by frame id, of those fused
+    seen: set[int] = field(default_factory=set)  # frame ids of all keyframes, also the refused
     corrected: dict[int, np.ndarray] = field(default_factory=dict)  # newest pose given to a frame by an update
+    updates: dict[int, int] = field(default_factory=dict)  # newest revision of pose updates, by epoch
     rejected: int = 0  # keyframes that could not be used
     joined_frame_id: int = 0  # first keyframe heard live; earlier ones come from the archive
     revision: int = -1
@@ -86,74 +120,81 @@ def empty(robot: str, epoch: int, cfg: Config) -> State:
         reach=cfg.voxels(cfg.freespace_max_length_m),
         free=cfg.voxels(cfg.freespace_min_clearance_m),
     )
-    return State(robot, epoch, PlaceGraph(rules))
+    return State(robot, epoch, PlaceGraph(rules), Archive(cfg.archive_mb * 1e6))
 
 
-def integrate(state: State, keyframe: Keyframe, depth_m: np.ndarray, cfg: Config) -> PlaceDelta:
-    """Fuse one keyframe with its decoded depth (h, w), metres, 0 = none, and return what changed in the place graph."""
-    if (pose := state.corrected.get(keyframe.frame_id)) is not None:
-        keyframe = msgspec.structs.replace(keyframe, world_from_camera=pose)
-    changed = fuse(state, keyframe, depth_m, cfg)
-    changes = refresh(state, changed, cfg) if changed is not None else Changes()
-    return _publish(state, keyframe, changes, cfg)
+def integrate(state: State, keyframe: Keyframe, cfg: Config) -> PlaceDelta:
+    """Fuse one keyframe and return what changed in the place graph.
+
+    A keyframe that cannot be used leaves the map as it is; the delta's `event` says why. One whose pose has jumped is
+    kept, for a pose update or the keyframes that follow may show where it was taken.
+    """
+    keyframe = moved(keyframe, state.corrected.get(keyframe.frame_id, keyframe.world_from_camera))
+    try:
+        depth_m = _usable_depth(keyframe, cfg)
+    except images.ImageFault as fault:
+        return reject(state, keyframe, str(fault), cfg)
+    jump_m = 0.0 if keyframe.frame_id in state.corrected else state.track.jump_m(keyframe, cfg.bounds)
+    if jump_m and (reason := _distrust(state, keyframe, depth_m, jump_m, cfg)):
+        state.archive.put(keyframe, fused=False)
+        return reject(state, keyframe, reason, cfg)
+    event = _order(state, keyframe)
+    changed = [_fuse_kept(state, keyframe, depth_m, cfg)]
+    if jump_m:
+        event = f"believed again at keyframe {keyframe.frame_id}: the pose stays where it jumped to and fits the map"
+        changed += _fuse_doubted(state, cfg)
+    state.track.believe(keyframe)
+    return _publish(state, keyframe, refresh(state, np.concatenate(changed), cfg), cfg, event)
 
 
-def correct(state: State, update: PoseUpdate) -> None:
-    """Take over corrected poses of keyframes that are still to come."""
-    poses = zip(update.frame_ids.tolist(), np.array(update.world_from_camera), strict=True)
-    state.corrected.update({i: pose for i, pose in poses if i not in state.cameras_m})
+def correct(state: State, update: PoseUpdate, cfg: Config) -> PlaceDelta | None:
+    """Move keyframes to their corrected poses: the map becomes what it would be, had these poses been known.
+
+    None when the update has been seen before. Keyframes that are still to come are moved when they come; those that
+    the archive no longer holds stay where they are, which the delta's `event` says.
+    """
+    if update.revision <= state.updates.get(update.epoch, -1):
+        return None
+    state.updates[update.epoch] = update.revision
+    poses = dict(zip(update.frame_ids.tolist(), np.array(update.world_from_camera), strict=True))
+    state.corrected.update(poses)
+    changed = [np.empty((0, 3), np.int64)]
+    moved_ids, lost = [], 0
+    for frame_id, pose in sorted(poses.items()):
+        kept = state.archive.get(frame_id)
+        if kept is not None:
+            changed += _move(state, kept, pose, cfg)
+            moved_ids.append(frame_id)
+        elif frame_id in state.cameras_m:
+            lost += 1
+    event = f"{lost} of {len(poses)} keyframes are no longer archived and keep their poses" if lost else ""
+    changes = refresh(state, np.concatenate(changed), cfg)
+    return _delta(state, changes, cfg, stamp_ns=update.stamp_ns, event=event, moved_ids=moved_ids)
 
 
-def reject(state: State, keyframe: Keyframe, cfg: Config) -> PlaceDelta:
-    """Count a keyframe that cannot be used; the delta is empty."""
+def reject(state: State, keyframe: Keyframe, reason: str, cfg: Config) -> PlaceDelta:
+    """Count a keyframe that cannot be used; the delta says why and changes nothing."""
     state.rejected += 1
-    return _publish(state, keyframe, Changes(), cfg)
+    event = f"keyframe {keyframe.frame_id} refused: {reason}"
+    state.stamp_ns, state.frame_id = max(state.stamp_ns, keyframe.stamp_ns), keyframe.frame_id
+    state.seen.add(keyframe.frame_id)
+    return _delta(state, Changes(), cfg, stamp_ns=keyframe.stamp_ns, event=event)
 
 
-def within_reach(keyframe: Keyframe, cfg: Config) -> bool:
-    """Whether all that this keyframe may touch has voxel indices of 16 bits, as VoxelMap sends them."""
-    reach_m = np.abs(keyframe.world_from_camera[:3, 3]).max() + 2 * cfg.max_range_m
-    return bool(reach_m / cfg.voxel_m < np.iinfo(np.int16).max)
+def fuse(state: State, keyframe: Keyframe, depth_m: np.ndarray, cfg: Config, sign: int = tsdf.ADD) -> np.ndarray:
+    """Fuse a depth image into the map only, or take it out; return the voxels (n, 3) whose label changed."""
+    view = tsdf.View(depth_m, keyframe.intrinsics, keyframe.world_from_camera)
+    return tsdf.integrate(state.grid, view, cfg.fusion, sign)
 
 
-def fuse(state: State, keyframe: Keyframe, depth_m: np.ndarray, cfg: Config) -> Box | None:
-    """Fuse a depth image into the map only; return the box of voxels whose label changed, if any."""
-    return tsdf.integrate(
-        state.grid,
-        depth_m,
-        keyframe.intrinsics,
-        keyframe.world_from_camera,
-        voxel_m=cfg.voxel_m,
-        truncation_m=max(cfg.truncation_m, 2 * cfg.voxel_m),
-        surface_m=cfg.surface_voxels * cfg.voxel_m,
-        min_range_m=cfg.min_range_m,
-        max_range_m=cfg.max_range_m,
-        max_weight=cfg.max_weight,
-    )
-
-
-def refresh(state: State, changed: Box, cfg: Config) -> Changes:
-    """Bring distances, places and edges up to date after voxel labels changed inside `changed`."""
-    recomputed = distance.refresh(
-        state.grid,
-        changed,
-        max_distance_voxels=cfg.voxels(cfg.max_distance_m),
-        voronoi_min_voxels=cfg.voxels(cfg.voronoi_min_distance_m),
-        parent_l1_voxels=cfg.parent_l1_separation,
-        parent_cos=cfg.parent_cos_angle_separation,
-    )
-    cell_voxels = cfg.cell_voxels
-    everything = places.whole_cells(state.grid.bounds, cell_voxels)
-    # Merging looks one cell around a changed cell, and absorbed places one further: both must be seen whole.
-    region = places.whole_cells(recomputed, cell_voxels, 1).clipped(everything)
-    extraction = places.extract(
-        state.grid,
-        region.grown(2 * cell_voxels).clipped(everything),
-        cell_voxels,
-        cfg.voxels(cfg.min_node_distance_m) ** 2,
-        cfg.voxels(cfg.node_merge_distance_m) ** 2,
-    )
-    return state.graph.update(state.grid, extraction, region)
+def refresh(state: State, changed: np.ndarray, cfg: Config) -> Changes:
+    """Bring distances, places and edges up to date after the labels of the voxels (n, 3) changed."""
+    boxes = [_renewed_field(state, part, cfg) for part in _tiles(changed)]
+    changes = Changes()
+    for box in boxes:
+        if box is not None:
+            changes.add(_renewed_places(state, box, cfg))
+    return changes
 
 
 def snapshot(state: State, cfg: Config) -> PlaceDelta:
@@ -166,8 +207,7 @@ def snapshot(state: State, cfg: Config) -> PlaceDelta:
         stamp_ns=state.stamp_ns,
         frame_id=state.frame_id,
         snapshot=True,
-        past_frame_ids=np.array(sorted(state.cameras_m), np.int64),
-        past_cameras_m=np.array([state.cameras_m[i] for i in sorted(state.cameras_m)], np.float32).reshape(-1, 3),
+        **_cameras(state, sorted(state.cameras_m)),
         **fields,
     )
 
@@ -178,19 +218,144 @@ def voxel_map(state: State, cfg: Config) -> VoxelMap:
     return VoxelMap(robot=state.robot, voxel_m=cfg.voxel_m, free=free, occupied=occupied)
 
 
-def _publish(state: State, keyframe: Keyframe, changes: Changes, cfg: Config) -> PlaceDelta:
-    """The delta of one keyframe; it has the next revision also when it is empty."""
-    state.revision += 1
-    state.stamp_ns, state.frame_id = keyframe.stamp_ns, keyframe.frame_id
+def _usable_depth(keyframe: Keyframe, cfg: Config) -> np.ndarray:
+    """Its depth, if all that it may touch has voxel indices of 16 bits, as VoxelMap sends them. Raises ImageFault."""
+    reach_m = np.abs(keyframe.world_from_camera[:3, 3]).max() + 2 * cfg.max_range_m
+    if not reach_m / cfg.voxel_m < np.iinfo(np.int16).max:
+        raise images.ImageFault(f"its camera is {reach_m:.0f} m from the origin, farther than voxel indices reach")
+    return images.depth_of(keyframe, cfg.max_principal_offset)
+
+
+def _distrust(state: State, keyframe: Keyframe, depth_m: np.ndarray, jump_m: float, cfg: Config) -> str:
+    """Why a keyframe whose pose has jumped cannot be believed; empty when it can."""
+    reason = f"its pose jumps by {jump_m:.2f} m"
+    state.track.doubt(keyframe, cfg.bounds)
+    if len(state.track.astray) < cfg.relocalised_after:
+        return reason
+    view = tsdf.View(depth_m, keyframe.intrinsics, keyframe.world_from_camera)
+    share = tsdf.contradiction(state.grid, view, cfg.fusion)
+    return f"{reason}, and {share:.0%} of its depth contradicts the map" if share > cfg.max_contradiction else ""
+
+
+def _order(state: State, keyframe: Keyframe) -> str:
+    """What to say of a keyframe that is late; the map does not mind the order."""
+    if state.joined_frame_id and keyframe.frame_id < state.joined_frame_id:
+        return ""  # fetched from the archive
+    late_s = (state.stamp_ns - keyframe.stamp_ns) / 1e9
+    return f"keyframe {keyframe.frame_id} is out of order by {late_s:.3f} s; fused all the same" if late_s > 0 else ""
+
+
+def _fuse_kept(state: State, keyframe: Keyframe, depth_m: np.ndarray, cfg: Config) -> np.ndarray:
+    """Fuse a keyframe and keep it for pose updates; returns the voxels (n, 3) whose label changed."""
+    state.archive.put(keyframe, fused=True)
+    _remember(state, keyframe)
+    return fuse(state, keyframe, depth_m, cfg)
+
+
+def _fuse_doubted(state: State, cfg: Config) -> Iterator[np.ndarray]:
+    """Fuse the keyframes of a jump that has turned out to be right."""
+    for frame_id in state.track.astray_ids():
+        kept = state.archive.get(frame_id)
+        if kept is not None and not kept.fused:
+            state.track.correct(kept.keyframe)
+            yield _fuse_kept(state, kept.keyframe, images.depth_of(kept.keyframe, cfg.max_principal_offset), cfg)
+
+
+def _move(state: State, kept: Kept, world_from_camera: np.ndarray, cfg: Config) -> Iterator[np.ndarray]:
+    """Take an archived keyframe out of the map and fuse it from elsewhere; yields the voxels whose label changed."""
+    there = moved(kept.keyframe, world_from_camera)
+    if kept.fused and (there.world_from_camera == kept.keyframe.world_from_camera).all():
+        return
+    depth_m = images.depth_of(kept.keyframe, cfg.max_principal_offset)
+    if kept.fused:
+        yield fuse(state, kept.keyframe, depth_m, cfg, tsdf.REMOVE)
+    yield _fuse_kept(state, there, depth_m, cfg)
+    state.track.correct(there)
+
+
+def _remember(state: State, keyframe: Keyframe) -> None:
     x, y, z = keyframe.world_from_camera[:3, 3].tolist()
     state.cameras_m[keyframe.frame_id] = (x, y, z)
+    state.seen.add(keyframe.frame_id)
+
+
+def _tiles(changed: np.ndarray) -> list[np.ndarray]:
+    """Voxels (n, 3) in groups that fit a window each."""
+    if not len(changed):
+        return []
+    tile = np.floor_divide(changed, TILE_VOXELS)
+    _, group = np.unique(tile, axis=0, return_inverse=True)
+    if (np.ptp(changed, axis=0) <= 2 * TILE_VOXELS).all():
+        return [changed]
+    return [changed[group == number] for number in range(group.max() + 1)]
+
+
+def _renewed_field(state: State, changed: np.ndarray, cfg: Config) -> Box | None:
+    return distance.refresh(
+        state.grid,
+        changed,
+        max_distance_voxels=cfg.voxels(cfg.max_distance_m),
+        voronoi_min_voxels=cfg.voxels(cfg.voronoi_min_distance_m),
+        parent_l1_voxels=cfg.parent_l1_separation,
+        parent_cos=cfg.parent_cos_angle_separation,
+    )
+
+
+def _renewed_places(state: State, changed: Box, cfg: Config) -> Changes:
+    cell_voxels = cfg.cell_voxels
+    everything = places.whole_cells(state.grid.bounds, cell_voxels)
+    # Merging looks one cell around a changed cell, and absorbed places one further: both must be seen whole.
+    region = places.whole_cells(changed, cell_voxels, 1).clipped(everything)
+    extraction = places.extract(
+        state.grid,
+        region.grown(2 * cell_voxels).clipped(everything),
+        cell_voxels,
+        cfg.voxels(cfg.min_node_distance_m) ** 2,
+        cfg.voxels(cfg.node_merge_distance_m) ** 2,
+    )
+    return state.graph.update(state.grid, extraction, region)
+
+
+def _publish(state: State, keyframe: Keyframe, changes: Changes, cfg: Config, event: str) -> PlaceDelta:
+    """The delta of one keyframe; it has the next revision also when it is empty."""
+    state.stamp_ns, state.frame_id = max(state.stamp_ns, keyframe.stamp_ns), keyframe.frame_id
+    return _delta(
+        state,
+        changes,
+        cfg,
+        stamp_ns=keyframe.stamp_ns,
+        event=event,
+        camera_m=state.cameras_m[keyframe.frame_id],
+    )
+
+
+def _delta(
+    state: State,
+    changes: Changes,
+    cfg: Config,
+    *,
+    stamp_ns: int,
+    event: str,
+    camera_m: tuple[float, float, float] | None = None,
+    moved_ids: Sequence[int] = (),
+) -> PlaceDelta:
+    state.revision += 1
     fields = state.published.update(state.graph, changes, cfg.voxel_m, cfg.min_component_size, cfg.min_change_m)
     return PlaceDelta(
         robot=state.robot,
         epoch=state.epoch,
         revision=state.revision,
-        stamp_ns=keyframe.stamp_ns,
-        frame_id=keyframe.frame_id,
-        camera_m=(x, y, z),
+        stamp_ns=stamp_ns,
+        frame_id=state.frame_id,
+        camera_m=camera_m,
+        event=event,
+        **_cameras(state, moved_ids),
         **fields,
     )
+
+
+def _cameras(state: State, frame_ids: Sequence[int]) -> dict[str, Any]:
+    return {
+        "past_frame_ids": np.array(frame_ids, np.int64),
+        "past_cameras_m": np.array([state.cameras_m[i] for i in frame_ids], np.float32).reshape(-1, 3),
+    }

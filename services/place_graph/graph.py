@@ -38,6 +38,11 @@ class Changes:
     touched: set[int] = field(default_factory=set)
     merged: dict[int, int] = field(default_factory=dict)
 
+    def add(self, later: "Changes") -> None:
+        """Changes that came after these."""
+        self.touched |= later.touched
+        self.merged |= later.merged
+
 
 @dataclass(frozen=True)
 class _Sight:

@@ -1,5 +1,11 @@
-"""A voxel map that grows: hashed blocks of 16 x 16 x 16 voxels, read and written through dense windows (pure)."""
+"""A voxel map that grows: hashed blocks of 16 x 16 x 16 voxels, read and written through dense windows (pure).
 
+Blocks lie open near the camera. Those left behind are compressed, and opened again when anything reads or writes them:
+the map does not change by it. When even the compressed blocks exceed the bound, the oldest are dropped for good.
+"""
+
+import zlib
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -44,8 +50,8 @@ def _cube(dtype: str, fill: int = 0) -> np.ndarray:
 class Block:
     """One cube of voxels. What is measured: `tsdf_m`, `weight`, `label`. What follows from it: the rest."""
 
-    tsdf_m: np.ndarray = field(default_factory=lambda: _cube("float32"))  # signed distance along the ray, truncated
-    weight: np.ndarray = field(default_factory=lambda: _cube("float32"))
+    sdf: np.ndarray = field(default_factory=lambda: _cube("int32"))  # sum of signed distances, shares of truncation
+    weight: np.ndarray = field(default_factory=lambda: _cube("int32"))  # sum of weights
     label: np.ndarray = field(default_factory=lambda: _cube("uint8"))  # UNOBSERVED, FREE, OCCUPIED
     d2: np.ndarray = field(default_factory=lambda: _cube("int16", UNKNOWN_D2))  # squared voxels to the nearest obstacle
     offset: np.ndarray = field(default_factory=lambda: np.zeros((BLOCK, BLOCK, BLOCK, 3), "int8"))  # voxel - obstacle
@@ -53,9 +59,24 @@ class Block:
 
 
 _EMPTY = Block()
+FIELDS = tuple(_EMPTY.__dataclass_fields__)
+BLOCK_BYTES = sum(getattr(_EMPTY, name).nbytes for name in FIELDS)
 
 BlockKey = tuple[int, int, int]
 Part = tuple[slice, slice, slice]
+
+
+def _packed(block: Block) -> bytes:
+    return zlib.compress(b"".join(getattr(block, name).tobytes() for name in FIELDS), 1)
+
+
+def _opened(data: bytes) -> Block:
+    raw, start, fields = zlib.decompress(data), 0, {}
+    for name in FIELDS:
+        sample = getattr(_EMPTY, name)
+        fields[name] = np.frombuffer(raw, sample.dtype, sample.size, start).reshape(sample.shape).copy()
+        start += sample.nbytes
+    return Block(**fields)
 
 
 class VoxelGrid:
@@ -63,21 +84,54 @@ class VoxelGrid:
 
     def __init__(self) -> None:
         self.blocks: dict[BlockKey, Block] = {}
+        self._packed: dict[BlockKey, bytes] = {}  # oldest first
+        self.packed_bytes = 0
         self._low = np.zeros(3, np.int64)
         self._high = np.zeros(3, np.int64)
 
     @property
     def bounds(self) -> Box:
-        """The smallest box of voxels that holds every block."""
+        """The smallest box of voxels that holds every block there was."""
         return Box(self._low * BLOCK, self._high * BLOCK)
+
+    @property
+    def size_bytes(self) -> int:
+        """Memory of all voxels, open and compressed."""
+        return len(self.blocks) * BLOCK_BYTES + self.packed_bytes
+
+    def block(self, key: BlockKey) -> Block | None:
+        """A block, opened if it was compressed; None if there is none."""
+        data = self._packed.pop(key, None)
+        if data is not None:
+            self.packed_bytes -= len(data)
+            self.blocks[key] = _opened(data)
+        return self.blocks.get(key)
 
     def insert(self, key: BlockKey, block: Block) -> None:
         """Add a block that is not there yet."""
         index = np.array(key, np.int64)
-        first = not self.blocks
+        first = not self.blocks and not self._packed
         self._low = index if first else np.minimum(self._low, index)
         self._high = index + 1 if first else np.maximum(self._high, index + 1)
         self.blocks[key] = block
+
+    def leave(self, center: np.ndarray, radius: float, limit_bytes: float) -> list[BlockKey]:
+        """Compress blocks whose centre is farther than `radius` voxels from `center`; drop the oldest beyond the limit.
+
+        Returns the keys of the dropped blocks. The limit counts open blocks too, which are never dropped.
+        """
+        keys = list(self.blocks)
+        distances = np.linalg.norm((np.array(keys).reshape(-1, 3) + 0.5) * BLOCK - center, axis=1)
+        for index in np.flatnonzero(distances > radius).tolist():
+            data = _packed(self.blocks.pop(keys[index]))
+            self._packed[keys[index]] = data
+            self.packed_bytes += len(data)
+        dropped = []
+        while self._packed and self.size_bytes > limit_bytes:
+            oldest = next(iter(self._packed))
+            self.packed_bytes -= len(self._packed.pop(oldest))
+            dropped.append(oldest)
+        return dropped
 
     def gather(self, name: str, box: Box, fill: int = 0) -> np.ndarray:
         """Dense copy of one field inside `box`; `fill` where there is no block."""
@@ -94,9 +148,15 @@ class VoxelGrid:
 
     def voxels_with(self, label: int) -> np.ndarray:
         """Indices (n, 3) of all voxels with this label, in ascending order."""
-        parts = [np.argwhere(b.label == label) + np.array(key) * BLOCK for key, b in sorted(self.blocks.items())]
+        parts = [np.argwhere(b.label == label) + np.array(key) * BLOCK for key, b in self._all()]
         voxels = np.concatenate(parts) if parts else np.empty((0, 3), np.int64)
         return voxels[np.lexsort(voxels.T[::-1])]
+
+    def _all(self) -> Iterator[tuple[BlockKey, Block]]:
+        """Every block; compressed ones stay compressed."""
+        yield from self.blocks.items()
+        for key, data in self._packed.items():
+            yield key, _opened(data)
 
     def _overlaps(self, box: Box) -> list[tuple[Block, Part, Part]]:
         """Blocks that meet `box`, each with its part of the window and its part of the block."""
@@ -105,7 +165,7 @@ class VoxelGrid:
         for bx, ox, ix in axes[0]:
             for by, oy, iy in axes[1]:
                 for bz, oz, iz in axes[2]:
-                    block = self.blocks.get((bx, by, bz))
+                    block = self.block((bx, by, bz))
                     if block is not None:
                         found.append((block, (ox, oy, oz), (ix, iy, iz)))
         return found

@@ -1,9 +1,7 @@
 """Reads keyframes, keeps the map and the place graph, writes what changed."""
 
+import logging
 from collections.abc import Iterator
-
-import cv2
-import numpy as np
 
 from schemas.codec import Message
 from schemas.frames import ArchiveReply, ArchiveRequest, Keyframe, PoseUpdate
@@ -11,6 +9,8 @@ from schemas.places import MapRequest, PlaceDelta, SnapshotRequest, VoxelMap
 from schemas.topics import ARCHIVE, KEYFRAME, PLACE_DELTA, PLACE_SNAPSHOT, POSE_UPDATE, VOXEL_MAP
 from services.place_graph import core
 from services.runtime.service import Ask, Identity, Output, Service
+
+log = logging.getLogger(__name__)
 
 
 def init(cfg: core.Config, identity: Identity) -> core.State:
@@ -23,12 +23,12 @@ def step(state: core.State, message: Message, cfg: core.Config) -> Iterator[Outp
     mid-stream fetches what it has missed from the archive, page by page."""
     match message:
         case Keyframe():
-            if not state.cameras_m and message.frame_id > 0:
+            if not state.seen and message.frame_id > 0:
                 state.joined_frame_id = message.frame_id
                 yield _ask_archive(state.robot, 0, message.frame_id)
             yield from _map(state, message, cfg)
         case PoseUpdate():
-            core.correct(state, message)
+            yield from _told(core.correct(state, message, cfg))
         case ArchiveReply():
             for keyframe in message.keyframes:
                 yield from _map(state, keyframe, cfg)
@@ -41,22 +41,16 @@ def _ask_archive(robot: str, first_frame_id: int, end_frame_id: int) -> Ask:
 
 
 def _map(state: core.State, keyframe: Keyframe, cfg: core.Config) -> Iterator[Output]:
-    if keyframe.frame_id not in state.cameras_m:
-        depth_m = depth_of(keyframe) if core.within_reach(keyframe, cfg) else None
-        delta = core.reject(state, keyframe, cfg) if depth_m is None else core.integrate(state, keyframe, depth_m, cfg)
+    if keyframe.frame_id not in state.seen:
+        yield from _told(core.integrate(state, keyframe, cfg))
+
+
+def _told(delta: PlaceDelta | None) -> Iterator[Output]:
+    """Publish a delta; what was wrong goes to the log too."""
+    if delta is not None:
+        if delta.event:
+            log.warning(delta.event, extra={"frame": delta.frame_id})
         yield PLACE_DELTA, delta
-
-
-def depth_of(keyframe: Keyframe) -> np.ndarray | None:
-    """Depth (h, w) float32 in metres, 0 = no measurement; None if the image is not a usable 16-bit depth image."""
-    try:
-        image = cv2.imdecode(np.frombuffer(keyframe.depth, np.uint8), cv2.IMREAD_UNCHANGED)
-    except cv2.error:  # empty, or a header that promises an absurd size
-        return None
-    size = (keyframe.intrinsics.height_px, keyframe.intrinsics.width_px)
-    if image is None or image.shape != size or image.dtype != np.uint16 or not image.any():
-        return None
-    return image.astype(np.float32) * np.float32(keyframe.depth_scale_m)
 
 
 def _snapshot(state: core.State, request: SnapshotRequest, cfg: core.Config) -> PlaceDelta:

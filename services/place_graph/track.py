@@ -1,0 +1,88 @@
+"""Whether a keyframe's pose can follow those before it (pure).
+
+A camera moves at bounded speed. A keyframe that lies farther away than that is refused: the tracker has jumped. If the
+following ones move on smoothly from there, the tracker may have found its place again; they are believed once a few of
+them in a row have done so and none of them contradicts the map.
+"""
+
+from bisect import bisect_left, insort
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from schemas.frames import Keyframe
+
+
+class Point(NamedTuple):
+    """When and where a keyframe was taken."""
+
+    stamp_ns: int
+    center_m: tuple[float, float, float]
+    frame_id: int
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """How far a camera gets: `slack_m` at once, and `max_speed_m_s`; 0 = anywhere."""
+
+    max_speed_m_s: float
+    slack_m: float
+
+    def reachable_m(self, seconds: float) -> float:
+        """The greatest distance after so much time."""
+        return self.slack_m + self.max_speed_m_s * abs(seconds)
+
+
+@dataclass
+class Track:
+    """Stamps and camera centres believed so far, and those of a jump that goes on."""
+
+    believed: list[Point] = field(default_factory=list)  # by stamp
+    astray: list[Point] = field(default_factory=list)
+
+    def jump_m(self, keyframe: Keyframe, bounds: Bounds) -> float:
+        """How far a keyframe lies from its neighbour in time, if that cannot be true; else 0."""
+        return _leap_m(self.believed, keyframe, bounds)
+
+    def goes_on(self, keyframe: Keyframe, bounds: Bounds) -> bool:
+        """Whether it moves on smoothly from the jump before it."""
+        return bool(self.astray) and not _leap_m(self.astray[-1:], keyframe, bounds)
+
+    def astray_ids(self) -> list[int]:
+        """The keyframes of the jump that goes on."""
+        return [point.frame_id for point in self.astray]
+
+    def believe(self, keyframe: Keyframe) -> None:
+        """The keyframe is where it says."""
+        insort(self.believed, _point(keyframe))
+        self.astray.clear()
+
+    def doubt(self, keyframe: Keyframe, bounds: Bounds) -> None:
+        """The keyframe is not where it says."""
+        if not self.goes_on(keyframe, bounds):
+            self.astray.clear()
+        self.astray.append(_point(keyframe))
+
+    def correct(self, keyframe: Keyframe) -> None:
+        """The keyframe is here too: what follows may go on from the corrected pose or from the old one."""
+        insort(self.believed, _point(keyframe))
+
+
+def _point(keyframe: Keyframe) -> Point:
+    x, y, z = keyframe.world_from_camera[:3, 3].tolist()
+    return Point(keyframe.stamp_ns, (x, y, z), keyframe.frame_id)
+
+
+def _leap_m(track: list[Point], keyframe: Keyframe, bounds: Bounds) -> float:
+    """Distance to the nearest in time, if it is too great; a keyframe that fits any of its neighbours fits."""
+    if not track or bounds.max_speed_m_s <= 0:
+        return 0.0
+    after = bisect_left(track, _point(keyframe))
+    leaps = []
+    for stamp_ns, center_m, _ in track[max(0, after - 2) : after + 2]:
+        distance_m = float(np.linalg.norm(keyframe.world_from_camera[:3, 3] - center_m))
+        if distance_m <= bounds.reachable_m((keyframe.stamp_ns - stamp_ns) / 1e9):
+            return 0.0
+        leaps.append(distance_m)
+    return min(leaps)
