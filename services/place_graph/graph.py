@@ -67,20 +67,26 @@ class PlaceGraph:
         self._by_cell: dict[Voxel, set[int]] = {}
         self._next_id = 0
 
-    def update(self, grid: VoxelGrid, extraction: Extraction, region: Box) -> Changes:
-        """Replace the places inside `region` (whole cells) by the extracted ones, keep ids, renew edges nearby."""
-        window = region.grown(2 * self._reach_voxels).clipped(grid.bounds)
+    def update(self, grid: VoxelGrid, extraction: Extraction, region: Box, changed: Box) -> Changes:
+        """Replace the places inside `region` (whole cells) by the extracted ones, keep ids, renew edges nearby.
+
+        Distances have changed inside `changed` only.
+        """
+        window = region.grown(self._reach_voxels).clipped(grid.bounds)
         sight = _Sight(grid.gather("d2", window, UNKNOWN_D2), window)
         changes = Changes()
         id_of, left = self._replace(extraction, region, sight, changes)
+        gone = self._voxels(left)
         self._retire(left, extraction, id_of, sight, changes)
-        self._touch(region, extraction, id_of)
-        self._relink(region, sight, changes)
+        stirred = self._touch(region, extraction, id_of) | (changes.touched & self.places.keys())
+        voxels = np.concatenate((self._voxels(sorted(stirred)), [changed.low, changed.high - 1], gone))
+        self._relink(Box(voxels.min(axis=0), voxels.max(axis=0) + 1), grid, changes)
         return changes
 
     @property
     def _reach_voxels(self) -> int:
-        return int(np.ceil(self.rules.reach))
+        """How long an edge can be: as far as free space may be crossed, or as far as places that touch lie apart."""
+        return int(np.ceil(max(self.rules.reach, 3 * self.rules.cell)))
 
     def _replace(
         self, extraction: Extraction, region: Box, sight: _Sight, changes: Changes
@@ -129,29 +135,33 @@ class PlaceGraph:
             changes.touched.update(self.edges.get(place_id, ()))
             self._drop(place_id)
 
-    def _touch(self, region: Box, extraction: Extraction, id_of: dict[int, int]) -> None:
-        """Renew which places touch, for all pairs with an end inside `region`."""
+    def _touch(self, region: Box, extraction: Extraction, id_of: dict[int, int]) -> set[int]:
+        """Renew which places touch, for all pairs with an end inside `region`; returns whose company changed."""
         inside = set(self._ids_within(region))
-        for place_id in inside:
-            for other in self._touching.pop(place_id, set()):
-                self._touching.get(other, set()).discard(place_id)
+        before = {place_id: self._touching.pop(place_id, set()) for place_id in inside}
+        for place_id, others in before.items():
+            for other in others - inside:
+                self._touching[other].discard(place_id)
         for one, two in extraction.touching.tolist():
             a, b = id_of.get(one), id_of.get(two)
             if a is not None and b is not None and (a in inside or b in inside):
                 self._touching.setdefault(a, set()).add(b)
                 self._touching.setdefault(b, set()).add(a)
+        return {place_id for place_id, others in before.items() if others != self._touching.get(place_id, set())}
 
-    def _relink(self, region: Box, sight: _Sight, changes: Changes) -> None:
+    def _relink(self, region: Box, grid: VoxelGrid, changes: Changes) -> None:
         """Renew the edges that may have changed: those with an end in `region`, or both ends within reach of it."""
         inside = set(self._ids_within(region))
         near = set(self._ids_within(region.grown(self._reach_voxels)))
+        window = region.grown(2 * self._reach_voxels).clipped(grid.bounds)
+        sight = _Sight(grid.gather("d2", window, UNKNOWN_D2), window)
         renewed: dict[int, dict[int, int]] = {a: {} for a in near}
         renewed.update({b: {} for a in inside for b in self.edges.get(a, ())})
 
         def concerned(a: int, b: int) -> bool:
             return a in inside or b in inside or (a in near and b in near)
 
-        for a, b, clearance in self._links_within(region.grown(2 * self._reach_voxels), sight):
+        for a, b, clearance in self._links_within(window, sight):
             if concerned(a, b):
                 renewed.setdefault(a, {})[b] = renewed.setdefault(b, {})[a] = clearance
         for a in sorted(renewed):

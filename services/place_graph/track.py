@@ -2,7 +2,7 @@
 
 A camera moves at bounded speed. A keyframe that lies farther away than that is refused: the tracker has jumped. If the
 following ones move on smoothly from there, the tracker may have found its place again; they are believed once a few of
-them in a row have done so and none of them contradicts the map.
+them in a row have done so and they do not contradict the map.
 """
 
 from bisect import bisect_left, insort
@@ -40,6 +40,12 @@ class Track:
 
     believed: list[Point] = field(default_factory=list)  # by stamp
     astray: list[Point] = field(default_factory=list)
+    contradictions: list[float] = field(default_factory=list)  # of these with the map, as shares of their depth
+
+    @property
+    def newest_ns(self) -> int:
+        """The newest stamp believed."""
+        return self.believed[-1].stamp_ns if self.believed else -(2**63)
 
     def jump_m(self, keyframe: Keyframe, bounds: Bounds) -> float:
         """How far a keyframe lies from its neighbour in time, if that cannot be true; else 0."""
@@ -56,13 +62,18 @@ class Track:
     def believe(self, keyframe: Keyframe) -> None:
         """The keyframe is where it says."""
         insort(self.believed, _point(keyframe))
-        self.astray.clear()
+        self._forget()
 
-    def doubt(self, keyframe: Keyframe, bounds: Bounds) -> None:
-        """The keyframe is not where it says."""
+    def doubt(self, keyframe: Keyframe, bounds: Bounds, contradiction: float) -> None:
+        """The keyframe may not be where it says."""
         if not self.goes_on(keyframe, bounds):
-            self.astray.clear()
+            self._forget()
         self.astray.append(_point(keyframe))
+        self.contradictions.append(contradiction)
+
+    def _forget(self) -> None:
+        self.astray.clear()
+        self.contradictions.clear()
 
     def correct(self, keyframe: Keyframe) -> None:
         """The keyframe is here too: what follows may go on from the corrected pose or from the old one."""
@@ -78,11 +89,12 @@ def _leap_m(track: list[Point], keyframe: Keyframe, bounds: Bounds) -> float:
     """Distance to the nearest in time, if it is too great; a keyframe that fits any of its neighbours fits."""
     if not track or bounds.max_speed_m_s <= 0:
         return 0.0
-    after = bisect_left(track, _point(keyframe))
-    leaps = []
+    after = bisect_left(track, keyframe.stamp_ns, key=lambda point: point.stamp_ns)
+    nearest = {point.stamp_ns for point in track[max(0, after - 1) : after + 1]}
+    leaps_m = []
     for stamp_ns, center_m, _ in track[max(0, after - 2) : after + 2]:
         distance_m = float(np.linalg.norm(keyframe.world_from_camera[:3, 3] - center_m))
-        if distance_m <= bounds.reachable_m((keyframe.stamp_ns - stamp_ns) / 1e9):
+        if stamp_ns in nearest and distance_m <= bounds.reachable_m((keyframe.stamp_ns - stamp_ns) / 1e9):
             return 0.0
-        leaps.append(distance_m)
-    return min(leaps)
+        leaps_m.append(distance_m)
+    return min(leaps_m)
