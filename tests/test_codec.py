@@ -27,6 +27,7 @@ GOLDEN: list[Message] = [
         color=b"c",
         depth=b"d",
         depth_scale_m=0.002,
+        mask=b"m",
     ),
     places.PlaceDelta(
         robot="r",

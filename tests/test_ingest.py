@@ -700,3 +700,11 @@ def test_pose_updates_that_cannot_be_true_are_refused(fault):
         poses[1, 0, 3] = np.nan
     with pytest.raises(ValueError):
         PoseUpdate(robot="r", epoch=0, revision=0, stamp_ns=0, frame_ids=ids, world_from_camera=poses)
+
+
+def test_masks_beside_the_images_travel_with_them(tmp_path):
+    folder = dataset_folder(tmp_path / "d", good_rows(2))
+    (folder / "mask").mkdir()
+    (folder / "mask" / "000001.png").write_bytes(DEPTH)
+    outputs = feed(empty_state(), open_source(folder), Config(every_frame=True))
+    assert [m.mask for topic, m in outputs if topic is KEYFRAME] == [b"", DEPTH]

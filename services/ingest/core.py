@@ -67,6 +67,7 @@ class RawFrame(Message, frozen=True, kw_only=True):
     depth_scale_m: float
     index: int  # position in the source, from 0
     total: int  # frames in the source, 0 = unknown (live)
+    mask: bytes = b""
 
     def check(self) -> None:
         check_pose(self.world_from_camera)
@@ -279,6 +280,7 @@ def _keyframe(state: State, frame: RawFrame) -> Keyframe:
         color=frame.color,
         depth=frame.depth,
         depth_scale_m=frame.depth_scale_m,
+        mask=frame.mask,
     )
 
 
@@ -290,4 +292,4 @@ def _archive(state: State, keyframe: Keyframe, cfg: Config) -> None:
 
 
 def _size(keyframe: Keyframe) -> int:
-    return len(keyframe.color) + len(keyframe.depth)
+    return len(keyframe.color) + len(keyframe.depth) + len(keyframe.mask)

@@ -70,7 +70,15 @@ class Rig:
     world_from_source: np.ndarray | None  # None = the source's world has z up and its floor at zero already
 
     def frame(
-        self, index: int, frame_id: int, stamp_ns: int, source_from_camera: np.ndarray, *, color: bytes, depth: bytes
+        self,
+        index: int,
+        frame_id: int,
+        stamp_ns: int,
+        source_from_camera: np.ndarray,
+        *,
+        color: bytes,
+        depth: bytes,
+        mask: bytes = b"",
     ) -> RawFrame:
         """A frame whose images fit the camera and whose pose is a rigid motion. Raises FrameError."""
         check_images(self.intrinsics, color, depth)
@@ -85,6 +93,7 @@ class Rig:
                 world_from_camera=pose if self.world_from_source is None else self.world_from_source @ pose,
                 color=color,
                 depth=depth,
+                mask=mask,
                 depth_scale_m=self.depth_scale_m,
                 index=index,
                 total=self.total,

@@ -3,6 +3,7 @@
 camera.json       width height fx fy cx cy (pixels), depth_scale_m (metres per unit)
 trajectory.csv    frame, stamp_ns, x_m y_m z_m qx qy qz qw: world_from_camera, world z up
 color/NNNNNN.jpg  or .png; depth/NNNNNN.png with 16 bits, 0 = no measurement
+mask/NNNNNN.png   where it exists: 8 bits, not 0 = something that moves, kept out of the map
 pose_updates.csv  corrected poses, where they exist: stamp_ns (when the correction was made) and the columns of the
                   trajectory; rows that follow each other with one stamp are one correction
 regions.json      ground truth, where it exists
@@ -88,8 +89,8 @@ def _frames(path: Path, rig: Rig, rows: list[dict[str, str]]) -> Iterator[RawFra
         frame_id = -1
         try:
             frame_id, stamp_ns, pose = _posed(row)
-            color, depth = _images(path, frame_id)
-            yield rig.frame(index, frame_id, stamp_ns, pose, color=color, depth=depth)
+            color, depth, mask = _images(path, frame_id)
+            yield rig.frame(index, frame_id, stamp_ns, pose, color=color, depth=depth, mask=mask)
         except FrameError as error:
             yield BadFrame(frame_id=frame_id, reason=str(error), index=index, total=rig.total)
 
@@ -103,11 +104,13 @@ def _posed(row: dict[str, str]) -> tuple[int, int, np.ndarray]:
     return frame_id, stamp_ns, quaternion_pose(words)
 
 
-def _images(path: Path, frame_id: int) -> tuple[bytes, bytes]:
+def _images(path: Path, frame_id: int) -> tuple[bytes, bytes, bytes]:
     color = path / "color" / f"{frame_id:06d}.jpg"
     if not color.exists() and color.with_suffix(".png").exists():
         color = color.with_suffix(".png")
-    return read_bytes(color), read_bytes(path / "depth" / f"{frame_id:06d}.png")
+    mask = path / "mask" / f"{frame_id:06d}.png"
+    depth = read_bytes(path / "depth" / f"{frame_id:06d}.png")
+    return read_bytes(color), depth, read_bytes(mask) if mask.exists() else b""
 
 
 def _rows(path: Path) -> list[dict[str, str]]:

@@ -53,7 +53,8 @@ def _frames(path: Path, key: str, total: int, world_from_source: np.ndarray | No
             frame_id = keyframe.frame_id
             rig = Rig(keyframe.intrinsics, keyframe.depth_scale_m, total, world_from_source)
             pose = np.array(keyframe.world_from_camera)
-            yield rig.frame(index, frame_id, keyframe.stamp_ns, pose, color=keyframe.color, depth=keyframe.depth)
+            images = {"color": keyframe.color, "depth": keyframe.depth, "mask": keyframe.mask}
+            yield rig.frame(index, frame_id, keyframe.stamp_ns, pose, **images)
         except (DecodeError, FrameError) as error:
             yield BadFrame(frame_id=frame_id, reason=str(error), index=index, total=total)
 
