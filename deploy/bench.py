@@ -13,6 +13,7 @@ import numpy as np
 import zenoh
 from scipy.spatial import cKDTree
 
+from deploy import bench_segmenter
 from schemas.codec import decode, encode
 from schemas.frames import Keyframe
 from schemas.priors import PriorRequest, Task
@@ -224,6 +225,8 @@ BENCHES: dict[str, Callable[[], tuple[dict, dict]]] = {
     "places": places,
     "features": features,
     "swap": swap_cold,
+    "segmenter": bench_segmenter.updates,
+    "task": bench_segmenter.switch,
     "e2e": e2e,
 }
 

@@ -178,7 +178,7 @@ def _add_tools(command: Command) -> None:
     )
 
     bench = command("bench", "measure one part, or all", "prior-sg bench places --json")
-    bench.add_argument("name", help="bus, places, features, swap, e2e, or all")
+    bench.add_argument("name", help="bus, places, features, swap, segmenter, task, e2e, or all")
     bench.add_argument("--json", action="store_true", help="print one JSON object per measurement")
 
     priors = command("priors", "list the curated priors", "prior-sg priors list")
