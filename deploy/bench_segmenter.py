@@ -1,4 +1,4 @@
-"""Measurements of the segmenter alone: one update on maps of many sizes, and a task switch, on made-up halls of rooms."""
+"""Measurements of the segmenter alone, on made-up halls of rooms: one update on maps of many sizes; a task switch."""
 
 import statistics
 import time
@@ -21,7 +21,7 @@ _NONE = np.zeros(0, dtype=np.int64)
 
 
 class Hall:
-    """Rooms side by side, each of one label, as places on a grid with doorways, and cameras that look around in them."""
+    """Rooms side by side, each of one label, as places on a grid with doorways; cameras look around in them."""
 
     def __init__(self, places: int, seed: int = 0) -> None:
         self.rng = np.random.default_rng(seed)
@@ -135,7 +135,9 @@ class Bench:
         costs = rng.uniform(0.02, 1.0, (labels, labels))
         adjacency = (np.triu(costs) + np.triu(costs, 1).T).astype(np.float32)
         regions = [
-            RegionPrior(name=f"{name} {i}", phrases=[f"{name} {i}"], existence=1 / labels, query_radius_m=query_radius_m)
+            RegionPrior(
+                name=f"{name} {i}", phrases=[f"{name} {i}"], existence=1 / labels, query_radius_m=query_radius_m
+            )
             for i in range(labels)
         ]
         prior = Prior(

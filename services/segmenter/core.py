@@ -6,6 +6,7 @@ beliefs, and requests for what is missing (a place snapshot, text embeddings, a 
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -33,6 +34,7 @@ from services.segmenter.experts import REGISTRY, Vote
 from services.segmenter.experts.context import Context, ObjectSettings, ObjectView, standardised
 from services.segmenter.geometry import GeometryConfig
 from services.segmenter.graph import PlaceGraph, apply
+from services.segmenter.incremental import Settings, Solver
 from services.segmenter.places import UNLABELLED, Places
 
 BIAS_SAMPLE = 4096  # places that stand for all when the map's bias is computed
@@ -52,6 +54,9 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
     beta: float = 2.0  # weight of the pairwise term (paper)
     edge_decay_m: float = 2.0  # w_dist = exp(-length / edge_decay_m)
     edge_sum: float = 3.0  # sum of w_dist at a place, whatever the graph's density and scale; 0 = w_dist as it is
+    solver: Settings = msgspec.field(default_factory=Settings)
+    budget_ms: float = 40.0  # of solving per keyframe; the rest is done when idle. 0 = as long as it takes
+    look_ms: float = 4.0  # of solving between two looks at the budget, see Budget
     edge_clearance_m: float = 0.0  # > 0: w_dist times min(clearance / edge_clearance_m, 1); no gain seen, so off
     probability_floor: float = 1e-6  # least probability in a logarithm, so that every cost is finite
     object_phrases: int = 2  # objects whose phrases join a region's concept, the most discriminative first
@@ -73,6 +78,19 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
             raise ValueError("beta, edge_decay_m or edge_sum is out of range")
         if not (0 < self.probability_floor < 1 and self.trust_half > 0 and self.temperature > 0):
             raise ValueError("probability_floor, trust_half or temperature is out of range")
+
+
+@dataclass
+class Budget:
+    """Ends solving after a number of looks. A clock would stop a replay elsewhere than the run it repeats, so each look
+    stands for a fixed time: about what the solver's work between two looks takes on one core of a laptop."""
+
+    looks: float
+
+    def expired(self) -> bool:
+        """Look."""
+        self.looks -= 1
+        return self.looks < 0
 
 
 @dataclass(frozen=True)
@@ -112,11 +130,13 @@ class State:
     priors: dict[str, Prior] = field(default_factory=dict)  # by digest, latest arrival last
     texts: dict[tuple[str, ...], TextEmbeddings] = field(default_factory=dict)  # by concepts
     alignment: Alignment | None = None
+    solver: Solver = field(default_factory=Solver)
     bias: np.ndarray = field(default_factory=lambda: np.zeros(0))  # (label,) of the visual scores in this map
     compared: int = 0  # places whose similarity was computed, or that left, since the bias was
     next_region_id: int = 0
     regions: dict[int, Region] = field(default_factory=dict)
-    disturbed: set[int] = field(default_factory=set)  # regions whose figures are to be computed again
+    disturbed: set[int] = field(default_factory=set)  # regions whose beliefs, ways or objects may have changed
+    reformed: set[int] = field(default_factory=set)  # regions whose places came, went or moved
     ledger: publication.Ledger = field(default_factory=publication.Ledger)
     dirty: bool = False  # something changed since the last solution
     asked_snapshot: bool = False
@@ -129,7 +149,7 @@ class State:
 
 def empty(cfg: Config, robot: str, epoch: int) -> State:
     """The state before the first message."""
-    return State(robot=robot, epoch=epoch, query_radius_m=cfg.default_query_radius_m)
+    return State(robot=robot, epoch=epoch, query_radius_m=cfg.default_query_radius_m, solver=Solver(cfg.solver))
 
 
 def update(state: State, message: Message, cfg: Config) -> Iterator[Message]:
@@ -171,6 +191,7 @@ def follow_places(state: State, delta: PlaceDelta, cfg: Config) -> None:
         step = apply(state.graph, ready, replaces)
         before, state.graph, state.graph_epoch = state.graph, step.graph, ready.epoch
         state.disturbed.update(state.places.regions[step.removed].tolist())
+        state.reformed.update(state.places.regions[step.removed].tolist())
         state.ledger.forget(state.places.slots[step.removed])
         state.compared += len(step.removed)
         state.evidence.remove(before.ids[step.removed].tolist())
@@ -181,6 +202,7 @@ def follow_places(state: State, delta: PlaceDelta, cfg: Config) -> None:
         state.places.unsettled |= unsettled
         state.places.unbelieved |= unsettled
         state.places.doubtful |= step.moved
+        state.reformed.update(state.places.regions[step.upserted].tolist())
         _reintegrate(state, np.flatnonzero(step.moved), cfg)
         state.stamp_ns = max(state.stamp_ns, ready.stamp_ns)
         state.dirty = True
@@ -409,22 +431,29 @@ def _segment(state: State, switched: bool, idle: bool, cfg: Config) -> Iterator[
     if state.alignment is None:
         return
     evaluate_experts(state, idle or switched, cfg)
-    settle(state)
+    hurried = cfg.budget_ms > 0 and not (idle or switched)
+    settle(state, Budget(cfg.budget_ms / cfg.look_ms if hurried else np.inf))
     changes = partition(state)
     believe(state, cfg)
     delta = publish(state, changes, switched or state.ledger.source is None, cfg)
-    state.dirty = False
+    state.dirty = state.solver.pending > 0 or state.compared > 0
     if delta is not None:
         yield delta
 
 
-def settle(state: State) -> None:
-    """Better labels around the places whose costs changed; new places begin with their own cheapest."""
-    places = state.places
-    start = np.where(places.labels == UNLABELLED, places.unary.argmin(axis=1), places.labels)
-    labels = swap.minimise(field_of(state), start) if places.unsettled.any() else start
+def settle(state: State, budget: Budget) -> None:
+    """Better labels around the places whose costs changed, and around those still waiting from former updates."""
+    places, rows = state.places, np.arange(len(state.places.labels))
+    same_rows = np.array_equal(places.solved, rows)
+    labels = state.solver.update(
+        field_of(state),
+        places.labels,
+        budget.expired,
+        dirty=np.flatnonzero(places.unsettled),
+        previous=None if same_rows else places.solved,
+    )
     places.unbelieved |= with_neighbours(state.graph, labels != places.labels)
-    places.labels = labels
+    places.labels, places.solved = labels, rows
     places.unsettled[:] = False
 
 
@@ -438,6 +467,7 @@ def partition(state: State) -> list[RegionEvent]:
     moved = places.regions != previous
     beside = with_neighbours(state.graph, moved)  # lists of neighbours name a region that came, went or grew
     state.disturbed.update(previous[moved].tolist(), places.regions[beside].tolist())
+    state.reformed.update(previous[moved].tolist(), places.regions[moved].tolist())
     _, first = np.unique(places.regions, return_index=True)
     labels = {int(places.regions[row]): names[places.labels[row]] for row in first.tolist()}
     before = {region.id: region.label for region in state.regions.values()}
@@ -463,6 +493,7 @@ def publish(state: State, events: list[RegionEvent], everything: bool, cfg: Conf
     fresh = np.arange(len(places.labels)) if everything else np.flatnonzero(places.unbelieved)
     places.unbelieved[:] = False
     state.disturbed.clear()
+    state.reformed.clear()
     source = publication.Source(
         robot=state.robot,
         epoch=state.epoch,
@@ -518,9 +549,10 @@ def _described(state: State, everything: bool, cfg: Config) -> dict[int, Region]
     objects = regions.members(state.objects, graph.positions_m, places.regions, rows)
     found = {} if everything else {number: region for number, region in state.regions.items() if not wanted[number]}
     for number, members in zip(ids.tolist(), np.split(order, starts[1:]), strict=False):
-        region = _region(state, members, cfg)
+        formed = everything or number in state.reformed or number not in state.regions
         found[number] = msgspec.structs.replace(
-            region,
+            _formed(state, members, cfg) if formed else state.regions[number],
+            **_believed(state, members, cfg),
             neighbour_ids=border.neighbours.get(number, []),
             transitions=border.transitions.get(number, []),
             object_ids=objects.get(number, []),
@@ -528,24 +560,33 @@ def _described(state: State, everything: bool, cfg: Config) -> dict[int, Region]
     return found
 
 
-def _region(state: State, rows: np.ndarray, cfg: Config) -> Region:
-    """What the places `rows` of one region say of it."""
-    assert state.alignment is not None
-    graph, places, label = state.graph, state.places, int(state.places.labels[rows[0]])
-    x, y, z = graph.positions_m[rows].mean(axis=0).tolist()
-    predicted = state.evidence.trust[places.slots[rows]] < cfg.predicted_trust
+def _formed(state: State, rows: np.ndarray, cfg: Config) -> Region:
+    """What the places `rows` of one region say of its shape."""
+    positions_m, radii_m = state.graph.positions_m[rows], state.graph.radii_m[rows]
+    x, y, z = positions_m.mean(axis=0).tolist()
     return Region(
-        id=int(places.regions[rows[0]]),
-        label=state.alignment.labels[label],
+        id=int(state.places.regions[rows[0]]),
+        label="",
         place_count=len(rows),
-        probability=round(float(places.posteriors[rows, label].mean()), 2),
+        probability=0.0,
         position_m=(round(x, 2), round(y, 2), round(z, 2)),
-        area_m2=round(regions.footprint_m2(graph.positions_m[rows], graph.radii_m[rows], cfg.footprint_cell_m), 2),
-        unknown=round(1.0 - float(known_mass(state, rows, cfg).mean()), 2),
-        predicted=bool(predicted.mean() > 0.5),
-        hull_m=regions.hull_m(graph.positions_m[rows], graph.radii_m[rows]),
-        parent=state.alignment.prior.regions[label].parent,
+        area_m2=round(regions.footprint_m2(positions_m, radii_m, cfg.footprint_cell_m), 2),
+        hull_m=regions.hull_m(positions_m, radii_m),
     )
+
+
+def _believed(state: State, rows: np.ndarray, cfg: Config) -> dict[str, Any]:
+    """What the places `rows` of one region say of its label, by the fields of Region."""
+    assert state.alignment is not None
+    places, label = state.places, int(state.places.labels[rows[0]])
+    predicted = state.evidence.trust[places.slots[rows]] < cfg.predicted_trust
+    return {
+        "label": state.alignment.labels[label],
+        "parent": state.alignment.prior.regions[label].parent,
+        "probability": round(float(places.posteriors[rows, label].mean()), 2),
+        "unknown": round(1.0 - float(known_mass(state, rows, cfg).mean()), 2),
+        "predicted": bool(predicted.mean() > 0.5),
+    }
 
 
 def snapshot(state: State) -> RegionDelta:

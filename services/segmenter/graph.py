@@ -81,6 +81,7 @@ class Step:
     previous: np.ndarray  # (place,) row of each place in the former graph, -1 = new
     moved: np.ndarray  # (place,) bool: new, or the position differs
     touched: np.ndarray  # (place,) bool: new, moved, or an edge of it may have changed
+    upserted: np.ndarray  # (upserted,) rows of the graph that the delta names
     removed: np.ndarray  # (removed,) rows of the former graph that are gone
 
 
@@ -113,7 +114,7 @@ def apply(graph: PlaceGraph, delta: PlaceDelta, replaces: bool) -> Step:
     ends = _join_edges(graph, after, delta, merged, replaces)
     touched = moved.copy()
     touched[ends] = True
-    return Step(graph=after, previous=previous, moved=moved, touched=touched, removed=np.flatnonzero(~kept))
+    return Step(after, previous, moved, touched, upserted=rows, removed=np.flatnonzero(~kept))
 
 
 def _join_edges(

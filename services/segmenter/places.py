@@ -13,6 +13,7 @@ _FILLS: dict[str, tuple[float | bool, str]] = {  # what a new place gets, and th
     "slots": (-1, "int64"),
     "labels": (UNLABELLED, "int64"),
     "regions": (NO_REGION, "int64"),
+    "solved": (-1, "int64"),
     "similarity": (0.0, "float64"),
     "unary": (0.0, "float64"),
     "posteriors": (0.0, "float32"),
@@ -37,6 +38,7 @@ class Places:
     slots: np.ndarray  # of the evidence
     labels: np.ndarray  # UNLABELLED = not yet
     regions: np.ndarray
+    solved: np.ndarray  # row in the field that the solver has seen last, -1 = new to it
     similarity: np.ndarray  # (place, label) standardised
     unary: np.ndarray  # (place, label)
     posteriors: np.ndarray  # (place, label)

@@ -60,8 +60,7 @@ def track(component: np.ndarray, previous: np.ndarray, next_id: int) -> tuple[np
     part), and a component that several ids would follow takes the one that brings most places (a merge); ties go to the
     older id and to the component of the older place. Components without an heir get new ids, in order.
     """
-    known = previous != NO_REGION
-    pairs, counts = np.unique(np.stack((previous[known], component[known]), axis=1), axis=0, return_counts=True)
+    pairs, counts = _pairs(previous, component)
     heir: dict[int, tuple[int, int]] = {}  # old id -> (places kept, component)
     for (old, number), count in zip(pairs.tolist(), counts.tolist(), strict=True):
         if old not in heir or count > heir[old][0]:
@@ -78,6 +77,19 @@ def track(component: np.ndarray, previous: np.ndarray, next_id: int) -> tuple[np
             ids[number] = next_id
             next_id += 1
     return ids[component], next_id
+
+
+def _pairs(previous: np.ndarray, now: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs (n, 2) of a former and a present number that some place has, sorted, and how many places have each.
+
+    Runs of places with one pair are taken together first, for neighbours in the order of ids mostly share it.
+    """
+    known = previous != NO_REGION
+    keys = previous[known] * (int(now.max(initial=0)) + 1) + now[known]
+    starts = np.flatnonzero(np.diff(keys, prepend=-1))
+    found, inverse = np.unique(keys[starts], return_inverse=True)
+    counts = np.bincount(inverse, np.diff(starts, append=len(keys)), minlength=len(found)).astype(np.int64)
+    return np.stack(np.divmod(found, int(now.max(initial=0)) + 1), axis=1), counts
 
 
 def footprint_m2(positions_m: np.ndarray, radii_m: np.ndarray, cell_m: float) -> float:
@@ -110,8 +122,7 @@ def events(previous: np.ndarray, now: np.ndarray, before: dict[int, str], labels
     labels of all regions then and now. A region that is new and holds places of one that lives on was split off; one
     that is gone was merged into the region with most of its places.
     """
-    known = previous != NO_REGION
-    pairs, counts = np.unique(np.stack((previous[known], now[known]), axis=1), axis=0, return_counts=True)
+    pairs, counts = _pairs(previous, now)
     into: dict[int, tuple[int, int]] = {}  # former id -> (places, id now)
     out_of: dict[int, tuple[int, int]] = {}  # id now -> (places, former id)
     for (old, new), count in zip(pairs.tolist(), counts.tolist(), strict=True):
