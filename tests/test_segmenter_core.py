@@ -36,7 +36,7 @@ from schemas.topics import (
     TEXT,
 )
 from services.runtime.service import Ask, Identity
-from services.segmenter import core
+from services.segmenter import core, swap
 from services.segmenter.experts.context import ObjectView
 from services.segmenter.service import SERVICE
 
@@ -296,6 +296,28 @@ def test_removed_places_and_regions_leave_the_followers_too():
     run.feed(no_places(revision=1, removed_ids=gone), TICK)
     assert set(run.reader.beliefs) == set(np.flatnonzero(positions[:, 0] < 8.0).tolist())
     assert sorted(region.label for region in run.reader.regions.values()) == ["hall", "kitchen"]
+
+
+def test_a_spent_budget_leaves_a_valid_labelling_and_an_idle_tick_finishes():
+    cfg = core.Config(budget_ms=1e-3)
+    positions, edges, frames = world()
+    run = Run(cfg=cfg).feed(place_delta(positions, edges), task(), prior(ROOMS))
+    waited = False
+    for frame in frames:
+        run.feed(frame)
+        state = run.state
+        assert ((state.places.labels >= 0) & (state.places.labels < len(ROOMS))).all()
+        assert state.dirty or not state.solver.pending
+        waited |= state.solver.pending > 0
+    assert waited
+    hurried = swap.energy(core.field_of(run.state), run.state.places.labels)
+    run.feed(TICK, TICK)
+    assert not (run.state.dirty or run.state.solver.pending)
+    field = core.field_of(run.state)
+    energy = swap.energy(field, run.state.places.labels)
+    assert energy <= hurried + 1e-9
+    assert swap.energy(field, swap.minimise(field, run.state.places.labels)) == pytest.approx(energy)
+    assert sorted(region.label for region in run.reader.regions.values()) == sorted(ROOMS)
 
 
 def test_following_the_deltas_equals_the_snapshot():
