@@ -38,7 +38,7 @@ def _sample_keyframes() -> list[Keyframe]:
     """Every frame of the sample as a keyframe."""
     keyframes = []
     for frame in open_source(SAMPLE):
-        fields = {name: getattr(frame, name) for name in Keyframe.__struct_fields__ if name != "robot"}
+        fields = {name: getattr(frame, name) for name in Keyframe.__struct_fields__ if hasattr(frame, name)}
         keyframes.append(Keyframe(robot="bench", **fields))
     return keyframes
 

@@ -30,6 +30,14 @@ class Pyramid(Message, frozen=True, kw_only=True):
         check_pose(self.world_from_camera)
 
 
+class Backfill(Message, frozen=True, kw_only=True):
+    """Wish of a reader of pyramids: encode the archived keyframes that it lacks in one embedding space."""
+
+    robot: str
+    space: str
+    frame_ids: Annotated[np.ndarray, Shape("int64", "frame")]  # those it has
+
+
 class TextRequest(Message, frozen=True, kw_only=True):
     """Embed concepts; each concept is a list of phrases whose embeddings are averaged."""
 

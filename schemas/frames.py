@@ -57,6 +57,7 @@ class Keyframe(Message, frozen=True, kw_only=True):
     depth: bytes  # a PNG file, 16 bit, 0 = no measurement; depth along the optical axis
     depth_scale_m: float  # metres per depth unit
     mask: bytes = b""  # a PNG file, 8 bit, not 0 = something that moves, kept out of the map; empty = nothing does
+    space: str = ""  # of an encoding job: the embedding space wanted; empty = every space that has workers
 
     def check(self) -> None:
         check_pose(self.world_from_camera)
@@ -110,6 +111,7 @@ class IngestState(Message, frozen=True, kw_only=True):
     encoded: int
     rejected: int  # frames refused by the source or the keyframe selection, with the reason in the log
     finished: bool
+    skipped: int = 0  # keyframes that nobody encoded: a newer one came first, or no worker could
 
 
 class ArchiveRequest(Message, frozen=True, kw_only=True):

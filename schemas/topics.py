@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from schemas.codec import Message
-from schemas.features import Pyramid, TextEmbeddings, TextRequest
+from schemas.features import Backfill, Pyramid, TextEmbeddings, TextRequest
 from schemas.frames import ArchiveReply, ArchiveRequest, CameraState, IngestState, Keyframe, PoseUpdate
 from schemas.places import MapRequest, PlaceDelta, SnapshotRequest, VoxelMap
 from schemas.priors import Prior, PriorList, PriorRequest, Task, TaskInForce, TaskRequest
@@ -69,6 +69,7 @@ INGEST_STATE = Topic("INGEST_STATE", IngestState, f"{ROOT}/{{robot}}/ingest", "l
 PLACE_DELTA = Topic("PLACE_DELTA", PlaceDelta, f"{ROOT}/{{robot}}/places", "every", 2, recorded=True, cache=256)
 ENCODE = Topic("ENCODE", Keyframe, f"{ROOT}/jobs/encode", "job", 2, recorded=False)
 PYRAMID = Topic("PYRAMID", Pyramid, f"{ROOT}/{{robot}}/pyramid", "every", 2, recorded=True, cache=256)
+BACKFILL = Topic("BACKFILL", Backfill, f"{ROOT}/{{robot}}/backfill", "every", 0.01, recorded=True, cache=4)
 TASK = Topic("TASK", Task, f"{ROOT}/{{robot}}/task", "every", 0.01, recorded=True, cache=4)
 PRIOR = Topic("PRIOR", Prior, f"{ROOT}/fleet/prior/{{digest}}", "every", 0.01, recorded=True, cache=4)
 REGION_DELTA = Topic("REGION_DELTA", RegionDelta, f"{ROOT}/{{robot}}/regions", "every", 2, recorded=True, cache=256)
@@ -83,6 +84,7 @@ TOPICS = (
     PLACE_DELTA,
     ENCODE,
     PYRAMID,
+    BACKFILL,
     TASK,
     PRIOR,
     REGION_DELTA,
@@ -115,6 +117,9 @@ def status_key(service: str, instance: str) -> str:
     return f"{STATUS.key}/{service}/{instance}"
 
 
-def worker_keys(job: Topic, worker: str) -> tuple[str, str]:
-    """The queryable and the liveliness token of one worker of a job's pool; `*` as worker gives the patterns."""
-    return f"{job.key}/run/{worker}", f"{job.key}/live/{worker}"
+def worker_keys(job: Topic, worker: str, group: str = "") -> tuple[str, str]:
+    """The queryable and the liveliness token of one worker of a job's pool; `*` as worker gives the patterns.
+
+    The token also names the worker's group: workers of one group do the same work, each job goes to one of each group.
+    """
+    return f"{job.key}/run/{worker}", "/".join((f"{job.key}/live/{worker}", *([group] if group else [])))

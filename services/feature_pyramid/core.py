@@ -9,13 +9,17 @@ from schemas.frames import Intrinsics
 class Config(msgspec.Struct, frozen=True, kw_only=True):
     """Settings of the feature pyramid; one embedding space per worker."""
 
-    space: str = "conse/efficientnet-lite2/minilm-l6-v2"  # embedding space, names the encoder and its weights
+    space: str = (
+        "conse/efficientnet-lite2/minilm-l6-v2"  # the encoder: conse/…, open_clip/MODEL/PRETRAINED, onnx:FOLDER
+    )
+    runtime: str = "onnx"  # or torch: what runs the networks of conse
+    device: str = "auto"  # cpu, cuda, or auto: cuda where there is one
     smallest_crop_px: int = 224  # side of layer 0; smaller images use their shorter side
     layers: int = 3  # sides grow linearly from the smallest crop to the shorter side of the image
     overlap: float = 0.5  # least share of a crop's side that its neighbour covers too
     min_area_m2: float = 2.25  # A_min: crops that see less physical area are not encoded
     surface_cell_px: int = 8  # cell size of the coarse depth surface
-    batch_size: int = 4  # crops per forward pass
+    batch_size: int = 4  # crops per forward pass, of one or several keyframes
     threads: int = 0  # of the neural network library; 0 = its own choice (OMP_NUM_THREADS)
 
     def __post_init__(self) -> None:

@@ -1,26 +1,45 @@
 """What an encoder is, and which family of encoders serves an embedding space."""
 
 from importlib import import_module
-from typing import Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
 from schemas.features import TextEmbeddings
 from services.runtime.service import ServiceError
 
-# family (the space's first part) -> module with `load(space, threads, batch_size) -> Encoder`, imported when needed
-FAMILIES = {"conse": "services.feature_pyramid.conse"}
+# family (how the choice begins) -> module with `load(choice, options) -> Encoder` and `space_of(choice) -> str`,
+# imported when needed
+FAMILIES = {
+    "conse/": "services.feature_pyramid.conse",
+    "open_clip/": "services.feature_pyramid.open_clip_family",
+    "onnx:": "services.feature_pyramid.onnx_family",
+}
 
 
 class EncoderUnavailable(ServiceError):
     """The embedding space cannot be served here; the message says what to do."""
 
 
+class Options(NamedTuple):
+    """How an encoder is to run."""
+
+    threads: int = 0  # 0 = the library's own choice (OMP_NUM_THREADS)
+    batch_size: int = 4  # crops per forward pass
+    runtime: str = "onnx"  # or torch, where a family has both
+    device: str = "auto"  # cpu, cuda, or auto: cuda where there is one
+
+
 class Encoder(Protocol):
-    """Images and text into one embedding space."""
+    """Images and text into one embedding space.
+
+    Text comes with what reads its similarities: each concept's mean and spread over the space's background, and the
+    space's temperature and null score (paper: tau, s_null).
+    """
 
     space: str
     dim: int
+    side_px: int  # of the square images that the network sees
 
     def encode_images(self, crops: list[np.ndarray]) -> np.ndarray:
         """Embeddings of RGB crops, each uint8 (h, w, 3): float32 (crop, dim), unit length."""
@@ -31,12 +50,35 @@ class Encoder(Protocol):
         ...
 
 
-def load_encoder(space: str, threads: int, batch_size: int) -> Encoder:
-    """The encoder of an embedding space, weights loaded. Raises EncoderUnavailable."""
-    family = space.split("/", maxsplit=1)[0]
-    if family not in FAMILIES:
-        raise EncoderUnavailable(
-            f"no encoder serves the embedding space {space!r}; set feature_pyramid.space to one that begins with "
-            f"{' or '.join(f'{name}/' for name in sorted(FAMILIES))}."
-        )
-    return import_module(FAMILIES[family]).load(space, threads, batch_size)
+def load_encoder(choice: str, options: Options) -> Encoder:
+    """The encoder that serves a choice (see FAMILIES), weights loaded. Raises EncoderUnavailable."""
+    return _family(choice).load(choice, options)
+
+
+def space_of(choice: str) -> str:
+    """The embedding space of a choice, without loading weights. Raises EncoderUnavailable."""
+    return _family(choice).space_of(choice)
+
+
+def package(module: str, name: str = "") -> Any:
+    """An installed package, imported when needed. Raises EncoderUnavailable; `name` is what pip calls it."""
+    try:
+        return import_module(module)
+    except ImportError as error:
+        name = name or module.replace("_", "-")
+        raise EncoderUnavailable(f"the package {name} is not installed; run `pip install {name}`.") from error
+
+
+def unit(vectors: np.ndarray) -> np.ndarray:
+    """Rows scaled to unit length: float32."""
+    return (vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)).astype(np.float32)
+
+
+def _family(choice: str) -> Any:
+    for prefix, module in FAMILIES.items():
+        if choice.startswith(prefix):
+            return import_module(module)
+    raise EncoderUnavailable(
+        f"no encoder serves the embedding space {choice!r}; set feature_pyramid.space to one that begins with "
+        f"{' or '.join(FAMILIES)}."
+    )

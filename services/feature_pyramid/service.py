@@ -1,7 +1,9 @@
 """A worker of the encoding pool: keyframes in, feature pyramids out; answers text queries of its embedding space."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -10,18 +12,30 @@ from schemas.codec import Message
 from schemas.features import Pyramid, TextEmbeddings, TextRequest
 from schemas.frames import Keyframe
 from schemas.topics import ENCODE, PYRAMID, TEXT
-from services.feature_pyramid.core import Config, coarse_surface, select_crops
-from services.feature_pyramid.encoders import Encoder, load_encoder
+from services.feature_pyramid.core import Config, Selection, coarse_surface, select_crops
+from services.feature_pyramid.encoders import Encoder, Options, load_encoder, space_of
 from services.runtime.service import Identity, Output, Service
+
+
+class View(NamedTuple):
+    """A keyframe, read: what is left to do is the encoder's."""
+
+    selection: Selection
+    crops: list[np.ndarray]  # RGB, uint8 (side, side, 3)
+    surface_m: np.ndarray
+    broken: bool
 
 
 @dataclass
 class Worker:
-    """Loaded weights, and how many keyframes could not be read."""
+    """Loaded weights, the keyframes that are being made ready, and how many could not be read."""
 
     instance: str
     encoder: Encoder
     broken: int = 0
+    reader: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(1, thread_name_prefix="reader"))
+    views: dict[tuple[str, int], Future[View]] = field(default_factory=dict)  # by robot and frame
+    encoded: dict[tuple[str, int], np.ndarray] = field(default_factory=dict)
 
 
 class BrokenImage(ValueError):
@@ -30,25 +44,61 @@ class BrokenImage(ValueError):
 
 def init(cfg: Config, identity: Identity) -> Worker:
     """Load the encoder of the configured space. Raises EncoderUnavailable."""
-    return Worker(identity.instance, load_encoder(cfg.space, cfg.threads, cfg.batch_size))
+    options = Options(cfg.threads, cfg.batch_size, cfg.runtime, cfg.device)
+    return Worker(identity.instance, load_encoder(cfg.space, options))
+
+
+def prepare(state: Worker, messages: list[Message], cfg: Config) -> None:
+    """Read the keyframes that wait, on a thread of their own, while the encoder is at work on others."""
+    for frame in messages:
+        if isinstance(frame, Keyframe) and _key(frame) not in state.views:
+            state.views[_key(frame)] = state.reader.submit(view, frame, cfg)
 
 
 def step(state: Worker, message: Message, cfg: Config) -> Iterator[Output]:
     """One pyramid per keyframe, empty when no crop survives or an image is broken: the job is done either way."""
     if not isinstance(message, Keyframe):
         return
+    key = _key(message)
+    waiting = state.views.pop(key, None)
+    seen = waiting.result() if waiting is not None else view(message, cfg)
+    state.broken += seen.broken
+    embeddings = state.encoded.pop(key) if key in state.encoded else encode(state, seen, cfg)
+    yield PYRAMID, pyramid(state, message, seen, embeddings)
+
+
+def view(frame: Keyframe, cfg: Config) -> View:
+    """Decode a keyframe and select its crops by depth; without crops when its images are broken."""
     try:
-        color, depth_m = read_color(message), read_depth(message)
+        color, depth_m, broken = read_color(frame), read_depth(frame), False
     except BrokenImage:
-        state.broken += 1
-        color, depth_m = blank(message)
-    yield PYRAMID, build_pyramid(state, message, color, depth_m, cfg)
-
-
-def build_pyramid(state: Worker, frame: Keyframe, color: np.ndarray, depth_m: np.ndarray, cfg: Config) -> Pyramid:
-    """Select crops by depth, encode them (eq. feature_pyramid). `color` uint8 (h, w, 3) RGB, `depth_m` (h, w)."""
+        color, depth_m = blank(frame)
+        broken = True
     selection = select_crops(depth_m, frame.intrinsics, cfg)
-    embeddings = state.encoder.encode_images(selection.crops.cut(color))
+    return View(selection, selection.crops.cut(color), coarse_surface(depth_m, cfg.surface_cell_px), broken)
+
+
+def encode(state: Worker, seen: View, cfg: Config) -> np.ndarray:
+    """Embeddings of the crops; a batch that they do not fill takes in those of keyframes that are ready and waiting."""
+    joined: dict[tuple[str, int], View] = {}
+    crops = list(seen.crops)
+    for key, waiting in state.views.items():
+        if len(crops) >= cfg.batch_size or not waiting.done() or waiting.exception() is not None:
+            break
+        if key not in state.encoded:
+            joined[key] = waiting.result()
+            crops += joined[key].crops
+    embeddings = state.encoder.encode_images(crops)
+    start = len(seen.crops)
+    for key, other in joined.items():
+        state.encoded[key] = embeddings[start : start + len(other.crops)]
+        start += len(other.crops)
+    return embeddings[: len(seen.crops)]
+
+
+def pyramid(state: Worker, frame: Keyframe, seen: View, embeddings: np.ndarray) -> Pyramid:
+    """What integration needs of a keyframe (eq. feature_pyramid)."""
+    crops = seen.selection.crops
     return Pyramid(
         robot=frame.robot,
         frame_id=frame.frame_id,
@@ -57,13 +107,13 @@ def build_pyramid(state: Worker, frame: Keyframe, color: np.ndarray, depth_m: np
         worker=state.instance,
         intrinsics=frame.intrinsics,
         world_from_camera=frame.world_from_camera.copy(),
-        centers_px=selection.crops.centers_px,
-        sigmas_px=selection.crops.sigmas_px,
-        layers=selection.crops.layers,
-        depths_m=selection.depths_m,
+        centers_px=crops.centers_px,
+        sigmas_px=crops.sigmas_px,
+        layers=crops.layers,
+        depths_m=seen.selection.depths_m,
         embeddings=embeddings.astype(np.float16),
-        surface_m=coarse_surface(depth_m, cfg.surface_cell_px),
-        crops_total=selection.candidates,
+        surface_m=seen.surface_m,
+        crops_total=seen.selection.candidates,
     )
 
 
@@ -93,6 +143,10 @@ def answer_text(state: Worker, request: TextRequest, cfg: Config) -> TextEmbeddi
     return state.encoder.encode_text(request.concepts)
 
 
+def _key(frame: Keyframe) -> tuple[str, int]:
+    return frame.robot, frame.frame_id
+
+
 def _decode(data: bytes, mode: int, frame: Keyframe) -> np.ndarray:
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), mode)
@@ -114,6 +168,9 @@ SERVICE = Service(
     writes=(PYRAMID,),
     answers={TEXT: answer_text},
     job=ENCODE,
-    key_fields=lambda cfg: {"space": cfg.space},
+    job_group=lambda cfg: space_of(cfg.space),
+    prepare=prepare,
+    key_fields=lambda cfg: {"space": space_of(cfg.space)},
+    close=lambda state: state.reader.shutdown(wait=False, cancel_futures=True),
     replay_tolerance=2e-3,  # of half-precision embeddings
 )

@@ -10,12 +10,13 @@ import math
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Annotated
+from typing import Annotated, Literal
 
 import msgspec
 import numpy as np
 
 from schemas.codec import Message, Shape
+from schemas.features import Backfill
 from schemas.frames import (
     ArchiveReply,
     ArchiveRequest,
@@ -46,7 +47,10 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
     world_up: list[float] = msgspec.field(default_factory=list)  # up in the source's world; empty = as the layout says
     floor_m: float = 0.0  # height of the floor in the source's world, measured along world_up; becomes z = 0
     speed: float = 0.0  # times real time, by stamps; 0 = as fast as the pipeline drains
-    window: int = 8  # keyframes under way before the source waits, when speed is 0; below the publisher's cache
+    when_behind: Literal["wait", "skip"] = "wait"  # wait for slow workers, or keep pace and encode only the newest
+    window: int = (
+        8  # keyframes under way before the source waits, or older ones are skipped; below the publisher's cache
+    )
     every_frame: bool = False  # make every frame a keyframe
     min_translation_m: float = 0.25  # camera motion since the last keyframe that makes the next
     min_rotation_deg: float = 12.0  # the same for turning
@@ -129,6 +133,7 @@ class State:
     rejected: int = 0
     keyframes: int = 0
     encoded: int = 0
+    skipped: int = 0
     corrections: int = 0  # pose updates published
     encoding: set[int] = field(default_factory=set)  # numbers of keyframes whose job is not done
     ended: bool = False
@@ -200,7 +205,16 @@ def encoded(state: State, done: JobDone) -> Iterator[Written]:
     if done.frame_id in state.encoding:
         state.encoding.remove(done.frame_id)
         state.encoded += not done.error
+        state.skipped += bool(done.error)
         yield progress(state)
+
+
+def backfill(state: State, wish: Backfill) -> Iterator[Written]:
+    """Encode archived keyframes again, in one space: those that the asking reader lacks. They give way to new ones."""
+    known = set(wish.frame_ids.tolist())
+    for keyframe in state.archive:
+        if keyframe.frame_id not in known:
+            yield ENCODE, msgspec.structs.replace(keyframe, space=wish.space)
 
 
 def announce(state: State, correction: Correction) -> Iterator[Written]:
@@ -244,6 +258,7 @@ def progress(state: State) -> Written:
         keyframes=state.keyframes,
         encoded=state.encoded,
         rejected=state.rejected,
+        skipped=state.skipped,
         finished=state.ended and not state.encoding,
     )
 

@@ -6,9 +6,10 @@ from collections.abc import Awaitable, Iterator
 from typing import Protocol
 
 from schemas.codec import Message
+from schemas.features import Backfill
 from schemas.frames import PoseUpdate
 from schemas.status import JobDone, Tick
-from schemas.topics import ARCHIVE, CAMERA_STATE, ENCODE, INGEST_STATE, KEYFRAME, POSE_UPDATE
+from schemas.topics import ARCHIVE, BACKFILL, CAMERA_STATE, ENCODE, INGEST_STATE, KEYFRAME, POSE_UPDATE
 from services.ingest import core
 from services.ingest.sources import Source, SourceError, open_source
 from services.runtime.service import Identity, Output, Service
@@ -51,6 +52,8 @@ def step(state: core.State, message: Message, cfg: core.Config) -> Iterator[Outp
             yield from core.encoded(state, message)
         case core.Correction():
             yield from core.announce(state, message)
+        case Backfill():
+            yield from core.backfill(state, message)
         case PoseUpdate():
             core.correct(state, message)
         case core.EndOfSource():
@@ -60,7 +63,7 @@ def step(state: core.State, message: Message, cfg: core.Config) -> Iterator[Outp
 
 
 async def drive(port: Port, cfg: core.Config) -> None:
-    """Feed the source's frames, paced by their stamps or by the pipeline's room. Raises SourceError."""
+    """Feed the source's frames, paced by their stamps, by the pipeline's room, or by both. Raises SourceError."""
     if not cfg.source:
         log.info("no source is configured: set ingest.source to a dataset folder or an MCAP log")
         return
@@ -69,8 +72,10 @@ async def drive(port: Port, cfg: core.Config) -> None:
     events = source.events()
     pace = Pace(cfg.speed)
     while (event := await asyncio.to_thread(next, events, None)) is not None:
-        waiting = pace.until_due(event) if cfg.speed > 0 else port.room(cfg.window)
-        if await _stopped_while(port, waiting):
+        if cfg.speed > 0 and await _stopped_while(port, pace.until_due(event)):
+            return
+        slows_down = cfg.speed <= 0 or cfg.when_behind == "wait"
+        if slows_down and await _stopped_while(port, port.room(cfg.window)):
             return
         await port.consume(event)
     await port.consume(core.EndOfSource())
@@ -122,9 +127,10 @@ SERVICE = Service(
     config=core.Config,
     init=init,
     step=step,
-    reads=(POSE_UPDATE,),
+    reads=(POSE_UPDATE, BACKFILL),
     writes=(KEYFRAME, POSE_UPDATE, CAMERA_STATE, INGEST_STATE, ENCODE),
     answers={ARCHIVE: core.archived},
     drive=drive,
+    job_limit=lambda cfg: cfg.window if cfg.when_behind == "skip" and cfg.speed > 0 else 0,
     tick_s=PROGRESS_S,
 )

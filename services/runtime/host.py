@@ -15,7 +15,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from statistics import quantiles
-from typing import Any
+from typing import Any, cast
 
 import msgspec
 import psutil
@@ -26,7 +26,7 @@ from schemas.topics import JOURNAL, Query, Topic, alive_key, status_key, worker_
 from services.runtime.bus import Answer, Bus, Request, Sample, pack_header
 from services.runtime.flow import Progress
 from services.runtime.inbox import Inbox
-from services.runtime.jobs import CREDITS, JobPool
+from services.runtime.jobs import CREDITS, Ended, JobPool
 from services.runtime.service import Ask, Identity, Service
 
 log = logging.getLogger(__name__)
@@ -57,6 +57,7 @@ class Work:
     """A job to do for a dispatcher."""
 
     request: Request
+    message: Message | None  # None = malformed
 
 
 @dataclass(frozen=True)
@@ -148,14 +149,15 @@ class Host:
         self.bus.serve(status_key(service.name, self.identity.instance), self._answer_status)
         for topic in service.writes:
             if topic.delivery == "job":
-                self._pools[topic] = JobPool(self.bus, topic, time.monotonic, self._job_done(topic))
+                limit = service.job_limit(self.cfg)
+                self._pools[topic] = JobPool(self.bus, topic, time.monotonic, self._job_ended(topic), limit=limit)
         for topic in service.reads:
             self.bus.subscribe(topic, topic.pattern(robot), self.inbox.offer, self._missed)
         if service.drive is not None:
             self.bus.subscribe(JOURNAL, JOURNAL.pattern(robot), self._saw_consumed, lambda topic, number: None)
             self.bus.watch(alive_key("*", "*"), self._saw_alive)
         if service.job is not None:
-            run_key, live_key = worker_keys(service.job, self.identity.instance)
+            run_key, live_key = worker_keys(service.job, self.identity.instance, service.job_group(self.cfg))
             self.bus.serve(run_key, self._offer_work)
             self.bus.announce(live_key)
         self.bus.announce(alive_key(service.name, self.identity.instance))
@@ -241,12 +243,14 @@ class Host:
     def _handle_work(self, work: Work) -> None:
         job = self.service.job
         assert job is not None
-        message = self._decoded(job.type, work.request.payload, job.name, job.key, "")
+        message = work.message
         self._slots.release()
         if message is None:
             work.request.refuse("malformed")
             return
         self.inbox.of(job.name).consumed += 1
+        if self.service.prepare is not None:
+            self.service.prepare(self._state, [message, *self._waiting_jobs()], self.cfg)
         try:
             self._step(message)
         except Exception as error:  # jobs are independent of each other: one that cannot be done ends no worker
@@ -261,10 +265,18 @@ class Host:
         self.inbox.put(Question(query, request), first=True)
 
     def _offer_work(self, request: Request) -> None:
+        job = self.service.job
+        assert job is not None
         if self._slots.acquire(blocking=False):
-            self.inbox.put(Work(request))
+            message = self._decoded(job.type, request.payload, job.name, job.key, "")
+            self.inbox.put(Work(request, message))
         else:
             request.refuse("busy")
+
+    def _waiting_jobs(self) -> list[Message]:
+        """Jobs taken in and not begun, oldest first."""
+        waiting = (item.message for item in self.inbox.waiting() if isinstance(item, Work))
+        return [message for message in waiting if message is not None]
 
     def _decoded(self, kind: type[Message], payload: bytes, name: str, key: str, writer: str) -> Message | None:
         """The message, or None after counting and logging that it is malformed."""
@@ -294,7 +306,8 @@ class Host:
         self.inbox.of(topic.name).published += 1
         if topic.delivery == "job":
             job_id = (message.robot, message.frame_id)  # type: ignore[attr-defined]
-            self._pools[topic].submit(job_id, encode(message))
+            group = getattr(message, "space", "")
+            self._pools[topic].submit(job_id, encode(message), group, later=bool(group))
         else:
             self._put(topic, message)
 
@@ -341,14 +354,18 @@ class Host:
         if not self.stopping.is_set():
             self._loop.run_in_executor(None, self._call, ask)
 
-    def _job_done(self, topic: Topic) -> Callable[[Any, str, int, str], None]:
-        def done(job_id: Any, worker: str, attempts: int, error: str) -> None:
-            if error:
-                log.error("job given up", extra={"topic": topic.name, "job": str(job_id), "reason": error})
-            self.inbox.put(JobDone(topic=topic.name, frame_id=job_id[1], worker=worker, attempts=attempts, error=error))
+    def _job_ended(self, topic: Topic) -> Callable[[Ended], None]:
+        def ended(job: Ended) -> None:
+            if job.error:
+                log.warning("job given up", extra={"topic": topic.name, "job": str(job.id), "reason": job.error})
+            _, frame_id = cast(tuple[str, int], job.id)
+            done = JobDone(
+                topic=topic.name, frame_id=frame_id, worker=job.worker, attempts=job.attempts, error=job.error
+            )
+            self.inbox.put(done)
             self._progress.changed(self._loop)
 
-        return done
+        return ended
 
     async def _tick(self, period_s: float) -> None:
         while True:

@@ -78,6 +78,11 @@ class Inbox:
         with self._lock:
             return self._waiting.popitem(last=False)[1] if self._waiting else None
 
+    def waiting(self) -> list[Any]:
+        """What waits, oldest first."""
+        with self._lock:
+            return list(self._waiting.values())
+
     def __len__(self) -> int:
         return len(self._waiting)
 

@@ -56,6 +56,9 @@ class Service:
     answers: Mapping[Query, Callable[[Any, Any, Any], Message]] = field(default_factory=dict)
     asks: tuple[Query, ...] = ()
     job: Topic | None = None  # the pool this service works for
+    job_group: Callable[[Any], str] = lambda cfg: ""  # workers of one group do the same work
+    prepare: Callable[[Any, list[Message], Any], None] | None = None  # told of jobs that wait; must not block
+    job_limit: Callable[[Any], int] = lambda cfg: 0  # of jobs written: how many may wait before the oldest is skipped
     tick_s: float | None = None
     drive: Callable[[Any, Any], Awaitable[None]] | None = None
     key_fields: Callable[[Any], dict[str, str]] = lambda cfg: {}  # config values that appear in keys of `answers`

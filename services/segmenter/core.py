@@ -5,7 +5,7 @@ beliefs, and requests for what is missing (a place snapshot, text embeddings, a 
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import msgspec
@@ -28,7 +28,7 @@ from schemas.regions import (
 )
 from schemas.status import Tick
 from services.deltas import Follower
-from services.segmenter import beliefs, descriptors, geometry, publication, regions, swap
+from services.segmenter import beliefs, descriptors, geometry, publication, regions, spaces, swap
 from services.segmenter.balance import BalanceConfig, label_bias
 from services.segmenter.experts import REGISTRY, Vote
 from services.segmenter.experts.context import Context, ObjectSettings, ObjectView, standardised
@@ -36,6 +36,7 @@ from services.segmenter.geometry import GeometryConfig
 from services.segmenter.graph import PlaceGraph, apply
 from services.segmenter.incremental import Settings, Solver
 from services.segmenter.places import UNLABELLED, Places
+from services.segmenter.spaces import Spaces, SpacesConfig
 
 BIAS_SAMPLE = 4096  # places that stand for all when the map's bias is computed
 
@@ -43,7 +44,8 @@ BIAS_SAMPLE = 4096  # places that stand for all when the map's bias is computed
 class Config(msgspec.Struct, frozen=True, kw_only=True):
     """Settings of the segmenter. Those marked (paper) are published values; the others were chosen here."""
 
-    space: str = "conse/efficientnet-lite2/minilm-l6-v2"  # embedding space of the evidence; other pyramids are ignored
+    space: str = "conse/efficientnet-lite2/minilm-l6-v2"  # embedding space at the start; another may take over
+    spaces: SpacesConfig = msgspec.field(default_factory=SpacesConfig)
     kernel: descriptors.KernelConfig = msgspec.field(default_factory=descriptors.KernelConfig)
     default_query_radius_m: float = 0.75  # r_Q until a prior is in force (paper)
     experts: dict[str, float] = msgspec.field(  # names, with their reliabilities lambda (paper)
@@ -121,6 +123,7 @@ class State:
     weights: np.ndarray = field(default_factory=lambda: np.zeros(0))  # (edge,) w_dist
     archive: descriptors.Archive = field(default_factory=descriptors.Archive)
     evidence: descriptors.Evidence = field(default_factory=descriptors.Evidence)
+    spaces: Spaces = field(default_factory=Spaces)
     query_radius_m: float = 0.0
     poses: dict[int, np.ndarray] = field(default_factory=dict)  # corrected world_from_camera by frame id
     pose_revisions: dict[int, int] = field(default_factory=dict)  # of the newest correction by the epoch of its writer
@@ -128,7 +131,7 @@ class State:
     objects: ObjectView = field(default_factory=ObjectView)
     task: Task | None = None
     priors: dict[str, Prior] = field(default_factory=dict)  # by digest, latest arrival last
-    texts: dict[tuple[str, ...], TextEmbeddings] = field(default_factory=dict)  # by concepts
+    texts: dict[tuple[str, ...], TextEmbeddings] = field(default_factory=dict)  # by space and concepts
     alignment: Alignment | None = None
     solver: Solver = field(default_factory=Solver)
     bias: np.ndarray = field(default_factory=lambda: np.zeros(0))  # (label,) of the visual scores in this map
@@ -140,7 +143,7 @@ class State:
     ledger: publication.Ledger = field(default_factory=publication.Ledger)
     dirty: bool = False  # something changed since the last solution
     asked_snapshot: bool = False
-    asked_text: TextRequest | None = None
+    asked_text: dict[str, TextRequest] = field(default_factory=dict)  # by space
     asked_prior: bool = False
     asked_task: bool = False
     waited_ticks: int = 0
@@ -149,7 +152,13 @@ class State:
 
 def empty(cfg: Config, robot: str, epoch: int) -> State:
     """The state before the first message."""
-    return State(robot=robot, epoch=epoch, query_radius_m=cfg.default_query_radius_m, solver=Solver(cfg.solver))
+    return State(
+        robot=robot,
+        epoch=epoch,
+        query_radius_m=cfg.default_query_radius_m,
+        spaces=Spaces(cfg.space),
+        solver=Solver(cfg.solver),
+    )
 
 
 def update(state: State, message: Message, cfg: Config) -> Iterator[Message]:
@@ -176,6 +185,9 @@ def update(state: State, message: Message, cfg: Config) -> Iterator[Message]:
             take_text(state, message, cfg)
         case Tick():
             state.waited_ticks += 1
+            spaces.tick(state.spaces)
+            yield from spaces.questions(state.spaces, state.archive, state.robot, cfg.spaces)
+            yield from follow_spaces(state, cfg)
     switched = align(state, cfg)
     yield from _requests(state, cfg)
     if switched or (state.dirty and isinstance(message, Pyramid | Tick)):
@@ -209,12 +221,13 @@ def follow_places(state: State, delta: PlaceDelta, cfg: Config) -> None:
 
 
 def observe(state: State, pyramid: Pyramid, cfg: Config) -> None:
-    """Integrate one frame into the places it sees; a repeated frame or another space is ignored."""
-    if pyramid.space != cfg.space:
-        state.ignored_pyramids += 1
-        return
+    """Integrate one frame into the places it sees; a repeated frame is ignored, one of another space kept apart."""
     if pyramid.frame_id in state.poses:
         pyramid = msgspec.structs.replace(pyramid, world_from_camera=state.poses[pyramid.frame_id])
+    if pyramid.space != state.spaces.force:
+        state.ignored_pyramids += not spaces.hear(state.spaces, pyramid, state.archive, cfg.spaces)
+        return
+    spaces.heard_in_force(state.spaces)
     frame = descriptors.compact(pyramid)
     if not (state.evidence.fits(frame) and state.archive.add(pyramid.frame_id, frame)):
         state.ignored_pyramids += 1
@@ -237,11 +250,39 @@ def correct_poses(state: State, poses: PoseUpdate, cfg: Config) -> None:
     affected = np.zeros(len(state.graph.ids), dtype=bool)
     for frame_id, world_from_camera in zip(poses.frame_ids.tolist(), poses.world_from_camera, strict=True):
         state.poses[frame_id] = world_from_camera.copy()
+        spaces.move(state.spaces, frame_id, world_from_camera)
         for frame in state.archive.move(frame_id, world_from_camera) or ():
             affected[descriptors.visible(frame, state.graph.positions_m, cfg.kernel)] = True
     if affected.any():
         _reintegrate(state, np.flatnonzero(affected), cfg)
         state.dirty = True
+
+
+def follow_spaces(state: State, cfg: Config) -> Iterator[TextRequest]:
+    """Put another embedding space in force when it covers the map; labels stay until they are found anew.
+
+    Its concepts are asked for first, if a prior is in force.
+    """
+    name = spaces.successor(state.spaces, state.archive, cfg.spaces)
+    if name is None:
+        return
+    text = None
+    if state.alignment is not None:
+        concepts = region_concepts(state.alignment.prior, cfg.object_phrases)
+        text = state.texts.get(_concept_key(name, concepts))
+        if text is None:
+            yield from _text_request(state, name, concepts)
+            return
+    evidence, archive = state.evidence.blank(), state.spaces.rivals[name].archive
+    targets = descriptors.Targets(state.places.slots, state.graph.positions_m)
+    descriptors.integrate_all(evidence, archive, targets, state.query_radius_m, cfg.kernel)
+    if not spaces.covers(evidence, state.evidence, state.places.slots, cfg.spaces):
+        spaces.refuse(state.spaces, name)
+        return
+    state.archive, state.evidence = spaces.succeed(state.spaces, name), evidence
+    state.places.stale[:], state.dirty = True, True
+    if state.alignment is not None and text is not None:
+        state.alignment = replace(state.alignment, text=text)
 
 
 def take_task(state: State, task: Task) -> None:
@@ -262,10 +303,10 @@ def remember_prior(state: State, prior: Prior, cfg: Config) -> None:
 
 
 def take_text(state: State, text: TextEmbeddings, cfg: Config) -> None:
-    """The reply to the one text request under way; it does not say which, hence never two at once."""
-    asked, state.asked_text = state.asked_text, None
-    if asked is not None and text.space == asked.space and len(text.embeddings) == len(asked.concepts):
-        state.texts[_concept_key(asked.concepts)] = copied(text)
+    """The reply to the text request under way in its space; it does not say which, hence never two at once."""
+    asked = state.asked_text.pop(text.space, None)
+    if asked is not None and len(text.embeddings) == len(asked.concepts):
+        state.texts[_concept_key(text.space, asked.concepts)] = copied(text)
         while len(state.texts) > cfg.remembered_priors:
             del state.texts[next(iter(state.texts))]
 
@@ -284,7 +325,7 @@ def align(state: State, cfg: Config) -> bool:
     if wanted is None or (state.alignment is not None and state.alignment.digest == wanted[0]):
         return False
     digest, prior = wanted
-    text = state.texts.get(_concept_key(region_concepts(prior, cfg.object_phrases)))
+    text = state.texts.get(_concept_key(state.spaces.force, region_concepts(prior, cfg.object_phrases)))
     if text is None:
         return False
     former = state.alignment
@@ -501,7 +542,7 @@ def publish(state: State, events: list[RegionEvent], everything: bool, cfg: Conf
         prior_digest=state.alignment.digest,
         environment=prior.environment,
         task=prior.task,
-        space=cfg.space if len(state.archive) else "",
+        space=state.spaces.force if len(state.archive) else "",
         labels=tuple(state.alignment.labels),
         energy=swap.energy(field_of(state), places.labels),
     )
@@ -660,9 +701,13 @@ def _requests(state: State, cfg: Config) -> Iterator[Message]:
     if state.alignment is not None and state.alignment.digest == wanted[0]:
         return
     concepts = region_concepts(wanted[1], cfg.object_phrases)
-    if state.asked_text is None:
-        state.asked_text = TextRequest(space=cfg.space, concepts=concepts)
-        yield state.asked_text
+    yield from _text_request(state, state.spaces.force, concepts)
+
+
+def _text_request(state: State, space: str, concepts: list[list[str]]) -> Iterator[TextRequest]:
+    if space not in state.asked_text:
+        state.asked_text[space] = TextRequest(space=space, concepts=concepts)
+        yield state.asked_text[space]
 
 
 def _reintegrate(state: State, rows: np.ndarray, cfg: Config) -> None:
@@ -686,5 +731,5 @@ def with_neighbours(graph: PlaceGraph, mask: np.ndarray) -> np.ndarray:
     return grown
 
 
-def _concept_key(concepts: list[list[str]]) -> tuple[str, ...]:
-    return tuple("\n".join(phrases) for phrases in concepts)
+def _concept_key(space: str, concepts: list[list[str]]) -> tuple[str, ...]:
+    return (space, *("\n".join(phrases) for phrases in concepts))

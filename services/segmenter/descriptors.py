@@ -4,6 +4,7 @@ All pyramids stay in an archive, without their images, so that new or moved plac
 radius are integrated over every frame as if they had been there from the start.
 """
 
+from collections.abc import Set
 from typing import NamedTuple
 
 import msgspec
@@ -147,6 +148,13 @@ class Evidence:
         """Slots of places."""
         return np.fromiter((self.slots[place] for place in place_ids), dtype=np.int64, count=len(place_ids))
 
+    def blank(self) -> "Evidence":
+        """The same places in the same slots, nothing observed yet."""
+        other = Evidence()
+        other.slots, other._free, other._used = dict(self.slots), list(self._free), self._used
+        other._reserve(self._used, 0)
+        return other
+
     def observe(self, slots: np.ndarray, frame: Frame, weights: np.ndarray, trust: np.ndarray) -> None:
         """Add one frame's observation of the places in `slots` (eqs. single_observation_feature,
         temporal_fusion_places)."""
@@ -206,6 +214,11 @@ class Archive:
             return None
         self.frames[index] = before._replace(camera_from_world=camera_from_world)
         return before, self.frames[index]
+
+    @property
+    def frame_ids(self) -> Set[int]:
+        """Numbers of the frames that are here."""
+        return self._index.keys()
 
     def __len__(self) -> int:
         return len(self.frames)

@@ -83,7 +83,8 @@ class Ledger:
         sent = np.flatnonzero(~self.told[slots] | self._differs(slots, now, tolerance))
         upserts = [region for _, region in sorted(regions.items()) if self.regions.get(region.id) != region]
         gone_regions = sorted(self.regions.keys() - regions.keys())
-        if not (everything or len(sent) or upserts or gone_regions or self.gone or events):
+        moved_on = self.source is not None and source.space != self.source.space
+        if not (everything or moved_on or len(sent) or upserts or gone_regions or self.gone or events):
             return None
         for known, news in zip(self.beliefs, now, strict=True):
             known[slots[sent]] = news[sent]

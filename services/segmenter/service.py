@@ -3,11 +3,12 @@
 from collections.abc import Iterator
 
 from schemas.codec import Message
-from schemas.features import TextRequest
+from schemas.features import Backfill, TextRequest
 from schemas.places import SnapshotRequest
 from schemas.priors import PriorRequest, TaskRequest
 from schemas.regions import PosteriorReply, PosteriorRequest, RegionDelta
 from schemas.topics import (
+    BACKFILL,
     PLACE_DELTA,
     PLACE_SNAPSHOT,
     POSE_UPDATE,
@@ -30,6 +31,7 @@ QUESTIONS = {
     PriorRequest: PRIORS,
     TaskRequest: TASK_IN_FORCE,
 }
+PUBLISHED = {RegionDelta: REGION_DELTA, Backfill: BACKFILL}
 
 
 def init(cfg: core.Config, identity: Identity) -> core.State:
@@ -40,7 +42,8 @@ def init(cfg: core.Config, identity: Identity) -> core.State:
 def step(state: core.State, message: Message, cfg: core.Config) -> Iterator[Output]:
     """One input; regions go to their topic, requests become questions."""
     for output in core.update(state, message, cfg):
-        yield (REGION_DELTA, output) if isinstance(output, RegionDelta) else Ask(QUESTIONS[type(output)], output)
+        topic = PUBLISHED.get(type(output))
+        yield (topic, output) if topic is not None else Ask(QUESTIONS[type(output)], output)
 
 
 def answer_snapshot(state: core.State, request: SnapshotRequest, cfg: core.Config) -> RegionDelta:
@@ -61,7 +64,7 @@ SERVICE = Service(
     init=init,
     step=step,
     reads=(PLACE_DELTA, PYRAMID, POSE_UPDATE, TASK, PRIOR),
-    writes=(REGION_DELTA,),
+    writes=(REGION_DELTA, BACKFILL),
     asks=(PLACE_SNAPSHOT, TEXT, PRIORS, TASK_IN_FORCE),
     answers={REGION_SNAPSHOT: answer_snapshot, POSTERIOR: answer_posterior},
     tick_s=0.5,
