@@ -33,6 +33,7 @@ from services.segmenter.maxflow import CUTS
 from services.segmenter.messages import empty_messages, lay_down, run_pass, take_up
 
 Expired = Callable[[], bool]
+FIRST_PROPOSAL = 2  # number of the first pass whose labels are worth a look
 
 
 class Settings(msgspec.Struct, frozen=True, kw_only=True):
@@ -42,11 +43,12 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True):
     compiled_up_to: int = 2_000  # free places in a cut that compiled code solves itself
     passes: int = 12  # of message passing, there and back counted as two
     reach: int = 3  # steps from a changed place within which message passing may propose labels
+    near: int = 150  # places of a swap's local problem
     chunk: int = 20_000  # visits of places between two looks at the clock
 
     def __post_init__(self) -> None:
-        if not (self.passes >= 0 and self.reach >= 0 and self.chunk > 0 and self.compiled_up_to >= 0):
-            raise ValueError("passes, reach, chunk or compiled_up_to is out of range")
+        if not (self.passes >= 0 and self.reach >= 0 and self.near > 0 and self.chunk > 0 and self.compiled_up_to >= 0):
+            raise ValueError("passes, reach, near, chunk or compiled_up_to is out of range")
 
 
 def never() -> bool:
@@ -64,12 +66,12 @@ class Solver:
         self._graph: Adjacency = adjacency(0, np.zeros((0, 2)), np.zeros(0))
         self._unary = np.zeros((0, 0))
         self._work = moves.empty_work(0, 0, 0)
-        self._waiting = np.zeros(0, np.int64)  # rows around which message passing has yet to propose
+        self._unproposed = np.zeros(0, np.int64)  # rows around which message passing has yet to propose
 
     @property
     def pending(self) -> int:
         """Places at which a swap is still to be tried, or around which labels are to be proposed."""
-        return 0 if self._field is None else int(self._work.cursor[moves.COUNT]) + len(self._waiting)
+        return moves.waiting(self._work, moves.DEEP) + len(self._unproposed)
 
     def update(
         self,
@@ -80,20 +82,23 @@ class Solver:
         dirty: np.ndarray | None = None,
         previous: np.ndarray | None = None,
     ) -> np.ndarray:
-        """Labels (place,) for `field`, starting from `labels`; see the module."""
+        """Labels (place,) for `field`, starting from `labels`, by work near the change only; see the module."""
         self.take(field, labels, dirty=dirty, previous=previous)
-        return self.drain(expired)
+        self._propose(expired)
+        self._swap(moves.NEAR, expired)
+        return self.labels.copy()
 
     def drain(self, expired: Expired = never) -> np.ndarray:
-        """Go on with what is pending; the labels (place,) so far."""
-        if self._field is None:
-            return self.labels.copy()
+        """Go on with what is pending, on the whole field; the labels (place,) so far."""
         self._propose(expired)
-        settings, arrays = self.settings, (self._graph, self._unary, self._pairwise, self.labels, self._work)
-        cut = CUTS[settings.min_cut]
-        while self._work.cursor[moves.COUNT] and not expired():
-            moves.run_swaps(*arrays, cut, settings.compiled_up_to, settings.chunk, self._least_gain)
+        self._swap(moves.DEEP, expired)
         return self.labels.copy()
+
+    def _swap(self, depth: int, expired: Expired) -> None:
+        settings, arrays = self.settings, (self._graph, self._unary, self._pairwise, self.labels, self._work)
+        limits = moves.Limits(depth, settings.near, settings.compiled_up_to, settings.chunk, self._least_gain)
+        while moves.waiting(self._work, depth) and not expired():
+            moves.run_swaps(*arrays, CUTS[settings.min_cut], limits)
 
     def take(
         self,
@@ -121,15 +126,15 @@ class Solver:
             dirty = changed_rows(self._graph, self._unary, graph, unary, origin)
         elif dirty.dtype == np.bool_:
             dirty = np.flatnonzero(dirty)
-        waiting = self._waiting
+        waiting = self._unproposed
         if not same_edges:
             waiting = self._carry(before, origin, count, field, graph)
         self._graph, self._unary, self._field = graph, unary, field
         self._pairwise = np.ascontiguousarray(field.pairwise, dtype=np.float64)
         self.labels = np.array(labels, dtype=np.int64)
         _label_new(self.labels, graph, unary, self._pairwise)
-        moves.flag_all(dirty, self._work)
-        self._waiting = np.union1d(waiting, dirty).astype(np.int64)
+        moves.flag_all(dirty, moves.NEAR if before is not None else moves.DEEP, self._work)
+        self._unproposed = np.union1d(waiting, dirty).astype(np.int64)
         self._least_gain = least_gain(field)
 
     def _carry(
@@ -144,38 +149,33 @@ class Solver:
             return np.zeros(0, np.int64)
         known = np.flatnonzero(origin >= 0)
         self._work.pending[known] = old_work.pending[origin[known]]
-        moves.enqueue_all(np.flatnonzero(self._work.pending.any(axis=1)), self._work)
-        waiting = np.zeros(len(old_work.queued), np.bool_)
-        waiting[self._waiting] = True
+        moves.requeue(self._work)
+        waiting = np.zeros(len(old_work.mark), np.bool_)
+        waiting[self._unproposed] = True
         return known[waiting[origin[known]]]
 
     def _propose(self, expired: Expired) -> None:
         """Message passing around the waiting places; takes the parts of its proposals that lower the energy."""
-        if not len(self._waiting) or not self.settings.passes:
-            self._waiting = self._waiting[:0]
+        if not len(self._unproposed) or not self.settings.passes:
+            self._unproposed = self._unproposed[:0]
             return
-        graph, messages = self._graph, self._messages
-        rows = _ball(self._waiting, self.settings.reach, graph, messages.inside)
-        messages.pairwise[:, : len(self._pairwise)] = self._pairwise
-        take_up(rows, graph, self._unary, self.labels, messages)
+        graph, messages, labels = self._graph, self._messages, self.labels
+        rows = _ball(self._unproposed, self.settings.reach, graph, messages.inside)
+        messages.pairwise[: len(self._pairwise), : len(self._pairwise)] = self._pairwise
+        take_up(rows, graph, self._unary, labels, messages)
+        before, done = labels[rows], False
         for number in range(self.settings.passes):
             if expired():
                 break
             run_pass(rows, number % 2 == 0, graph, messages, True)
-            if number >= 2 or number == self.settings.passes - 1:
-                _fuse(
-                    rows,
-                    messages.proposed,
-                    self.labels,
-                    graph,
-                    self._unary,
-                    self._pairwise,
-                    self._work,
-                    self._least_gain,
-                )
-        else:
-            self._waiting = self._waiting[:0]
+            done = number == self.settings.passes - 1
+            if done or number >= FIRST_PROPOSAL:
+                scene = (graph, self._unary, self._pairwise, self._work.mark)
+                fuse(rows, messages.proposed, labels, *scene, self._least_gain)
         lay_down(rows, messages)
+        moves.flag_around(rows[labels[rows] != before], moves.NEAR, graph, self._work)
+        if done:
+            self._unproposed = self._unproposed[:0]
 
 
 @njit(cache=True, nogil=True)
@@ -255,15 +255,15 @@ def _ball(centers, reach, graph, inside):  # noqa: ANN001, ANN202
 
 
 @njit(cache=True, nogil=True)
-def _fuse(rows, proposed, labels, graph, unary, pairwise, work, least_gain):  # noqa: PLR0917, ANN001, ANN202
+def fuse(rows, proposed, labels, graph, unary, pairwise, mark, least_gain):  # noqa: PLR0917, ANN001, ANN201
     """Take each connected set of places that `proposed` labels otherwise if that alone gains more than `least_gain`.
 
-    Sets that do not touch each other change the energy independently, so each is decided by itself.
+    Sets that do not touch each other change the energy independently, so each is decided by itself. `mark` is scratch,
+    all zero before and after.
     """
+    starts, neighbours, weights = graph.starts, graph.neighbours, graph.weights
     costs = np.empty(unary.shape[1])
-    members = np.empty(len(rows), np.int64)
-    former = np.empty(len(rows), np.int64)
-    mark = work.mark
+    members, former = np.empty(len(rows), np.int64), np.empty(len(rows), np.int64)
     for row in rows:
         mark[row] = 1 if proposed[row] != labels[row] else 0
     for row in rows:
@@ -273,19 +273,17 @@ def _fuse(rows, proposed, labels, graph, unary, pairwise, work, least_gain):  # 
         mark[row] = 0
         while index < count:
             place = members[index]
-            for arc in range(graph.starts[place], graph.starts[place + 1]):
-                neighbour = graph.neighbours[arc]
+            for arc in range(starts[place], starts[place + 1]):
+                neighbour = neighbours[arc]
                 if mark[neighbour] == 1:
                     mark[neighbour] = 0
                     members[count] = neighbour
                     count += 1
-            moves.conditional(place, graph, unary, pairwise, labels, costs)
+            moves.conditional(place, starts, neighbours, weights, unary, pairwise, labels, costs)
             gain += costs[labels[place]] - costs[proposed[place]]
             former[index] = labels[place]
             labels[place] = proposed[place]
             index += 1
-        if gain > least_gain:
-            moves.flag_around(members[:count], graph, work)
-        else:
+        if gain <= least_gain:
             for index in range(count):
                 labels[members[index]] = former[index]

@@ -4,7 +4,8 @@ Messages run along the order of the rows and back. Each pass yields a labelling 
 decided predecessors and the messages of its successors make cheapest), and the pass back a lower bound on the energy of
 every labelling. Restricted to some of the places, the others keep their labels and only their costs are felt.
 
-Label arrays are padded to a multiple of eight, so that the inner loops are whole vector operations.
+Label arrays are padded with labels of cost FAR to a multiple of eight, so that the inner loops are whole vector
+operations.
 """
 
 from typing import NamedTuple
@@ -13,6 +14,7 @@ import numpy as np
 from numba import njit
 
 VECTOR = 8
+UNROLLED = 4  # labels that one step of the inner loop takes
 FAR = 1e30  # cost of a label that is not there
 FAST = {"nnan", "nsz", "contract"}  # no NaN occurs; these let minima and products be vectorised
 
@@ -22,7 +24,7 @@ class Messages(NamedTuple):
 
     costs: np.ndarray  # (place, padded label) unary, with the costs of fixed neighbours, of the places in hand
     incoming: np.ndarray  # (arc, padded label) what the arc's far end tells its near end
-    pairwise: np.ndarray  # (label, padded label) symmetric
+    pairwise: np.ndarray  # (label in whole steps of UNROLLED, padded label)
     inside: np.ndarray  # (place,) bool: in hand
     proposed: np.ndarray  # (place,) int64 the labelling of the last pass
 
@@ -31,8 +33,8 @@ def empty_messages(places: int, arcs: int, pairwise: np.ndarray, number: type) -
     """Room for messages; no place is in hand yet."""
     labels = len(pairwise)
     padded = -(-labels // VECTOR) * VECTOR
-    square: np.ndarray = np.zeros((labels, padded), number)
-    square[:, :labels] = pairwise
+    square: np.ndarray = np.zeros((-(-labels // UNROLLED) * UNROLLED, padded), number)
+    square[:labels, :labels] = pairwise
     return Messages(
         costs=np.empty((places, padded), number),
         incoming=np.empty((arcs, padded), number),
@@ -81,11 +83,8 @@ def run_pass(rows, forward, graph, messages, reweighted):  # noqa: ANN001, ANN20
     inside, proposed = messages.inside, messages.proposed
     count, padded = pairwise.shape
     number = costs.dtype.type
-    known, open_, decided = (
-        np.empty(padded, costs.dtype),
-        np.empty(padded, costs.dtype),
-        np.empty(padded, costs.dtype),
-    )
+    known, open_ = np.empty(padded, costs.dtype), np.empty(padded, costs.dtype)
+    decided, told = np.empty(padded, costs.dtype), np.empty(padded, costs.dtype)
     bound = 0.0
     for step in range(len(rows)):
         place = rows[step] if forward else rows[len(rows) - 1 - step]
@@ -122,17 +121,20 @@ def run_pass(rows, forward, graph, messages, reweighted):  # noqa: ANN001, ANN20
             if not inside[neighbour] or (neighbour < place) == forward:
                 continue
             weight, twin, least = number(weights[arc]), twins[arc], number(FAR)
+            for label in range(padded):
+                told[label] = known[label] - incoming[arc, label]
+                incoming[twin, label] = FAR
+            for other in range(0, count, UNROLLED):
+                told_0, told_1, told_2, told_3 = told[other], told[other + 1], told[other + 2], told[other + 3]
+                for label in range(padded):
+                    low = min(told_0 + weight * pairwise[other, label], told_1 + weight * pairwise[other + 1, label])
+                    high = min(
+                        told_2 + weight * pairwise[other + 2, label], told_3 + weight * pairwise[other + 3, label]
+                    )
+                    incoming[twin, label] = min(incoming[twin, label], min(low, high))
             for label in range(count):
-                decided[label] = known[label] - incoming[arc, label]
-            for label in range(count, padded):
-                decided[label] = FAR
-            for label in range(count):
-                told = number(FAR)
-                for other in range(padded):
-                    told = min(told, decided[other] + weight * pairwise[label, other])
-                incoming[twin, label] = told
-                least = min(least, told)
-            for label in range(count):
+                least = min(least, incoming[twin, label])
+            for label in range(padded):
                 incoming[twin, label] -= least
             bound += least
     return bound

@@ -1,0 +1,1 @@
+"""Measurements that fill a module of their own."""
