@@ -9,11 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
-import numpy as np
 import zenoh
-from scipy.spatial import cKDTree
 
 from deploy import bench_segmenter
+from deploy.benches.swap import swap_bench
 from schemas.codec import decode, encode
 from schemas.frames import Keyframe
 from schemas.priors import PriorRequest, Task
@@ -23,10 +22,8 @@ from services.registry import BY_NAME
 from services.runtime.bus import Sample, pack_header
 from services.runtime.service import Ask, Identity
 from services.runtime.zenoh_bus import ZenohBus, client_config, free_endpoint, open_router
-from services.segmenter import swap
 
 SAMPLE = Path(__file__).parent / "sample" / "home.mcap"
-LABELS = 12
 
 
 def machine() -> dict[str, Any]:
@@ -77,44 +74,6 @@ def features() -> tuple[dict, dict]:
         crops += sum(len(pyramid.embeddings) for _, pyramid in outputs)
     seconds = time.perf_counter() - started_s
     return {"crops_per_s": crops / seconds, "ms_per_keyframe": 1e3 * seconds / len(keyframes)}, {"space": cfg.space}
-
-
-def random_field(nodes: int, rng: np.random.Generator) -> swap.Field:
-    """A field as place graphs have: points in a hall, edges to near ones, patches of labels, non-metric costs."""
-    side_m = np.sqrt(nodes) * 0.7
-    points_m = rng.uniform(0, side_m, (nodes, 2))
-    edges = cKDTree(points_m).query_pairs(1.2, output_type="ndarray")
-    centers_m = rng.uniform(0, side_m, (max(2, nodes // 40), 2))
-    truth = rng.integers(0, LABELS, len(centers_m))[cKDTree(centers_m).query(points_m)[1]]
-    unary = rng.gumbel(0, 1.0, (nodes, LABELS)) + 1.5
-    unary[np.arange(nodes), truth] -= 1.2
-    costs = -2 * np.log(rng.uniform(0.02, 1.0, (LABELS, LABELS)))
-    costs = np.triu(costs, 1) + np.triu(costs, 1).T
-    lengths_m = np.linalg.norm(points_m[edges[:, 0]] - points_m[edges[:, 1]], axis=1)
-    return swap.Field(unary=unary, edges=edges, weights=np.exp(-lengths_m / 2), pairwise=costs)
-
-
-def swap_cold() -> tuple[dict, dict]:
-    """Cold α-β-swap against gco-wrapper's on the same fields, in the same run."""
-    import gco
-
-    metrics: dict[str, float] = {}
-    for nodes in (500, 2_000, 10_000):
-        field = random_field(nodes, np.random.default_rng(nodes))
-        start = field.unary.argmin(axis=1)
-        started_s = time.perf_counter()
-        ours = swap.minimise(field, start)
-        seconds = time.perf_counter() - started_s
-        started_s = time.perf_counter()
-        theirs = gco.cut_general_graph(
-            field.edges, field.weights, field.unary, field.pairwise, n_iter=-1, algorithm="swap", init_labels=start
-        )
-        gco_seconds = time.perf_counter() - started_s
-        suffix = "" if nodes == 10_000 else f"_{nodes}"
-        metrics[f"cold_time_ratio_gco{suffix}"] = seconds / gco_seconds
-        metrics[f"cold_energy_ratio_gco{suffix}"] = swap.energy(field, ours) / swap.energy(field, np.asarray(theirs))
-        metrics[f"cold_seconds{suffix}"] = seconds
-    return metrics, {"labels": LABELS, "nodes": [500, 2_000, 10_000]}
 
 
 def bus() -> tuple[dict, dict]:
@@ -224,7 +183,7 @@ BENCHES: dict[str, Callable[[], tuple[dict, dict]]] = {
     "bus": bus,
     "places": places,
     "features": features,
-    "swap": swap_cold,
+    "swap": swap_bench,
     "segmenter": bench_segmenter.updates,
     "task": bench_segmenter.switch,
     "e2e": e2e,

@@ -39,6 +39,6 @@ def conditional_costs(field: Field, labels: np.ndarray) -> np.ndarray:
     return field.unary + weights @ field.pairwise[labels]
 
 
-def least_gain(field: Field) -> float:
-    """The smallest fall of the energy that counts as one."""
-    return RELATIVE_GAIN * (float(np.abs(field.unary).sum()) + 1.0)
+def least_gain(unary: np.ndarray) -> float:
+    """The smallest fall of the energy that counts as one, given the unary costs (place, label) that may take part."""
+    return RELATIVE_GAIN * (float(np.abs(unary).sum()) + 1.0)

@@ -42,7 +42,7 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True):
     min_cut: Literal["pymaxflow", "scipy"] = "pymaxflow"  # library for large cuts; PyMaxflow is under the GPL
     compiled_up_to: int = 2_000  # free places in a cut that compiled code solves itself
     passes: int = 12  # of message passing, there and back counted as two
-    reach: int = 3  # steps from a changed place within which message passing may propose labels
+    reach: int = 5  # steps from a changed place within which message passing may propose labels
     near: int = 150  # places of a swap's local problem
     chunk: int = 20_000  # visits of places between two looks at the clock
 
@@ -66,6 +66,7 @@ class Solver:
         self._graph: Adjacency = adjacency(0, np.zeros((0, 2)), np.zeros(0))
         self._unary = np.zeros((0, 0))
         self._work = moves.empty_work(0, 0, 0)
+        self._least_gain = 0.0
         self._unproposed = np.zeros(0, np.int64)  # rows around which message passing has yet to propose
 
     @property
@@ -135,7 +136,7 @@ class Solver:
         _label_new(self.labels, graph, unary, self._pairwise)
         moves.flag_all(dirty, moves.NEAR if before is not None else moves.DEEP, self._work)
         self._unproposed = np.union1d(waiting, dirty).astype(np.int64)
-        self._least_gain = least_gain(field)
+        self._least_gain = max(self._least_gain if before is not None else 0.0, least_gain(unary[dirty]))
 
     def _carry(
         self, before: Field | None, origin: np.ndarray | None, count: int, field: Field, graph: Adjacency

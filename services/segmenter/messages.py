@@ -131,7 +131,7 @@ def run_pass(rows, forward, graph, messages, reweighted):  # noqa: ANN001, ANN20
                     high = min(
                         told_2 + weight * pairwise[other + 2, label], told_3 + weight * pairwise[other + 3, label]
                     )
-                    incoming[twin, label] = min(incoming[twin, label], min(low, high))
+                    incoming[twin, label] = min(incoming[twin, label], low, high)
             for label in range(count):
                 least = min(least, incoming[twin, label])
             for label in range(padded):

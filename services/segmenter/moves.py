@@ -129,7 +129,7 @@ def flag_all(places, depth, work):  # noqa: ANN001, ANN201
 
 
 @njit(cache=True, nogil=True)
-def flag_around(places, depth, graph, work):  # noqa: PLR0917, ANN001, ANN201
+def flag_around(places, depth, graph, work):  # noqa: ANN001, ANN201
     """`flag` for each of `places` and its neighbours: what to do after its label was changed from outside."""
     for place in places:
         flag(place, depth, work)
@@ -328,11 +328,11 @@ def commit(graph, unary, pairwise, labels, work, limits):  # noqa: PLR0917, ANN0
 
 
 @njit(cache=True, nogil=True)
-def flag_others(place, alpha, beta, labels, work):  # noqa: PLR0917, ANN001, ANN201
+def flag_others(place, alpha, beta, labels, work):  # noqa: ANN001, ANN201
     """Flag a place after a swap of alpha and beta nearby, by which that same swap is the only one not to change."""
     kept_alpha, kept_beta = work.pending[place, alpha], work.pending[place, beta]
     flag(place, NEAR, work)
-    if labels[place] == alpha or labels[place] == beta:  # noqa: PLR1714 (compiled to two comparisons)
+    if labels[place] == alpha or labels[place] == beta:
         work.pending[place, alpha], work.pending[place, beta] = kept_alpha, kept_beta
 
 

@@ -17,4 +17,6 @@ def minimise(field: Field, labels: np.ndarray, settings: Settings | None = None)
     Message passing proposes a labelling for the whole field, which replaces `labels` wherever that lowers the energy;
     then swaps run until none is left that gains.
     """
-    return Solver(settings).update(field, labels, dirty=np.arange(len(labels)))
+    solver = Solver(settings)
+    solver.take(field, labels)
+    return solver.drain()
