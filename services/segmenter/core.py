@@ -473,7 +473,7 @@ def _segment(state: State, switched: bool, idle: bool, cfg: Config) -> Iterator[
         return
     evaluate_experts(state, idle or switched, cfg)
     hurried = cfg.budget_ms > 0 and not (idle or switched)
-    settle(state, Budget(cfg.budget_ms / cfg.look_ms if hurried else np.inf))
+    settle(state, Budget(cfg.budget_ms / cfg.look_ms if hurried else np.inf), whole=not hurried)
     changes = partition(state)
     believe(state, cfg)
     delta = publish(state, changes, switched or state.ledger.source is None, cfg)
@@ -482,8 +482,8 @@ def _segment(state: State, switched: bool, idle: bool, cfg: Config) -> Iterator[
         yield delta
 
 
-def settle(state: State, budget: Budget) -> None:
-    """Better labels around the places whose costs changed, and around those still waiting from former updates."""
+def settle(state: State, budget: Budget, whole: bool) -> None:
+    """Better labels around the places whose costs changed; with `whole`, until no swap on the whole field gains."""
     places, rows = state.places, np.arange(len(state.places.labels))
     same_rows = np.array_equal(places.solved, rows)
     labels = state.solver.update(
@@ -493,6 +493,8 @@ def settle(state: State, budget: Budget) -> None:
         dirty=np.flatnonzero(places.unsettled),
         previous=None if same_rows else places.solved,
     )
+    if whole:
+        labels = state.solver.drain(budget.expired)
     places.unbelieved |= with_neighbours(state.graph, labels != places.labels)
     places.labels, places.solved = labels, rows
     places.unsettled[:] = False
