@@ -21,14 +21,16 @@ from schemas.places import MapRequest, PlaceDelta, SnapshotRequest
 from schemas.topics import PLACE_DELTA, PLACE_SNAPSHOT, VOXEL_MAP
 from services.geometry import inside_polygon, pose_from_quaternion
 from services.place_graph import core, distance, images, links, service
+from services.place_graph.config import PRESETS, Config, preset
 from services.place_graph.grid import BLOCK, FAR_D2, FREE, OCCUPIED, UNKNOWN_D2, UNOBSERVED, Block, Box, VoxelGrid
+from services.runtime.config import resolve
 from services.runtime.service import Ask, Identity
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 CAMERA = Intrinsics(120, 120, 60.0, 60.0, 59.5, 59.5)
-CFG = core.Config()
-FEARLESS = core.Config(max_speed_m_s=0.0)  # believes every pose
-CFG_STRICT = core.Config(jump_slack_m=0.1, max_speed_m_s=0.01)
+CFG = Config()
+FEARLESS = Config(max_speed_m_s=0.0)  # believes every pose
+CFG_STRICT = Config(jump_slack_m=0.1, max_speed_m_s=0.01)
 FORWARD = (0.5, -0.5, 0.5, -0.5)  # camera z along world x, image upright
 HALF = np.sqrt(0.5)
 
@@ -448,7 +450,7 @@ def test_nothing_changes_when_the_same_views_come_again():
 
 
 def test_places_keep_their_ids_when_an_obstacle_appears_elsewhere():
-    forgetful = core.Config(max_weight=2.0)
+    forgetful = Config(max_weight=2.0)
     state = start(forgetful)
     play(state, TWO_ROOMS_WALK, forgetful)
     before = ask(state)
@@ -479,6 +481,67 @@ def test_thinning_keeps_what_is_connected_connected():
     after = connected_components(csr_matrix(keep), directed=False)
     assert before[0] == after[0] and (before[1] == after[1]).all()
     assert keep.sum() < np.triu(clear > 0).sum()
+
+
+# Bounded memory.
+
+
+def test_compressed_blocks_change_nothing(two_rooms):
+    near = Config(map_window_max_radius_m=1.5)
+    state = start(near)
+    deltas = play(state, TWO_ROOMS_WALK, near)
+    assert [encode(d) for d in deltas] == [encode(d) for d in two_rooms[1]]
+    assert state.grid.packed_bytes > 0 and state.grid.size_bytes < 0.7 * two_rooms[0].grid.size_bytes
+    assert encode(core.voxel_map(state, CFG)) == encode(core.voxel_map(two_rooms[0], CFG))
+
+
+def test_memory_is_bounded_and_places_of_dropped_space_stay_until_seen_again(room):
+    small = Config(map_window_max_radius_m=6.0, map_mb=3.0, max_speed_m_s=0.0)
+    state, sizes = start(small), []
+    for lap in range(6):
+        play(state, shifted(ROOM_WALK, 12.8 * lap, 100 * lap), small)
+        sizes.append(state.grid.size_bytes)
+    assert max(sizes) <= 3.0e6 and state.graph.frozen
+    one, _ = room
+    told = ask(state)
+    assert len(told.place_ids) > 4 * len(one.published.places) and parts(told) == 6
+    frozen = set(state.graph.frozen)
+    assert {p for i, p in state.published.places.items() if i in frozen} <= set(state.published.places.values())
+    first = {i for i, x in zip(told.place_ids.tolist(), told.positions_m[:, 0].tolist(), strict=True) if x < 6}
+    assert first & frozen
+    play(state, shifted(ROOM_WALK, 0.0, 1000), small)  # back at the first room: the same places under the same ids
+    again = ask(state)
+    now = {i for i, x in zip(again.place_ids.tolist(), again.positions_m[:, 0].tolist(), strict=True) if x < 6}
+    assert len(first & now) >= 0.7 * len(now) and len(now) == len(one.published.places)
+    assert not {i for i in now if i in state.graph.frozen}
+
+
+def test_lenses_of_overlapping_spheres_by_hand():
+    d2 = np.full((40, 9, 9), 50, np.int16)
+    voxels = np.array([(5, 4, 4), (11, 4, 4), (12, 4, 4), (30, 4, 4)])
+    lens = np.sqrt(links.lenses(d2, voxels, np.array((5.0, 5.0, 1.0, 4.0)), 0.5, 100.0))
+    assert lens[0, 1] == pytest.approx(4.0)  # two spheres of 5 at distance 6 meet in a circle of 4
+    assert lens[1, 2] == pytest.approx(1.0)  # one lies in the other
+    assert lens[0, 3] == 0.0 == lens[0, 2]
+    d2[8] = UNKNOWN_D2
+    assert not links.lenses(d2, voxels, np.array((5.0, 5.0, 1.0, 4.0)), 0.5, 100.0)[0].any()
+
+
+def test_hydras_limits_and_overlap_edges_change_edges_only(two_rooms):
+    few = Config(freespace_num_nodes_to_check=10, freespace_num_neighbors_to_find=2, add_overlap_edges=True)
+    bare = Config(add_freespace_edges=False)
+    counts = {}
+    for name, cfg in (("few", few), ("bare", bare)):
+        state = start(cfg)
+        play(state, TWO_ROOMS_WALK, cfg)
+        assert canonical(state)[0] == canonical(two_rooms[0])[0]
+        counts[name] = sum(map(len, state.graph.edges.values()))
+        batch = start(cfg)
+        for frame in TWO_ROOMS_WALK:
+            core.fuse(batch, frame, images.depth_of(frame, 0.5), cfg)
+        core.refresh(batch, observed(batch.grid), cfg)
+        assert canonical(state) == canonical(batch)
+    assert counts["bare"] < counts["few"]
 
 
 # Inputs that must do no harm.
@@ -622,7 +685,7 @@ def test_a_correction_may_come_before_its_keyframe(two_rooms):
 
 def test_keyframes_that_left_the_archive_keep_their_poses_and_are_counted(two_rooms):
     frames = disturbed(TWO_ROOMS_WALK, WRONG)
-    small = core.Config(archive_mb=sum(len(f.depth) for f in frames[8:]) / 1e6)
+    small = Config(archive_mb=sum(len(f.depth) for f in frames[8:]) / 1e6)
     state = start(small)
     play(state, frames, small)
     assert state.archive.size_bytes <= small.archive_mb * 1e6
@@ -648,10 +711,17 @@ def test_a_repeated_keyframe_is_ignored(room):
     assert encode(ask(state)) == before
 
 
+@pytest.mark.parametrize("name", list(PRESETS))
+def test_presets_are_defaults_that_other_settings_change(name):
+    cfg = resolve(Config, "place_graph", {"place_graph": {"preset": name, "min_node_distance_m": "0.35"}})
+    assert cfg == preset(name, min_node_distance_m=0.35)
+    assert cfg.max_distance_m == {"outdoor": 6.0, "hydra": 2.0, "habitat": 4.5, "uhumans2": 4.5}.get(name, 3.0)
+
+
 def test_config_refuses_what_cannot_work():
     for bad in ({"voxel_m": 0.0}, {"voxel_m": 0.5}, {"max_distance_m": 13.0}, {"min_range_m": 6.0}):
         with pytest.raises(ValueError):
-            core.Config(**bad)
+            Config(**bad)
 
 
 # A home with exact floor polygons.

@@ -8,86 +8,19 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-import msgspec
 import numpy as np
 
 from schemas.frames import Keyframe, PoseUpdate
 from schemas.places import PlaceDelta, VoxelMap
 from services.place_graph import distance, images, places, tsdf
 from services.place_graph.archive import Archive, Kept, moved
+from services.place_graph.config import Config
 from services.place_graph.graph import Changes, PlaceGraph, Rules
-from services.place_graph.grid import FREE, OCCUPIED, Box, VoxelGrid
+from services.place_graph.grid import BLOCK, FREE, OCCUPIED, Box, VoxelGrid
 from services.place_graph.published import Published
-from services.place_graph.track import Bounds, Track
+from services.place_graph.track import Track
 
-MAX_FIELD_VOXELS = 120  # offsets to the nearest obstacle are kept in 8 bits
 TILE_VOXELS = 128  # side of the windows in which far-flung changes are worked off
-
-
-class Config(msgspec.Struct, frozen=True, kw_only=True):
-    """Hydra's parameters under Hydra's names; defaults of its habitat preset unless a comment says otherwise."""
-
-    voxel_m: float = 0.1  # side of a voxel, of the map and of the Voronoi diagram; Hydra's diagram has 0.2
-    truncation_m: float = 0.3  # the signed distance is clipped here, and nothing is fused farther behind a surface
-    surface_voxels: float = 0.5  # a voxel whose signed distance is below this many voxels is an obstacle
-    min_range_m: float = 0.2  # nearer measurements are the robot itself or noise
-    max_range_m: float = 5.0  # nothing is fused farther from the camera; farther surfaces still clear what lies before
-    max_weight: float = 1e5  # 1 / m^2 of evidence for one voxel; beyond it, old evidence fades
-    use_constant_weight: bool = False  # weigh measurements alike, instead of by 1 / depth^2 as sensors are precise
-    max_distance_m: float = 3.0  # distances end here: half the height of the highest halls (Clio 3.0, habitat 4.5)
-    voronoi_min_distance_m: float = 0.3  # the Voronoi diagram ends this close to obstacles
-    parent_l1_separation: float = 20.0  # voxels: obstacles farther apart than this (L1) are distinct basis points ...
-    parent_cos_angle_separation: float = 0.2  # ... and so are those seen under an angle with a smaller cosine
-    compression_distance_m: float = 1.0  # side of the cells that become one place each
-    min_node_distance_m: float = 0.4  # smallest radius of a place
-    min_edge_distance_m: float = 0.2  # smallest clearance of an edge between touching places
-    node_merge_distance_m: float = 0.5  # touching places nearer than this become one
-    freespace_max_length_m: float = 2.0  # longest edge across free space
-    freespace_min_clearance_m: float = 0.2  # smallest clearance of such an edge (habitat 0.5, uhumans2 0.2): doorways
-    min_component_size: int = 3  # smaller connected parts of the graph are not published
-    min_change_m: float = 0.01  # smaller changes of a position, radius or clearance are not published
-    max_speed_m_s: float = 3.0  # of a camera carried or driven indoors; a faster pose is a jump; 0 = believe everything
-    jump_slack_m: float = 1.0  # what stamps and trackers may be wrong by, on top
-    relocalised_after: int = 5  # keyframes that go on from a jump before it is believed ...
-    max_contradiction: float = 0.4  # ... unless more of their depth contradicts the map: 0.1 to 0.33 with true poses of
-    # the development sequences, above 0.58 half a metre beside them
-    max_principal_offset: float = 0.2  # share of the image by which the principal point may be off its middle
-    archive_mb: float = 256.0  # compressed depth images kept for pose updates, oldest dropped first
-
-    def __post_init__(self) -> None:
-        if not 0 < self.voxel_m <= min(self.truncation_m, self.compression_distance_m):
-            raise ValueError("voxel_m must be positive and at most truncation_m and compression_distance_m")
-        if not self.max_distance_m / self.voxel_m <= MAX_FIELD_VOXELS:
-            raise ValueError(f"max_distance_m may be at most {MAX_FIELD_VOXELS} voxels")
-        if not 0 <= self.min_range_m < self.max_range_m:
-            raise ValueError("min_range_m must be at least 0 and below max_range_m")
-
-    def voxels(self, length_m: float) -> float:
-        """A length in voxels."""
-        return length_m / self.voxel_m
-
-    @property
-    def fusion(self) -> tsdf.Fusion:
-        """How depth is fused."""
-        return tsdf.Fusion(
-            voxel_m=self.voxel_m,
-            truncation_m=max(self.truncation_m, 2 * self.voxel_m),
-            surface_m=self.surface_voxels * self.voxel_m,
-            min_range_m=self.min_range_m,
-            max_range_m=self.max_range_m,
-            max_weight=self.max_weight,
-            constant_weight=self.use_constant_weight,
-        )
-
-    @property
-    def bounds(self) -> Bounds:
-        """How far the camera gets."""
-        return Bounds(self.max_speed_m_s, self.jump_slack_m)
-
-    @property
-    def cell_voxels(self) -> int:
-        """Voxels along one side of a compression cell."""
-        return max(1, round(self.compression_distance_m / self.voxel_m))
 
 
 @dataclass
@@ -118,8 +51,12 @@ def empty(robot: str, epoch: int, cfg: Config) -> State:
         cell=cfg.cell_voxels,
         merge=cfg.voxels(cfg.node_merge_distance_m),
         edge=cfg.voxels(cfg.min_edge_distance_m),
-        reach=cfg.voxels(cfg.freespace_max_length_m),
+        reach=cfg.voxels(cfg.freespace_max_length_m) if cfg.add_freespace_edges else 0.0,
         free=cfg.voxels(cfg.freespace_min_clearance_m),
+        check=cfg.freespace_num_nodes_to_check,
+        find=cfg.freespace_num_neighbors_to_find,
+        overlap=cfg.voxels(cfg.overlap_min_clearance_m),
+        overlap_check=cfg.overlap_num_neighbors_to_check if cfg.add_overlap_edges else 0,
     )
     return State(robot, epoch, PlaceGraph(rules), Archive(cfg.archive_mb * 1e6))
 
@@ -145,7 +82,9 @@ def integrate(state: State, keyframe: Keyframe, cfg: Config) -> PlaceDelta:
         event = f"believed again at keyframe {keyframe.frame_id}: the pose stays where it jumped to and fits the map"
         changed += _fuse_doubted(state, cfg)
     state.track.believe(keyframe)
-    return _publish(state, keyframe, refresh(state, np.concatenate(changed), cfg), cfg, event)
+    changes = refresh(state, np.concatenate(changed), cfg)
+    _leave_behind(state, keyframe, cfg)
+    return _publish(state, keyframe, changes, cfg, event)
 
 
 def correct(state: State, update: PoseUpdate, cfg: Config) -> PlaceDelta | None:
@@ -275,6 +214,14 @@ def _move(state: State, kept: Kept, world_from_camera: np.ndarray, cfg: Config) 
     state.track.correct(there)
 
 
+def _leave_behind(state: State, keyframe: Keyframe, cfg: Config) -> None:
+    """Compress what is far from the camera; where even that must be dropped, its places freeze."""
+    center = keyframe.world_from_camera[:3, 3] / cfg.voxel_m
+    for key in state.grid.leave(center, cfg.voxels(cfg.map_window_max_radius_m), cfg.map_mb * 1e6):
+        low = np.array(key, np.int64) * BLOCK
+        state.graph.freeze(Box(low, low + BLOCK))
+
+
 def _remember(state: State, keyframe: Keyframe) -> None:
     x, y, z = keyframe.world_from_camera[:3, 3].tolist()
     state.cameras_m[keyframe.frame_id] = (x, y, z)
@@ -296,7 +243,7 @@ def _renewed_field(state: State, changed: np.ndarray, cfg: Config) -> Box | None
         state.grid,
         changed,
         max_distance_voxels=cfg.voxels(cfg.max_distance_m),
-        voronoi_min_voxels=cfg.voxels(cfg.voronoi_min_distance_m),
+        voronoi_min_voxels=cfg.voxels(max(cfg.voronoi_min_distance_m, cfg.min_distance_m)),
         parent_l1_voxels=cfg.parent_l1_separation,
         parent_cos=cfg.parent_cos_angle_separation,
     )
@@ -314,6 +261,7 @@ def _renewed_places(state: State, changed: Box, cfg: Config) -> Changes:
         cell_voxels,
         cfg.voxels(cfg.min_node_distance_m) ** 2,
         cfg.voxels(cfg.node_merge_distance_m) ** 2,
+        cfg.merge_policy == "distance",
     )
     return state.graph.update(state.grid, extraction, region, changed)
 
@@ -342,7 +290,7 @@ def _delta(
     moved_ids: Sequence[int] = (),
 ) -> PlaceDelta:
     state.revision += 1
-    fields = state.published.update(state.graph, changes, cfg.voxel_m, cfg.min_component_size, cfg.min_change_m)
+    fields = state.published.update(state.graph, changes, cfg.voxel_m, cfg.min_component_size, cfg.min_diff_m)
     return PlaceDelta(
         robot=state.robot,
         epoch=state.epoch,

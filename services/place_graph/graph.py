@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from services.place_graph.grid import UNKNOWN_D2, Box, VoxelGrid
-from services.place_graph.links import clear_lines, line_d2, thinned
+from services.place_graph.links import clear_lines, lenses, line_d2, nearest, thinned
 from services.place_graph.places import Extraction
 
 Voxel = tuple[int, int, int]
@@ -28,7 +28,11 @@ class Rules:
     merge: float  # touching places nearer than this are one
     edge: float  # smallest clearance between touching places
     reach: float  # longest edge across free space ...
-    free: float  # ... and its smallest clearance
+    free: float  # ... its smallest clearance ...
+    check: int = 0  # ... how many places in sight are looked at ...
+    find: int = 0  # ... and how many of them joined; 0 = all
+    overlap: float = 0.0  # smallest radius of the lens that two spheres share
+    overlap_check: int = 0  # nearest places looked at for such edges; 0 = none
 
 
 @dataclass
@@ -51,6 +55,10 @@ class _Sight:
     d2: np.ndarray
     box: Box
 
+    def observed(self, voxel: Voxel) -> bool:
+        """Whether a voxel of the window was observed."""
+        return bool(self.d2[tuple(np.array(voxel) - self.box.low)] != UNKNOWN_D2)
+
     def clear(self, start: np.ndarray, stop: np.ndarray) -> bool:
         """Whether the straight line between two voxels stays in free space."""
         return line_d2(self.d2, start - self.box.low, stop - self.box.low) > 0
@@ -64,6 +72,7 @@ class PlaceGraph:
         self.places: dict[int, Place] = {}
         self.edges: dict[int, dict[int, int]] = {}  # id -> neighbour -> squared clearance (voxels)
         self._touching: dict[int, set[int]] = {}  # ids whose GVD voxels touch
+        self.frozen: set[int] = set()  # places whose voxels were dropped: they stay as they were until seen again
         self._by_cell: dict[Voxel, set[int]] = {}
         self._next_id = 0
 
@@ -83,6 +92,10 @@ class PlaceGraph:
         self._relink(Box(voxels.min(axis=0), voxels.max(axis=0) + 1), grid, changes)
         return changes
 
+    def freeze(self, box: Box) -> None:
+        """The voxels of a box were dropped: its places stay as they are until they are seen again."""
+        self.frozen.update(self._ids_within(box))
+
     @property
     def _reach_voxels(self) -> int:
         """How long an edge can be: as far as free space may be crossed, or as far as places that touch lie apart."""
@@ -98,7 +111,8 @@ class PlaceGraph:
         old_ids = self._ids_within(region)
         inside = region.contains(extraction.voxels)
         new = np.flatnonzero(inside)
-        matched = _match(self._voxels(old_ids), extraction.voxels[new], self.rules.cell, sight)
+        frozen = np.array([i in self.frozen for i in old_ids], np.bool_)
+        matched = _match(self._voxels(old_ids), extraction.voxels[new], frozen, self.rules, sight)
         id_of: dict[int, int] = {}
         for position, index in enumerate(new.tolist()):
             if position in matched:
@@ -114,7 +128,10 @@ class PlaceGraph:
             outside = self._id_at(extraction.voxels[index])
             if outside is not None:
                 id_of[index] = outside
-        return id_of, sorted(set(old_ids) - set(id_of.values()))
+        self.frozen.difference_update(id_of.values())
+        unseen = {i for i in self.frozen.intersection(old_ids) if not sight.observed(self.places[i].voxel)}
+        self.frozen.difference_update(set(old_ids) - unseen)
+        return id_of, sorted(set(old_ids) - set(id_of.values()) - unseen)
 
     def _retire(
         self, gone: list[int], extraction: Extraction, id_of: dict[int, int], sight: _Sight, changes: Changes
@@ -131,13 +148,21 @@ class PlaceGraph:
                     owner = id_of[nearest]
             if owner is not None:
                 changes.merged[place_id] = owner
+                self._inherit(place_id, owner)
             changes.touched.add(place_id)
             changes.touched.update(self.edges.get(place_id, ()))
             self._drop(place_id)
 
+    def _inherit(self, place_id: int, heir: int) -> None:
+        """Edges to frozen places cannot be found again; they go to whoever takes over."""
+        for other in self.frozen.intersection(self.edges.get(place_id, ())):
+            clearance = self.edges[place_id][other]
+            self.edges.setdefault(heir, {}).setdefault(other, clearance)
+            self.edges[other].setdefault(heir, clearance)
+
     def _touch(self, region: Box, extraction: Extraction, id_of: dict[int, int]) -> set[int]:
         """Renew which places touch, for all pairs with an end inside `region`; returns whose company changed."""
-        inside = set(self._ids_within(region))
+        inside = set(self._ids_within(region)) - self.frozen
         before = {place_id: self._touching.pop(place_id, set()) for place_id in inside}
         for place_id, others in before.items():
             for other in others - inside:
@@ -159,7 +184,7 @@ class PlaceGraph:
         renewed.update({b: {} for a in inside for b in self.edges.get(a, ())})
 
         def concerned(a: int, b: int) -> bool:
-            return a in inside or b in inside or (a in near and b in near)
+            return (a in inside or b in inside or (a in near and b in near)) and self.frozen.isdisjoint((a, b))
 
         for a, b, clearance in self._links_within(window, sight):
             if concerned(a, b):
@@ -173,7 +198,7 @@ class PlaceGraph:
 
     def _links_within(self, box: Box, sight: _Sight) -> list[tuple[int, int, int]]:
         """Edges between the places of `box`: smaller id, larger id, squared clearance."""
-        ids = self._ids_within(box)
+        ids = [i for i in self._ids_within(box) if i not in self.frozen]
         index = {place_id: n for n, place_id in enumerate(ids)}
         touching = np.zeros((len(ids), len(ids)), np.bool_)
         for place_id in ids:
@@ -184,6 +209,14 @@ class PlaceGraph:
         rules = self.rules
         clear = clear_lines(sight.d2, voxels, touching, rules.edge**2, rules.reach**2, rules.free**2)
         keep = thinned(clear, voxels, touching, rules.edge**2)
+        if rules.check or rules.find:
+            keep &= touching | nearest(clear > 0, voxels, rules.check) & nearest(keep & ~touching, voxels, rules.find)
+        if rules.overlap_check:
+            radii = np.sqrt([self.places[i].d2 for i in ids])
+            lens2 = lenses(sight.d2, voxels, radii, rules.overlap, self._reach_voxels)
+            lens2[~nearest(np.ones_like(keep), voxels, rules.overlap_check)] = 0
+            clear = np.where(keep, clear, lens2)
+            keep |= np.triu(lens2 > 0, 1)
         return [(ids[one], ids[two], int(clear[one, two])) for one, two in np.argwhere(keep).tolist()]
 
     def _voxels(self, ids: list[int]) -> np.ndarray:
@@ -214,20 +247,34 @@ class PlaceGraph:
 
     def _put(self, place_id: int, place: Place) -> None:
         if place_id in self.places:
-            self._by_cell[self._cell(self.places[place_id].voxel)].discard(place_id)
+            self._leave_cell(place_id)
         self.places[place_id] = place
         self._by_cell.setdefault(self._cell(place.voxel), set()).add(place_id)
 
     def _drop(self, place_id: int) -> None:
-        self._by_cell[self._cell(self.places.pop(place_id).voxel)].discard(place_id)
+        self._leave_cell(place_id)
+        del self.places[place_id]
+        self.frozen.discard(place_id)
         for other in self.edges.pop(place_id, {}):
             self.edges[other].pop(place_id, None)
         for other in self._touching.pop(place_id, set()):
             self._touching[other].discard(place_id)
 
+    def _leave_cell(self, place_id: int) -> None:
+        cell = self._cell(self.places[place_id].voxel)
+        self._by_cell[cell].discard(place_id)
+        if not self._by_cell[cell]:
+            del self._by_cell[cell]
 
-def _match(old_voxels: np.ndarray, new_voxels: np.ndarray, cell_voxels: int, sight: _Sight) -> dict[int, int]:
-    """Index of the old place that each new one continues: nearest first, within a cell or its side, in clear sight."""
+
+def _match(
+    old_voxels: np.ndarray, new_voxels: np.ndarray, frozen: np.ndarray, rules: Rules, sight: _Sight
+) -> dict[int, int]:
+    """Index of the old place that each new one continues: nearest first, within a cell or its side, in clear sight.
+
+    What lies between a `frozen` place and a new one is not known: they are one if they would merge.
+    """
+    cell_voxels = rules.cell
     squared = ((old_voxels[:, None] - new_voxels[None]) ** 2).sum(axis=2)
     same_cell = (old_voxels[:, None] // cell_voxels == new_voxels[None] // cell_voxels).all(axis=2)
     rows, columns = np.nonzero(same_cell | (squared <= cell_voxels**2))
@@ -237,7 +284,8 @@ def _match(old_voxels: np.ndarray, new_voxels: np.ndarray, cell_voxels: int, sig
     for row, column in zip(rows[order].tolist(), columns[order].tolist(), strict=True):
         if row in taken or column in matched:
             continue
-        if squared[row, column] and not sight.clear(old_voxels[row], new_voxels[column]):
+        near = squared[row, column] <= rules.merge**2 if frozen[row] else squared[row, column] == 0
+        if not near and not sight.clear(old_voxels[row], new_voxels[column]):
             continue
         matched[column] = row
         taken.add(row)

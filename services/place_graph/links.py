@@ -83,3 +83,41 @@ def thinned(clear, voxels, touching, edge_d2):  # noqa: ANN001, ANN201
                         break
             keep[one, two] = stays
     return keep
+
+
+def nearest(mask: np.ndarray, voxels: np.ndarray, limit: int) -> np.ndarray:
+    """Pairs (n, n) of `mask` in which either is among the `limit` nearest of the other's pairs; 0 = all."""
+    if not limit:
+        return mask
+    mask = mask | mask.T
+    length = ((voxels[:, None] - voxels[None]) ** 2).sum(axis=2).astype(float)
+    length[~mask] = np.inf
+    np.fill_diagonal(length, np.inf)
+    farthest = np.sort(length, axis=1)[:, min(limit, len(voxels)) - 1 : min(limit, len(voxels))]
+    near = mask & (length <= farthest) & np.isfinite(length)
+    return near | near.T
+
+
+@njit(cache=True, nogil=True)
+def lenses(d2, voxels, radii, smallest, reach):  # noqa: ANN001, ANN201
+    """Squared radius (n, n) of the lens that two spheres share, or of the smaller one if it lies in the other.
+
+    0 where it is smaller than `smallest`, the centres are farther apart than `reach`, or do not see each other.
+    """
+    count = len(voxels)
+    found = np.zeros((count, count), np.int32)
+    for one in range(count):
+        for two in range(one + 1, count):
+            dx, dy, dz = voxels[one] - voxels[two]
+            apart = np.sqrt(float(dx * dx + dy * dy + dz * dz))
+            r, s = radii[one], radii[two]
+            if apart >= r + s or apart > reach:
+                continue
+            if apart <= abs(r - s):
+                lens = min(r, s)
+            else:
+                along = (apart * apart - s * s + r * r) / (2 * apart)
+                lens = np.sqrt(max(0.0, r * r - along * along))
+            if lens >= smallest and line_d2(d2, voxels[one], voxels[two]) > 0:
+                found[one, two] = found[two, one] = int(lens * lens + 0.5)
+    return found

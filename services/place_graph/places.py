@@ -37,8 +37,13 @@ def whole_cells(box: Box, cell_voxels: int, margin_cells: int = 0) -> Box:
     return Box(low * cell_voxels, high * cell_voxels)
 
 
-def extract(grid: VoxelGrid, box: Box, cell_voxels: int, min_d2: float, merge_d2: float) -> Extraction:
-    """Places of all cells inside `box`, which must consist of whole cells; the grid's GVD must be up to date."""
+def extract(  # noqa: PLR0917
+    grid: VoxelGrid, box: Box, cell_voxels: int, min_d2: float, merge_d2: float, widest: bool = False
+) -> Extraction:
+    """Places of all cells inside `box`, which must consist of whole cells; the grid's GVD must be up to date.
+
+    Of places that merge the one with most basis points stays, or with `widest` the widest.
+    """
     basis = grid.gather("basis", box)
     d2 = grid.gather("d2", box)
     members = _member_voxels(basis, d2, min_d2)
@@ -46,7 +51,8 @@ def extract(grid: VoxelGrid, box: Box, cell_voxels: int, min_d2: float, merge_d2
     groups = _grow_groups(members, labels, box.low, cell_voxels)
     local, group_d2, group_basis = _representatives(members, labels, d2, basis, groups)
     pairs = _unique_pairs(_touching(members, labels))
-    root = _merge(local, group_d2, group_basis, pairs, merge_d2)
+    first, second = (group_d2, group_basis) if widest else (group_basis, group_d2)
+    root = _merge(local, first, second, pairs, merge_d2)
     kept = np.flatnonzero(root == np.arange(groups))
     index = np.full(groups, -1, np.int64)
     index[kept] = np.arange(len(kept))
@@ -135,11 +141,11 @@ def _touching(members, labels):  # noqa: ANN001, ANN202
 
 
 @njit(cache=True, nogil=True)
-def _merge(voxels, d2, basis, pairs, merge_d2):  # noqa: ANN001, ANN202
+def _merge(voxels, first, second, pairs, merge_d2):  # noqa: ANN001, ANN202
     """Root of each group: a group that touches a better one nearby is absorbed by the best such, and so on upwards.
 
-    Better means more basis points, then wider, then earlier. The rule looks at neighbours only, so what happens far
-    away never changes who absorbs whom.
+    Better means greater in the `first` measure, then in the `second`, then earlier. The rule looks at neighbours only,
+    so what happens far away never changes who absorbs whom.
     """
     parent = np.arange(len(voxels))
     for n in range(len(pairs)):
@@ -148,10 +154,10 @@ def _merge(voxels, d2, basis, pairs, merge_d2):  # noqa: ANN001, ANN202
         if dx * dx + dy * dy + dz * dz > merge_d2:
             continue
         worse, better = one, two
-        if (basis[one], d2[one], -one) > (basis[two], d2[two], -two):
+        if (first[one], second[one], -one) > (first[two], second[two], -two):
             worse, better = two, one
         best = parent[worse]
-        if best == worse or (basis[better], d2[better], -better) > (basis[best], d2[best], -best):
+        if best == worse or (first[better], second[better], -better) > (first[best], second[best], -best):
             parent[worse] = better
     for n in range(len(parent)):
         while parent[parent[n]] != parent[n]:

@@ -66,8 +66,12 @@ def check_sections(layers: Mapping[str, Any], known: Sequence[str]) -> None:
 
 
 def resolve(config_type: type[C], section: str, layers: Mapping[str, Mapping[str, Any]]) -> C:
-    """The config of one service. Text values are read as the field's type; lists as JSON."""
+    """The config of one service. Text values are read as the field's type; lists as JSON.
+
+    A config with `PRESETS` has a setting `preset`, which names the defaults that all others change.
+    """
     values = dict(layers.get(section, {}))
+    values = getattr(config_type, "PRESETS", {}).get(values.get("preset"), {}) | values
     fields = {field.name: field for field in msgspec.structs.fields(config_type)}
     for name, value in values.items():
         if name not in fields:
