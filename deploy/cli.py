@@ -149,6 +149,12 @@ def _add_tools(command: Command) -> None:
     export.add_argument("--database", type=Path, help="read this scene.sqlite instead of the running store")
     _add_bus(export)
 
+    explain = command("explain", "say why a place carries its label", "prior-sg explain 12 --log out/demo/log.mcap")
+    explain.add_argument("place", type=int, help="id of the place, as in scene.json")
+    explain.add_argument("--log", type=Path, help="ask the segmenter at the end of this log, not the running one")
+    explain.add_argument("--json", action="store_true", help="print JSON")
+    _add_bus(explain)
+
     record = command("record", "record all topics into a log, until Ctrl-C", "prior-sg record out/log.mcap")
     record.add_argument("log", type=Path)
     record.add_argument("--seconds", type=float, default=0.0, help="stop after this long; 0 = at Ctrl-C")
@@ -405,6 +411,30 @@ def cmd_export(arguments: argparse.Namespace) -> int:
         raise UserError(f"the store holds no places of {arguments.robot}; name another with --robot")
     report.export(scene, voxels, arguments.format, arguments.out)
     console.print(f"{len(scene.place_ids)} places, {len(scene.regions)} regions: {arguments.out}")
+    return 0
+
+
+def cmd_explain(arguments: argparse.Namespace) -> int:
+    """Each expert's vote on a place, its neighbours' pull, and what follows."""
+    import msgspec
+
+    from deploy import explain
+    from schemas.regions import PosteriorRequest
+    from schemas.topics import POSTERIOR
+
+    if arguments.log is not None:
+        if not arguments.log.exists():
+            raise UserError(f"{arguments.log} does not exist; `run`, `demo` and `record` write one")
+        reply = explain.from_log(arguments.log, arguments.robot, arguments.place)
+    else:
+        with _client(arguments.connect) as client:
+            reply = client.ask(POSTERIOR, PosteriorRequest(robot=arguments.robot, place_id=arguments.place))
+    if not reply.found:
+        raise UserError(f"{arguments.robot} has no labelled place {arguments.place}; scene.json lists their ids")
+    if arguments.json:
+        print(msgspec.json.encode(reply).decode())
+    else:
+        explain.show(reply, console)
     return 0
 
 

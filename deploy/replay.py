@@ -119,6 +119,17 @@ def replay_life(log: Log, life: Life) -> Iterator[tuple[Topic, Message]]:
         service.close(state)
 
 
+def final_state(log: Log, life: Life) -> tuple[Any, Any]:
+    """State and config of one life after its recorded inputs; the caller closes the state."""
+    service = log.service
+    cfg = service.replay_config(msgspec.json.decode(life.started.config, type=service.config))
+    state = service.init(cfg, Identity(life.started.robot, life.instance, life.started.epoch))
+    for entry in life.inputs:
+        for _ in service.step(state, log.input(entry), cfg):
+            pass
+    return state, cfg
+
+
 def compare(log: Log, life: Life) -> Comparison:
     """Replay one life and compare, message by message and field by field."""
     replayed: dict[str, list[Message]] = {}

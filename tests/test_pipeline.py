@@ -236,6 +236,25 @@ def test_exports_agree(disturbed):
     assert (out / "map.png").stat().st_size > 10_000
 
 
+def test_explain_from_the_log_adds_up(disturbed, capsys):
+    """The segmenter at the end of the log holds the label of the final scene, and its costs add up to its belief."""
+    scene, log = disturbed[0].scene, str(disturbed[0].log_path)
+    row = int(np.argmax(scene.place_regions >= 0))
+    place, names = int(scene.place_ids[row]), {region.id: region.label for region in scene.regions}
+    assert main(["explain", str(place), "--log", log, "--json"]) == 0
+    reply = json.loads(capsys.readouterr().out)
+    assert (reply["place_id"], reply["label"]) == (place, names[int(scene.place_regions[row])])
+    costs = (np.array(reply["unary"]) + reply["pull"]) / reply["temperature"]
+    likelihoods = np.exp(costs.min() - costs)
+    np.testing.assert_allclose(reply["posterior"], likelihoods / likelihoods.sum(), atol=1e-9)
+    assert [vote["expert"] for vote in reply["votes"]][:2] == ["visual", "geometric"]
+    assert main(["explain", str(place), "--log", log]) == 0
+    text = capsys.readouterr().out
+    assert f"place {place} at" in text and f"{reply['label']} before" in text and "neighbours" in text
+    assert main(["explain", "999999", "--log", log]) == 1
+    assert "scene.json lists their ids" in capsys.readouterr().err
+
+
 def test_the_log_holds_everything_recorded(disturbed):
     counts = summary(disturbed[1] / "log.mcap")
     for topic in TOPICS:
