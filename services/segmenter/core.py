@@ -28,7 +28,7 @@ from schemas.regions import (
 )
 from schemas.status import Tick
 from services.deltas import Follower
-from services.segmenter import beliefs, descriptors, geometry, publication, regions, spaces, swap
+from services.segmenter import beliefs, descriptors, geometry, publication, regions, sharing, spaces, swap
 from services.segmenter.balance import BalanceConfig, label_bias
 from services.segmenter.experts import REGISTRY, Vote
 from services.segmenter.experts.context import Context, ObjectSettings, ObjectView, standardised
@@ -36,6 +36,7 @@ from services.segmenter.geometry import GeometryConfig
 from services.segmenter.graph import PlaceGraph, apply
 from services.segmenter.incremental import Settings, Solver
 from services.segmenter.places import UNLABELLED, Places
+from services.segmenter.sharing import SharingConfig
 from services.segmenter.spaces import Spaces, SpacesConfig
 
 BIAS_SAMPLE = 4096  # places that stand for all when the map's bias is computed
@@ -62,6 +63,7 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
     edge_clearance_m: float = 0.0  # > 0: w_dist times min(clearance / edge_clearance_m, 1); no gain seen, so off
     probability_floor: float = 1e-6  # least probability in a logarithm, so that every cost is finite
     object_phrases: int = 2  # objects whose phrases join a region's concept, the most discriminative first
+    sharing: SharingConfig = msgspec.field(default_factory=SharingConfig)  # beyond the paper
     balance: BalanceConfig = msgspec.field(default_factory=BalanceConfig)  # beyond the paper
     temperature: float = 1.0  # of the posteriors; see services.segmenter.beliefs
     trust_half: float = 0.5  # sum of trust at which half of the unknown mass is left
@@ -212,6 +214,7 @@ def follow_places(state: State, delta: PlaceDelta, cfg: Config) -> None:
         state.weights = edge_weights(state.graph, cfg)
         unsettled = with_neighbours(state.graph, step.touched)
         state.places.unsettled |= unsettled
+        state.places.unshared |= unsettled
         state.places.unbelieved |= unsettled
         state.places.doubtful |= step.moved
         state.reformed.update(state.places.regions[step.upserted].tolist())
@@ -382,13 +385,24 @@ def votes(state: State, rows: np.ndarray, cfg: Config) -> dict[str, Vote]:
 
 
 def compare(state: State) -> None:
-    """Similarity of the places whose evidence changed with each label."""
+    """Similarity of the places whose evidence changed, each for itself, with each label."""
     alignment, places, rows = state.alignment, state.places, np.flatnonzero(state.places.stale)
     assert alignment is not None
     found = state.evidence.descriptors(places.slots[rows])
     if found.shape[1]:  # after the first pyramid
-        places.similarity[rows] = standardised(found, alignment.text)
-    places.stale[rows], places.doubtful[rows] = False, True
+        places.own_similarity[rows] = standardised(found, alignment.text)
+    places.stale[rows], places.unshared[rows] = False, True
+
+
+def share(state: State, cfg: Config) -> None:
+    """Average similarity around the places whose own, or whose edges, changed."""
+    places, near = state.places, state.graph.adjacency
+    rows = sharing.reached(near, places.unshared, cfg.sharing.steps)
+    trust = state.evidence.trust[places.slots]
+    places.similarity[rows] = sharing.shared(
+        places.own_similarity, trust, near, state.weights, rows=rows, cfg=cfg.sharing
+    )
+    places.unshared[:], places.doubtful[rows] = False, True
     state.compared += len(rows)
 
 
@@ -432,6 +446,7 @@ def evaluate_experts(state: State, idle: bool, cfg: Config) -> None:
     """Unary potentials wherever an expert may have changed its mind (eqs. product_of_experts, unary_potential)."""
     reshape(state, cfg)
     compare(state)
+    share(state, cfg)
     rebalance(state, idle, cfg)
     places, rows = state.places, np.flatnonzero(state.places.doubtful)
     answers = votes(state, rows, cfg)

@@ -14,6 +14,7 @@ _FILLS: dict[str, tuple[float | bool, str]] = {  # what a new place gets, and th
     "labels": (UNLABELLED, "int64"),
     "regions": (NO_REGION, "int64"),
     "solved": (-1, "int64"),
+    "own_similarity": (0.0, "float64"),
     "similarity": (0.0, "float64"),
     "unary": (0.0, "float64"),
     "posteriors": (0.0, "float32"),
@@ -22,13 +23,14 @@ _FILLS: dict[str, tuple[float | bool, str]] = {  # what a new place gets, and th
     "support": (0.0, "float64"),
     "anisotropy": (0.0, "float64"),
     "stale": (True, "bool"),
+    "unshared": (True, "bool"),
     "reshaped": (True, "bool"),
     "doubtful": (True, "bool"),
     "unsettled": (True, "bool"),
     "unbelieved": (True, "bool"),
 }
-_PER_LABEL = ("similarity", "unary", "posteriors")
-_AFTER_A_SWITCH = ("stale", "doubtful", "unsettled", "unbelieved")
+_PER_LABEL = ("own_similarity", "similarity", "unary", "posteriors")
+_AFTER_A_SWITCH = ("stale", "unshared", "doubtful", "unsettled", "unbelieved")
 
 
 @dataclass
@@ -39,7 +41,8 @@ class Places:
     labels: np.ndarray  # UNLABELLED = not yet
     regions: np.ndarray
     solved: np.ndarray  # row in the field that the solver has seen last, -1 = new to it
-    similarity: np.ndarray  # (place, label) standardised
+    own_similarity: np.ndarray  # (place, label) standardised
+    similarity: np.ndarray  # (place, label) its average over the surroundings
     unary: np.ndarray  # (place, label)
     posteriors: np.ndarray  # (place, label)
     sight: np.ndarray  # confidence of the visual expert
@@ -47,6 +50,7 @@ class Places:
     support: np.ndarray
     anisotropy: np.ndarray
     stale: np.ndarray  # evidence changed: compare with the labels again
+    unshared: np.ndarray  # its own similarity or its edges changed: share again around it
     reshaped: np.ndarray  # graph changed nearby: find the local surface again
     doubtful: np.ndarray  # what an expert looks at changed: ask the experts again
     unsettled: np.ndarray  # costs changed: look for a better label
