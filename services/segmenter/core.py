@@ -59,7 +59,7 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
     edge_sum: float = 3.0  # sum of w_dist at a place, whatever the graph's density and scale; 0 = w_dist as it is
     solver: Settings = msgspec.field(default_factory=Settings)
     budget_ms: float = 40.0  # of solving per keyframe; the rest is done when idle. 0 = as long as it takes
-    look_ms: float = 4.0  # of solving between two looks at the budget, see Budget
+    look_ms: float = 2.0  # of solving between two looks at the budget, see Budget
     edge_clearance_m: float = 0.0  # > 0: w_dist times min(clearance / edge_clearance_m, 1); no gain seen, so off
     probability_floor: float = 1e-6  # least probability in a logarithm, so that every cost is finite
     object_phrases: int = 2  # objects whose phrases join a region's concept, the most discriminative first
