@@ -23,7 +23,7 @@ def random_field(seed, count=60, columns=3):
 def test_sharing_equals_powers_of_the_walk(seed, steps):
     """(1 - s) I + s D^-1 W, `steps` times, on mass and on mass times value."""
     graph, weights, trust, own = random_field(seed)
-    cfg, count = SharingConfig(steps=steps, share=0.6, trust_limit=5.0), len(trust)
+    cfg, count = SharingConfig(steps=steps, share=0.6, trust_limit=5.0, gain=2.0), len(trust)
     walk = np.zeros((count, count))
     walk[graph.edges[:, 0], graph.edges[:, 1]] = walk[graph.edges[:, 1], graph.edges[:, 0]] = weights
     sums = walk.sum(axis=1, keepdims=True)
@@ -33,7 +33,7 @@ def test_sharing_equals_powers_of_the_walk(seed, steps):
     spread = np.linalg.matrix_power(walk, steps)
     mass = np.minimum(trust, 5.0)
     sums, total = spread @ (mass[:, None] * own), (spread @ mass)[:, None]
-    expected = np.divide(sums, total, out=np.zeros_like(own), where=total > 0)
+    expected = 2.0 * np.divide(sums, total, out=np.zeros_like(own), where=total > 0) if steps else own
     found = shared(own, trust, graph.adjacency, weights, rows=np.arange(count), cfg=cfg)
     np.testing.assert_allclose(found, expected, atol=1e-12)
     some = np.random.default_rng(seed).choice(count, 5, replace=False)
@@ -58,7 +58,7 @@ def test_a_change_reaches_as_many_edges_as_there_are_steps(seed):
     assert not np.allclose(before[rows], after[rows])
 
 
-@pytest.mark.parametrize("fields", [{"steps": -1}, {"share": 1.5}, {"trust_limit": 0.0}])
+@pytest.mark.parametrize("fields", [{"steps": -1}, {"share": 1.5}, {"trust_limit": 0.0}, {"gain": 0.0}])
 def test_impossible_settings_are_refused(fields):
     with pytest.raises(ValueError):
         SharingConfig(**fields)

@@ -15,9 +15,9 @@ SCALINGS = 20  # of Sinkhorn's; the bias is bounded anyway, so the rest does not
 class BalanceConfig(msgspec.Struct, frozen=True, kw_only=True):
     """How far the beliefs of a map are drawn towards the expected proportions."""
 
-    limit: float = 0.7  # greatest bias, in natural logarithms: odds at most double. 0 = no correction (paper)
-    half_places: float = 100.0  # observed places at which half of the correction is in force: first rooms are no sample
-    existence_share: float = 0.75  # of P(r | E0) in the expected proportions; the rest is uniform
+    limit: float = 1.2  # greatest bias, in natural logarithms: odds at most tripled. 0 = no correction (paper)
+    half_places: float = 20.0  # observed places at which half of the correction is in force: first rooms are no sample
+    existence_share: float = 0.0  # of P(r | E0) in the expected proportions; the rest is uniform
     patience: float = 0.2  # share of the map to be seen anew before the bias is computed again, unless idle
     tolerance: float = 0.01  # smaller changes of the bias are not worth asking the experts again
 

@@ -22,19 +22,23 @@ class SharingConfig(msgspec.Struct, frozen=True, kw_only=True):
     steps: int = 4  # 0 = every place for itself (paper)
     share: float = 0.8  # of the neighbours' mean in each step
     trust_limit: float = 5.0  # sum of trust above which a place counts no more: a few good looks
+    gain: float = 1.4  # of the averages: errors that cancel take some of the spread with them
 
     def __post_init__(self) -> None:
-        if not (self.steps >= 0 and 0 <= self.share <= 1 and self.trust_limit > 0):
-            raise ValueError("steps, share or trust_limit is out of range")
+        if not (self.steps >= 0 and 0 <= self.share <= 1 and self.trust_limit > 0 and self.gain > 0):
+            raise ValueError("steps, share, trust_limit or gain is out of range")
 
 
 def shared(
     own: np.ndarray, trust: np.ndarray, near: Adjacency, weights: np.ndarray, *, rows: np.ndarray, cfg: SharingConfig
 ) -> np.ndarray:
-    """Averages (row, column) of `own` (place, column) around the places `rows`; `trust` (place,) weighs places,
-    `weights` (edge,) weigh edges. Where nothing around has trust, zeros."""
+    """Averages (row, column) of `own` (place, column) around the places `rows`, times the gain; `trust` (place,)
+    weighs places, `weights` (edge,) weigh edges. Where nothing around has trust, zeros; without steps, `own`."""
+    if not cfg.steps:
+        return own[rows]
     masses = np.minimum(trust, cfg.trust_limit)
-    return _shared(own, masses, near.starts, near.neighbours, weights[near.edges], rows, cfg.steps, cfg.share)
+    averages = _shared(own, masses, near.starts, near.neighbours, weights[near.edges], rows, cfg.steps, cfg.share)
+    return cfg.gain * averages
 
 
 def reached(near: Adjacency, mask: np.ndarray, steps: int) -> np.ndarray:
