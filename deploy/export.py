@@ -7,7 +7,8 @@
     regions       [{id, label, parent, probability, unknown, predicted, area_m2, position_m [x, y, z], hull_m [[x, y]],
                     places [id], objects [id], adjacent [region id],
                     transitions [{region, edge [place id inside, outside], position_m, clearance_m, door}]}]
-    places        [{id, position_m [x, y, z], radius_m, region, label, posterior {label: p}, unknown, predicted}]
+    places        [{id, position_m [x, y, z], radius_m, region, label, posterior {label: p}, unknown, predicted,
+                    frontier {direction [x, y, z], area_m2}, ellipse {half_axes_m, angle_rad}, hull_m [[x, y]]}]
     edges         [{a, b, clearance_m}]           between places
     trajectory_m  [[x, y, z]]                     camera centres in order of time
 
@@ -30,7 +31,7 @@ from schemas.scene import Scene
 
 NO_REGION = -1
 DECIMALS = 4  # a tenth of a millimetre, a hundredth of a percent
-PLACE, ROOM, BUILDING = "p", "R", "B"  # node prefixes of Spark-DSG
+PLACE, PLACE_2D, ROOM, BUILDING = "p", "P", "R", "B"  # node prefixes of Spark-DSG
 
 
 def scene_json(scene: Scene) -> dict[str, Any]:
@@ -39,6 +40,7 @@ def scene_json(scene: Scene) -> dict[str, Any]:
     adjacent = _adjacent(scene)
     members = _members(scene)
     predicted = set(scene.predicted_ids.tolist())
+    frontiers, surfaces = _frontiers(scene), _surfaces(scene)
     return {
         "robot": scene.robot,
         "stamp_ns": scene.stamp_ns,
@@ -65,7 +67,12 @@ def scene_json(scene: Scene) -> dict[str, Any]:
             }
             for region in scene.regions
         ],
-        "places": [_place_json(scene, row, names, predicted) for row in range(len(scene.place_ids))],
+        "places": [
+            _place_json(scene, row, names, predicted)
+            | _opening_json(frontiers.get(place_id))
+            | _ground_json(surfaces.get(place_id))
+            for row, place_id in enumerate(scene.place_ids.tolist())
+        ],
         "edges": [
             {"a": a, "b": b, "clearance_m": _short(clearance_m)}
             for (a, b), clearance_m in zip(scene.edges.tolist(), scene.clearances_m, strict=True)
@@ -89,6 +96,32 @@ def _place_json(scene: Scene, row: int, names: dict[int, str], predicted: set[in
     }
 
 
+def _opening_json(opening: tuple[np.ndarray, float] | None) -> dict[str, Any]:
+    if opening is None:
+        return {"frontier": None}
+    return {"frontier": {"direction": _short(opening[0]), "area_m2": _short(opening[1])}}
+
+
+def _ground_json(surface: tuple[np.ndarray, np.ndarray] | None) -> dict[str, Any]:
+    if surface is None:
+        return {"ellipse": None, "hull_m": []}
+    (long_m, short_m, angle_rad), hull_m = surface
+    ellipse = {"half_axes_m": _short((long_m, short_m)), "angle_rad": _short(angle_rad)}
+    return {"ellipse": ellipse, "hull_m": _short(hull_m)}
+
+
+def _frontiers(scene: Scene) -> dict[int, tuple[np.ndarray, float]]:
+    """Direction and area of each opening, by place id."""
+    columns = (scene.frontier_ids.tolist(), scene.frontier_directions, scene.frontier_areas_m2.tolist())
+    return {place: (direction, area_m2) for place, direction, area_m2 in zip(*columns, strict=True)}
+
+
+def _surfaces(scene: Scene) -> dict[int, tuple[np.ndarray, np.ndarray]]:
+    """Ellipse (half axes, angle) and hull (n, 2) of each 2D place, by place id."""
+    hulls = np.split(scene.hulls_m, np.cumsum(scene.hull_counts)[:-1])
+    return dict(zip(scene.surface_ids.tolist(), zip(scene.ellipses, hulls, strict=False), strict=True))
+
+
 def save_json(scene: Scene, path: str | Path) -> None:
     """Write `scene_json`, indented. Raises OSError."""
     Path(path).write_text(json.dumps(scene_json(scene), indent=1) + "\n")
@@ -103,18 +136,25 @@ def spark_dsg_graph(scene: Scene) -> spark_dsg.DynamicSceneGraph:
     """
     graph = spark_dsg.DynamicSceneGraph()
     colors = label_colors(scene)
-    for row in range(len(scene.place_ids)):
-        _add(graph, spark_dsg.DsgLayers.PLACES, PLACE, int(scene.place_ids[row]), _place_node(scene, row, colors))
+    surfaces = _surfaces(scene)
+    prefix = PLACE_2D if surfaces else PLACE
+    layer = "MESH_PLACES" if surfaces else spark_dsg.DsgLayers.PLACES
+    if surfaces:
+        graph.add_layer(3, 1, layer)
+    for row, place in enumerate(scene.place_ids.tolist()):
+        node = _ground_node(scene, row, surfaces[place]) if place in surfaces else _place_node(scene, row)
+        _describe_place(node, scene, row, prefix, colors)
+        _add(graph, layer, prefix, place, node)
     for (a, b), clearance_m in zip(scene.edges.tolist(), scene.clearances_m.tolist(), strict=True):
         weight = spark_dsg.EdgeAttributes()
         weight.weighted, weight.weight = True, clearance_m
-        graph.insert_edge(_symbol(PLACE, a), _symbol(PLACE, b), weight)
+        graph.insert_edge(_symbol(prefix, a), _symbol(prefix, b), weight)
     members = _members(scene)
     for region in scene.regions:
         rows = members[region.id]
         _add(graph, spark_dsg.DsgLayers.ROOMS, ROOM, region.id, _room_node(scene, region, rows, colors))
         for place in scene.place_ids[rows].tolist():
-            graph.insert_edge(_symbol(ROOM, region.id), _symbol(PLACE, place), enforce_single_parent=True)
+            graph.insert_edge(_symbol(ROOM, region.id), _symbol(prefix, place), enforce_single_parent=True)
     for a, b in sorted(_adjacent(scene)):
         graph.insert_edge(_symbol(ROOM, a), _symbol(ROOM, b))
     if scene.regions:
@@ -124,8 +164,9 @@ def spark_dsg_graph(scene: Scene) -> spark_dsg.DynamicSceneGraph:
     about = {"robot": scene.robot, "environment": scene.environment, "task": scene.task}
     graph.metadata.set(about | {"prior_digest": scene.prior_digest, "embedding_space": scene.space})
     labelspace = spark_dsg.Labelspace(dict(enumerate(scene.labels)))  # kept in the metadata, hence after them
-    for layer in (spark_dsg.DsgLayers.PLACES, spark_dsg.DsgLayers.ROOMS):
-        graph.set_labelspace(labelspace, graph.get_layer_key(layer).layer, 0)
+    for named in (layer, spark_dsg.DsgLayers.ROOMS):
+        key = graph.get_layer_key(named)
+        graph.set_labelspace(labelspace, key.layer, key.partition)
     return graph
 
 
@@ -140,18 +181,52 @@ def map_png(scene: Scene, voxel_map: VoxelMap | None, path: str | Path, truth: G
     Path(path).write_bytes(draw_map(scene, voxel_map, outlines))
 
 
-def _place_node(scene: Scene, row: int, colors: dict[str, tuple[int, int, int]]) -> spark_dsg.PlaceNodeAttributes:
-    names = {region.id: region.label for region in scene.regions}
-    label = names.get(int(scene.place_regions[row]), "")
+def _place_node(scene: Scene, row: int) -> spark_dsg.PlaceNodeAttributes:
+    """A sphere; one beside unobserved space is an active frontier whose x axis leads there."""
     node = spark_dsg.PlaceNodeAttributes()
-    node.position = scene.positions_m[row].astype(float)
     node.distance = float(scene.radii_m[row])
     node.num_basis_points = int(scene.basis_points[row])
+    node.real_place = True
+    opening = np.flatnonzero(scene.frontier_ids == scene.place_ids[row])
+    if len(opening):
+        x, y, z = scene.frontier_directions[opening[0]].astype(float)
+        side_m = float(scene.frontier_areas_m2[opening[0]]) ** 0.5
+        node.active_frontier = True
+        node.frontier_scale = np.array((0.0, side_m, side_m))
+        # Half the turn from the x axis: the axis halfway between the two, as a quaternion (w, cross product).
+        turn = np.array((1 + x, 0.0, -z, y)) if x > -1 + 1e-6 else np.array((0.0, 0.0, 0.0, 1.0))
+        node.orientation = spark_dsg.Quaternion(*(turn / np.linalg.norm(turn)))
+    return node
+
+
+def _ground_node(scene: Scene, row: int, surface: tuple[np.ndarray, np.ndarray]) -> spark_dsg.Place2dNodeAttributes:
+    """A piece of ground: its hull, and the ellipse as the matrix that makes it of the unit circle, and its inverse."""
+    (long_m, short_m, angle_rad), hull_m = surface[0].astype(float), surface[1].astype(float)
+    cosine, sine = np.cos(angle_rad), np.sin(angle_rad)
+    expand = np.array(((cosine, -sine), (sine, cosine))) * (long_m, short_m)
+    height_m = float(scene.positions_m[row, 2])
+    node = spark_dsg.Place2dNodeAttributes()
+    node.boundary = [np.array((x, y, height_m)) for x, y in hull_m]
+    node.ellipse_centroid = scene.positions_m[row].astype(float)
+    node.ellipse_matrix_expand, node.ellipse_matrix_compress = expand, np.linalg.inv(expand)
+    return node
+
+
+def _describe_place(
+    node: spark_dsg.SemanticNodeAttributes,
+    scene: Scene,
+    row: int,
+    prefix: str,
+    colors: dict[str, tuple[int, int, int]],
+) -> None:
+    """What places of both kinds tell."""
+    names = {region.id: region.label for region in scene.regions}
+    label = names.get(int(scene.place_regions[row]), "")
+    node.position = scene.positions_m[row].astype(float)
     node.last_update_time_ns = scene.stamp_ns
-    node.name = str(_symbol(PLACE, int(scene.place_ids[row])))
+    node.name = str(_symbol(prefix, int(scene.place_ids[row])))
     node.metadata.set({"label": label, "unknown": float(scene.unknown[row])})
     _label_node(node, label, scene, colors)
-    return node
 
 
 def _room_node(

@@ -7,14 +7,17 @@ import numpy as np
 
 from schemas.codec import Message, Shape
 
-_NO_FRAMES = msgspec.field(default_factory=lambda: np.zeros(0, np.int64))
-_NO_CAMERAS = msgspec.field(default_factory=lambda: np.zeros((0, 3), np.float32))
+_NO_IDS = msgspec.field(default_factory=lambda: np.zeros(0, np.int64))
+_NO_LENGTHS = msgspec.field(default_factory=lambda: np.zeros(0, np.float32))
+_NO_CORNERS = msgspec.field(default_factory=lambda: np.zeros((0, 2), np.float32))
+_NO_POINTS = msgspec.field(default_factory=lambda: np.zeros((0, 3), np.float32))
 
 
 class PlaceDelta(Message, frozen=True, kw_only=True):
     """Change of the place graph since the previous revision; with `snapshot`, the whole graph.
 
-    Apply in this order: remove edges, remove places (their edges go too), merge, upsert places, upsert edges.
+    Apply in this order: remove edges, remove places (with all about them), merge, upsert places, upsert edges,
+    upsert frontiers and surfaces.
     """
 
     robot: str
@@ -34,10 +37,23 @@ class PlaceDelta(Message, frozen=True, kw_only=True):
     removed_edges: Annotated[np.ndarray, Shape("int64", "removed_edge", 2)]
     camera_m: tuple[float, float, float] | None = None  # camera centre of the keyframe, world; None in snapshots
     event: str = ""  # what was wrong with the keyframe or the pose update, one sentence; empty = nothing
-    past_frame_ids: Annotated[np.ndarray, Shape("int64", "past")] = (
-        _NO_FRAMES  # snapshots: all keyframes; else those moved
-    )
-    past_cameras_m: Annotated[np.ndarray, Shape("float32", "past", 3)] = _NO_CAMERAS  # and their camera centres
+    # Snapshots: the keyframes so far and their camera centres; else those that a pose update moved.
+    past_frame_ids: Annotated[np.ndarray, Shape("int64", "past")] = _NO_IDS
+    past_cameras_m: Annotated[np.ndarray, Shape("float32", "past", 3)] = _NO_POINTS
+    # Frontiers: places beside unobserved space, the direction towards it, and the area of the opening, 0 = none now.
+    frontier_ids: Annotated[np.ndarray, Shape("int64", "frontier")] = _NO_IDS
+    frontier_directions: Annotated[np.ndarray, Shape("float32", "frontier", 3)] = _NO_POINTS
+    frontier_areas_m2: Annotated[np.ndarray, Shape("float32", "frontier")] = _NO_LENGTHS
+    # 2D places: the ellipse on the ground (half axes in metres, angle of the long one in radians) and the convex hull,
+    # whose points of all such places follow each other.
+    surface_ids: Annotated[np.ndarray, Shape("int64", "surface")] = _NO_IDS
+    ellipses: Annotated[np.ndarray, Shape("float32", "surface", 3)] = _NO_POINTS
+    hull_counts: Annotated[np.ndarray, Shape("int64", "surface")] = _NO_IDS
+    hulls_m: Annotated[np.ndarray, Shape("float32", "hull", 2)] = _NO_CORNERS
+
+    def check(self) -> None:
+        if (self.hull_counts < 0).any() or self.hull_counts.sum() != len(self.hulls_m):
+            raise ValueError("hull_counts do not add up to the points of hulls_m")
 
 
 class SnapshotRequest(Message, frozen=True, kw_only=True):

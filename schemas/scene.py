@@ -9,6 +9,9 @@ from schemas.codec import Message, Shape
 from schemas.regions import Region
 
 _NO_IDS = msgspec.field(default_factory=lambda: np.zeros(0, np.int64))
+_NO_LENGTHS = msgspec.field(default_factory=lambda: np.zeros(0, np.float32))
+_NO_CORNERS = msgspec.field(default_factory=lambda: np.zeros((0, 2), np.float32))
+_NO_POINTS = msgspec.field(default_factory=lambda: np.zeros((0, 3), np.float32))
 
 
 class SceneRevision(Message, frozen=True, kw_only=True):
@@ -51,3 +54,11 @@ class Scene(Message, frozen=True, kw_only=True):
     clearances_m: Annotated[np.ndarray, Shape("float32", "edge")]
     trajectory: Annotated[np.ndarray, Shape("float32", "frame", 3)]  # camera centres of the keyframes, world
     predicted_ids: Annotated[np.ndarray, Shape("int64", "predicted")] = _NO_IDS  # places whose label is a prediction
+    # Frontiers and 2D places, as in PlaceDelta.
+    frontier_ids: Annotated[np.ndarray, Shape("int64", "frontier")] = _NO_IDS
+    frontier_directions: Annotated[np.ndarray, Shape("float32", "frontier", 3)] = _NO_POINTS
+    frontier_areas_m2: Annotated[np.ndarray, Shape("float32", "frontier")] = _NO_LENGTHS
+    surface_ids: Annotated[np.ndarray, Shape("int64", "surface")] = _NO_IDS
+    ellipses: Annotated[np.ndarray, Shape("float32", "surface", 3)] = _NO_POINTS
+    hull_counts: Annotated[np.ndarray, Shape("int64", "surface")] = _NO_IDS
+    hulls_m: Annotated[np.ndarray, Shape("float32", "hull", 2)] = _NO_CORNERS

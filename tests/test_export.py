@@ -4,9 +4,11 @@ import json
 from pathlib import Path
 
 import cv2
+import msgspec
 import numpy as np
 import pytest
 import spark_dsg
+from scipy.spatial.transform import Rotation
 
 from deploy.evaluation.metrics import GroundTruth
 from deploy.export import map_png, save_json, save_spark_dsg, scene_json, spark_dsg_graph
@@ -91,6 +93,9 @@ def test_json_by_hand():
         "posterior": {"hall": 0.125, "kitchen": 0.75, "office": 0.125},
         "unknown": 0.25,
         "predicted": False,
+        "frontier": None,
+        "ellipse": None,
+        "hull_m": [],
     }
     assert data["places"][4]["region"] is data["places"][4]["label"] is data["places"][4]["posterior"] is None
     kitchen, hall, other = data["regions"]
@@ -130,6 +135,49 @@ def test_spark_dsg_reads_the_same_counts(tmp_path, name, make):
         sum(len(r["adjacent"]) for r in data["regions"]) / 2,
     )
     assert graph.get_layer("BUILDINGS").num_nodes() == (1 if data["regions"] else 0)
+
+
+def with_details():
+    square = np.array([(0, 0), (2, 0), (2, 1), (0, 1)], np.float32)
+    return msgspec.structs.replace(
+        flat(),
+        frontier_ids=np.array([13]),
+        frontier_directions=np.array([(0, 1, 0)], np.float32),
+        frontier_areas_m2=np.array([2.25], np.float32),
+        surface_ids=np.array([10, 13, 16, 19, 22]),
+        ellipses=np.tile(np.array((2.0, 0.5, np.pi / 2), np.float32), (5, 1)),
+        hull_counts=np.full(5, 4),
+        hulls_m=np.tile(square, (5, 1)),
+    )
+
+
+def test_openings_are_exported_as_frontiers():
+    scene = msgspec.structs.replace(with_details(), **{k: getattr(flat(), k) for k in GROUND})
+    place = json.loads(json.dumps(scene_json(scene)))["places"][1]
+    assert place["frontier"] == {"direction": [0.0, 1.0, 0.0], "area_m2": 2.25} and place["ellipse"] is None
+    attributes = node(spark_dsg_graph(scene), "p", 13).attributes
+    assert attributes.active_frontier and attributes.frontier_scale.tolist() == [0.0, 1.5, 1.5]
+    turn = attributes.orientation
+    x_axis = Rotation.from_quat((turn.x, turn.y, turn.z, turn.w)).apply((1, 0, 0))
+    assert x_axis == pytest.approx((0, 1, 0), abs=1e-9)
+    assert not node(spark_dsg_graph(scene), "p", 16).attributes.active_frontier
+
+
+GROUND = ("surface_ids", "ellipses", "hull_counts", "hulls_m")
+
+
+def test_places_on_the_ground_are_exported_with_hull_and_ellipse(tmp_path):
+    place = json.loads(json.dumps(scene_json(with_details())))["places"][1]
+    assert place["ellipse"] == {"half_axes_m": [2.0, 0.5], "angle_rad": 1.5708} and len(place["hull_m"]) == 4
+    spark_dsg_graph(with_details()).save(str(tmp_path / "dsg.json"), include_mesh=False)
+    graph = spark_dsg.DynamicSceneGraph.load(str(tmp_path / "dsg.json"))
+    attributes = node(graph, "P", 13).attributes
+    assert isinstance(attributes, spark_dsg.Place2dNodeAttributes)
+    assert attributes.ellipse_matrix_expand == pytest.approx(np.array(((0, -0.5), (2.0, 0))), abs=1e-6)
+    assert attributes.ellipse_matrix_compress @ attributes.ellipse_matrix_expand == pytest.approx(np.eye(2), abs=1e-6)
+    assert [corner.tolist() for corner in attributes.boundary] == [[0, 0, 1], [2, 0, 1], [2, 1, 1], [0, 1, 1]]
+    assert node(graph, "P", 13).get_parent() == spark_dsg.NodeSymbol("R", 4).value
+    assert graph.get_edge(spark_dsg.NodeSymbol("P", 13), spark_dsg.NodeSymbol("P", 16)).info.weight == 0.375
 
 
 def test_spark_dsg_hierarchy_and_attributes():

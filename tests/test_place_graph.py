@@ -20,7 +20,7 @@ from schemas.frames import ArchiveReply, Intrinsics, Keyframe, PoseUpdate
 from schemas.places import MapRequest, PlaceDelta, SnapshotRequest
 from schemas.topics import PLACE_DELTA, PLACE_SNAPSHOT, VOXEL_MAP
 from services.geometry import inside_polygon, pose_from_quaternion
-from services.place_graph import core, distance, images, links, service
+from services.place_graph import core, distance, frontiers, images, links, service
 from services.place_graph.config import PRESETS, Config, preset
 from services.place_graph.grid import BLOCK, FAR_D2, FREE, OCCUPIED, UNKNOWN_D2, UNOBSERVED, Block, Box, VoxelGrid
 from services.runtime.config import resolve
@@ -145,12 +145,14 @@ class Reader:
     places: dict = field(default_factory=dict)
     edges: dict = field(default_factory=dict)
     merged: set = field(default_factory=set)
+    frontiers: dict = field(default_factory=dict)
 
     def apply(self, delta: PlaceDelta) -> None:
         for a, b in delta.removed_edges.tolist():
             del self.edges[a, b]
         for gone in [*delta.removed_ids.tolist(), *delta.merged_ids[:, 0].tolist()]:
             del self.places[gone]
+            self.frontiers.pop(gone, None)
             self.edges = {pair: c for pair, c in self.edges.items() if gone not in pair}
         for n, place_id in enumerate(delta.place_ids.tolist()):
             assert place_id not in self.merged
@@ -164,6 +166,12 @@ class Reader:
         for (a, b), clearance in zip(delta.edges.tolist(), delta.clearances_m.tolist(), strict=True):
             assert a < b and a in self.places and b in self.places
             self.edges[a, b] = clearance
+        openings = np.concatenate((delta.frontier_directions, delta.frontier_areas_m2[:, None]), axis=1)
+        for place_id, opening in zip(delta.frontier_ids.tolist(), openings.tolist(), strict=True):
+            assert place_id in self.places
+            self.frontiers[place_id] = opening
+            if not opening[3]:
+                del self.frontiers[place_id]
 
 
 def read(deltas: list[PlaceDelta]) -> Reader:
@@ -481,6 +489,46 @@ def test_thinning_keeps_what_is_connected_connected():
     after = connected_components(csr_matrix(keep), directed=False)
     assert before[0] == after[0] and (before[1] == after[1]).all()
     assert keep.sum() < np.triu(clear > 0).sum()
+
+
+# Frontiers.
+
+
+def test_a_doorway_not_yet_passed_is_a_frontier_that_closes_once_it_is_seen_through():
+    state = start()
+    first = play(state, walk(TWO_ROOMS, [(0.8, 0.6, 1.3)]))  # sees little through the door, aslant
+    opened = read(first).frontiers
+    assert opened == read([ask(state)]).frontiers and opened
+    positions = dict(zip(ask(state).place_ids.tolist(), ask(state).positions_m.tolist(), strict=True))
+    widest = max(opened, key=lambda i: opened[i][3])
+    assert positions[widest][0] > 2.0 and positions[widest][1] > 0.8
+    assert opened[widest][3] > 0.4
+    normals = np.linalg.norm([o[:3] for o in opened.values()], axis=1)
+    np.testing.assert_allclose(normals, 1.0, rtol=1e-5)
+    later = play(state, [keyframe(50 + n, f.world_from_camera, f.depth) for n, f in enumerate(TWO_ROOMS_WALK)])
+    closed = read([*first, *later]).frontiers
+    assert closed == read([ask(state)]).frontiers
+    assert sum(o[3] for o in closed.values()) < 0.5 * sum(o[3] for o in opened.values())
+
+
+def test_normals_of_a_hole_cancel_and_those_of_an_opening_add_up():
+    label = np.full((20, 20, 20), OCCUPIED, np.uint8)
+    label[2:18, 2:18, 2:18] = FREE
+    label[8:11, 8:10, 8:12] = UNOBSERVED  # a hole
+    label[18, 5:9, 6:12] = UNOBSERVED  # an opening of 4 by 6
+    found = frontiers.summed_normals(label, np.array([(5, 9, 9), (14, 9, 9), (14, 9, 10)]), np.full(3, 12.0))
+    assert found.sum(axis=0).tolist() == [24, 0, 0] and found[1:].any(axis=1).all()
+    assert not frontiers.summed_normals(label, np.array([(5, 9, 9)]), np.array([1.5])).any()
+
+
+def test_openings_do_not_depend_on_the_order_of_keyframes(two_rooms):
+    state = start(FEARLESS)
+    play(state, TWO_ROOMS_WALK[::-1], FEARLESS)
+
+    def by_position(s):
+        return {s.graph.places[i].voxel: s.openings.normals[i].tolist() for i in s.graph.places}
+
+    assert by_position(state) == by_position(two_rooms[0])
 
 
 # Bounded memory.

@@ -412,6 +412,30 @@ def test_everything_a_region_tells_survives_a_restart(tmp_path):
         assert scene.predicted_ids.tolist() == [2]
 
 
+def test_openings_and_ground_are_kept_until_they_close_or_their_place_goes(tmp_path):
+    store = Store(tmp_path / "scene.sqlite")
+    opening = {"frontier_directions": np.array([(0, 0, 1), (1, 0, 0)], np.float32)}
+    ground = {
+        "surface_ids": np.array([1, 2]),
+        "ellipses": np.array([(1, 0.5, 0.25), (3, 2, 1)], np.float32),
+        "hull_counts": np.array([3, 0]),
+        "hulls_m": np.array([(0, 0), (1, 0), (0, 1)], np.float32),
+    }
+    both = {"frontier_ids": np.array([1, 2]), "frontier_areas_m2": np.array([2.0, 0.5], np.float32)}
+    store.feed(place_delta(0, [(1, 0, 0, 1, 0.5), (2, 1, 0, 1, 0.5)], **opening, **both, **ground))
+    for scene in (store.scene(), store.reopened().scene()):
+        assert (scene.frontier_ids.tolist(), scene.frontier_areas_m2.tolist()) == ([1, 2], [2.0, 0.5])
+        assert scene.frontier_directions.tolist() == [[0, 0, 1], [1, 0, 0]]
+        assert scene.ellipses.tolist() == [[1, 0.5, 0.25], [3, 2, 1]] and scene.hull_counts.tolist() == [3, 0]
+        assert scene.hulls_m.tolist() == [[0, 0], [1, 0], [0, 1]]
+    closed = {"frontier_ids": np.array([1]), "frontier_areas_m2": np.zeros(1, np.float32)}
+    again = store.reopened()
+    again.feed(place_delta(1, frontier_directions=np.zeros((1, 3), np.float32), **closed))
+    again.feed(place_delta(2, removed_ids=[2]))
+    for scene in (again.scene(), again.reopened().scene()):
+        assert scene.frontier_ids.tolist() == [] and scene.surface_ids.tolist() == [1]
+
+
 def test_a_file_of_the_former_layout_is_upgraded(tmp_path):
     path = tmp_path / "scene.sqlite"
     store = Store(path)
@@ -421,6 +445,7 @@ def test_a_file_of_the_former_layout_is_upgraded(tmp_path):
     with sqlite3.connect(path) as sql:
         sql.execute("ALTER TABLE regions DROP COLUMN message")
         sql.execute("ALTER TABLE beliefs DROP COLUMN predicted")
+        sql.execute("DROP TABLE place_details")
         sql.execute("PRAGMA user_version = 1")
     again = Store(path)
     assert encode(again.scene()) == encode(before)

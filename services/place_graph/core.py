@@ -15,6 +15,7 @@ from schemas.places import PlaceDelta, VoxelMap
 from services.place_graph import distance, images, places, tsdf
 from services.place_graph.archive import Archive, Kept, moved
 from services.place_graph.config import Config
+from services.place_graph.frontiers import Openings
 from services.place_graph.graph import Changes, PlaceGraph, Rules
 from services.place_graph.grid import BLOCK, FREE, OCCUPIED, Box, VoxelGrid
 from services.place_graph.published import Published
@@ -31,6 +32,7 @@ class State:
     epoch: int
     graph: PlaceGraph
     archive: Archive
+    openings: Openings
     grid: VoxelGrid = field(default_factory=VoxelGrid)
     published: Published = field(default_factory=Published)
     track: Track = field(default_factory=Track)
@@ -58,7 +60,7 @@ def empty(robot: str, epoch: int, cfg: Config) -> State:
         overlap=cfg.voxels(cfg.overlap_min_clearance_m),
         overlap_check=cfg.overlap_num_neighbors_to_check if cfg.add_overlap_edges else 0,
     )
-    return State(robot, epoch, PlaceGraph(rules), Archive(cfg.archive_mb * 1e6))
+    return State(robot, epoch, PlaceGraph(rules), Archive(cfg.archive_mb * 1e6), Openings(int(1.5 * cfg.cell_voxels)))
 
 
 def integrate(state: State, keyframe: Keyframe, cfg: Config) -> PlaceDelta:
@@ -134,12 +136,15 @@ def refresh(state: State, changed: np.ndarray, cfg: Config) -> Changes:
     for box in boxes:
         if box is not None:
             changes.add(_renewed_places(state, box, cfg))
+    for box in boxes:
+        if box is not None:
+            changes.opened |= state.openings.renew(state.grid, state.graph, box)
     return changes
 
 
 def snapshot(state: State, cfg: Config) -> PlaceDelta:
     """Everything published so far as one delta, ids ascending, at the last revision."""
-    fields = state.published.snapshot(cfg.voxel_m)
+    fields = state.published.snapshot(cfg.voxel_m) | state.openings.all(cfg.voxel_m)
     return PlaceDelta(
         robot=state.robot,
         epoch=state.epoch,
@@ -291,6 +296,11 @@ def _delta(
 ) -> PlaceDelta:
     state.revision += 1
     fields = state.published.update(state.graph, changes, cfg.voxel_m, cfg.min_component_size, cfg.min_diff_m)
+    shown = state.published.places
+    gone = (*fields["removed_ids"].tolist(), *fields["merged_ids"][:, 0].tolist())
+    looked_at = changes.opened.union(fields["place_ids"].tolist(), gone)
+    fields |= state.openings.tell(looked_at, shown, cfg.voxel_m, cfg.frontier_min_area_m2)
+    state.openings.forget(i for i in changes.touched if i not in state.graph.places)
     return PlaceDelta(
         robot=state.robot,
         epoch=state.epoch,

@@ -41,11 +41,13 @@ class Changes:
 
     touched: set[int] = field(default_factory=set)
     merged: dict[int, int] = field(default_factory=dict)
+    opened: set[int] = field(default_factory=set)  # ids whose openings were looked at again
 
     def add(self, later: "Changes") -> None:
         """Changes that came after these."""
         self.touched |= later.touched
         self.merged |= later.merged
+        self.opened |= later.opened
 
 
 @dataclass(frozen=True)
@@ -94,7 +96,7 @@ class PlaceGraph:
 
     def freeze(self, box: Box) -> None:
         """The voxels of a box were dropped: its places stay as they are until they are seen again."""
-        self.frozen.update(self._ids_within(box))
+        self.frozen.update(self.within(box))
 
     @property
     def _reach_voxels(self) -> int:
@@ -108,7 +110,7 @@ class PlaceGraph:
 
         Returns the id of every extracted place that has one, and the old ids of `region` that nothing took over.
         """
-        old_ids = self._ids_within(region)
+        old_ids = self.within(region)
         inside = region.contains(extraction.voxels)
         new = np.flatnonzero(inside)
         frozen = np.array([i in self.frozen for i in old_ids], np.bool_)
@@ -162,7 +164,7 @@ class PlaceGraph:
 
     def _touch(self, region: Box, extraction: Extraction, id_of: dict[int, int]) -> set[int]:
         """Renew which places touch, for all pairs with an end inside `region`; returns whose company changed."""
-        inside = set(self._ids_within(region)) - self.frozen
+        inside = set(self.within(region)) - self.frozen
         before = {place_id: self._touching.pop(place_id, set()) for place_id in inside}
         for place_id, others in before.items():
             for other in others - inside:
@@ -176,8 +178,8 @@ class PlaceGraph:
 
     def _relink(self, region: Box, grid: VoxelGrid, changes: Changes) -> None:
         """Renew the edges that may have changed: those with an end in `region`, or both ends within reach of it."""
-        inside = set(self._ids_within(region))
-        near = set(self._ids_within(region.grown(self._reach_voxels)))
+        inside = set(self.within(region))
+        near = set(self.within(region.grown(self._reach_voxels)))
         window = region.grown(2 * self._reach_voxels).clipped(grid.bounds)
         sight = _Sight(grid.gather("d2", window, UNKNOWN_D2), window)
         renewed: dict[int, dict[int, int]] = {a: {} for a in near}
@@ -198,7 +200,7 @@ class PlaceGraph:
 
     def _links_within(self, box: Box, sight: _Sight) -> list[tuple[int, int, int]]:
         """Edges between the places of `box`: smaller id, larger id, squared clearance."""
-        ids = [i for i in self._ids_within(box) if i not in self.frozen]
+        ids = [i for i in self.within(box) if i not in self.frozen]
         index = {place_id: n for n, place_id in enumerate(ids)}
         touching = np.zeros((len(ids), len(ids)), np.bool_)
         for place_id in ids:
@@ -222,7 +224,7 @@ class PlaceGraph:
     def _voxels(self, ids: list[int]) -> np.ndarray:
         return np.array([self.places[i].voxel for i in ids], np.int64).reshape(-1, 3)
 
-    def _ids_within(self, box: Box) -> list[int]:
+    def within(self, box: Box) -> list[int]:
         """Ids of the places whose centre lies in `box`, ascending."""
         low = np.floor_divide(box.low, self.rules.cell)
         high = np.floor_divide(box.high - 1, self.rules.cell) + 1

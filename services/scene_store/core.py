@@ -79,6 +79,8 @@ class Graph:
 
     robot: str
     places: dict[int, Place] = field(default_factory=dict)
+    frontiers: dict[int, np.ndarray] = field(default_factory=dict)  # by place id: direction and area, (4,) float32
+    surfaces: dict[int, np.ndarray] = field(default_factory=dict)  # by place id: ellipse, then hull, flat float32
     edges: dict[Edge, float] = field(default_factory=dict)  # smaller id first; clearance in metres
     neighbours: dict[int, set[int]] = field(default_factory=dict)
     sightings: dict[int, Sighting] = field(default_factory=dict)  # by frame id
@@ -110,6 +112,8 @@ def apply_places(graph: Graph, delta: PlaceDelta) -> Changes:
     changes = Changes(replaced=delta.snapshot or delta.epoch != graph.place_cursor.epoch)
     if changes.replaced:
         graph.places.clear()
+        graph.frontiers.clear()
+        graph.surfaces.clear()
         graph.edges.clear()
         graph.neighbours.clear()
         graph.sightings = {frame: seen for frame, seen in graph.sightings.items() if seen.epoch >= delta.epoch}
@@ -125,9 +129,25 @@ def apply_places(graph: Graph, delta: PlaceDelta) -> Changes:
         changes.places.add(place)
     for (a, b), clearance_m in zip(delta.edges.tolist(), delta.clearances_m.tolist(), strict=True):
         _put_edge(graph, a, b, clearance_m, changes)
+    _put_details(graph, delta, changes)
     graph.place_cursor = Cursor(delta.epoch, delta.revision, delta.stamp_ns)
     graph.revision += 1
     return changes
+
+
+def _put_details(graph: Graph, delta: PlaceDelta, changes: Changes) -> None:
+    """What a delta says about openings and ground of its places; an opening of no area is closed."""
+    openings = np.concatenate((delta.frontier_directions, delta.frontier_areas_m2[:, None]), axis=1)
+    for place, opening in zip(delta.frontier_ids.tolist(), openings, strict=True):
+        graph.frontiers.pop(place, None)
+        if opening[3] > 0 and place in graph.places:
+            graph.frontiers[place] = opening.copy()
+        changes.places.add(place)
+    hulls = np.split(delta.hulls_m, np.cumsum(delta.hull_counts)[:-1])
+    for place, ellipse, hull in zip(delta.surface_ids.tolist(), delta.ellipses, hulls, strict=False):
+        if place in graph.places:
+            graph.surfaces[place] = np.concatenate((ellipse, hull.ravel()))
+            changes.places.add(place)
 
 
 def apply_regions(graph: Graph, delta: RegionDelta) -> Changes:
@@ -227,7 +247,23 @@ def scene(graph: Graph) -> Scene:
         predicted_ids=np.array(
             [place for place, belief in zip(ids, beliefs, strict=True) if belief.predicted], np.int64
         ),
+        **_details(graph),
     )
+
+
+def _details(graph: Graph) -> dict[str, np.ndarray]:
+    """Openings and ground as columns of the scene."""
+    openings = _rows([graph.frontiers[place] for place in sorted(graph.frontiers)], 4, np.float32)
+    surfaces = [graph.surfaces[place] for place in sorted(graph.surfaces)]
+    return {
+        "frontier_ids": np.array(sorted(graph.frontiers), np.int64),
+        "frontier_directions": openings[:, :3],
+        "frontier_areas_m2": openings[:, 3],
+        "surface_ids": np.array(sorted(graph.surfaces), np.int64),
+        "ellipses": _rows([surface[:3] for surface in surfaces], 3, np.float32),
+        "hull_counts": np.array([(len(surface) - 3) // 2 for surface in surfaces], np.int64),
+        "hulls_m": np.concatenate([np.zeros(0, np.float32), *(surface[3:] for surface in surfaces)]).reshape(-1, 2),
+    }
 
 
 def revision_of(graph: Graph, store_epoch: int) -> SceneRevision:
@@ -272,7 +308,8 @@ def _remove_place(graph: Graph, place: int, changes: Changes) -> None:
     for other in sorted(graph.neighbours.get(place, ())):
         _remove_edge(graph, place, other, changes)
     graph.neighbours.pop(place, None)
-    graph.places.pop(place, None)
+    for columns in (graph.places, graph.frontiers, graph.surfaces):
+        columns.pop(place, None)
     changes.places.add(place)
 
 

@@ -20,7 +20,7 @@ from services.runtime.service import ServiceError
 from services.scene_store import core
 
 APPLICATION_ID = 0x70736753  # "psgS", in the header of the file
-LAYOUT_VERSION = 2
+LAYOUT_VERSION = 3
 
 LAYOUT = """
 CREATE TABLE robots (id INTEGER PRIMARY KEY, name TEXT NOT NULL UNIQUE);
@@ -35,6 +35,9 @@ CREATE TABLE places (
 CREATE TABLE edges (
     robot INTEGER NOT NULL REFERENCES robots, a INTEGER NOT NULL, b INTEGER NOT NULL, clearance_m REAL NOT NULL,
     PRIMARY KEY (robot, a, b)) WITHOUT ROWID;
+CREATE TABLE place_details (
+    robot INTEGER NOT NULL REFERENCES robots, place INTEGER NOT NULL, kind TEXT NOT NULL, numbers BLOB NOT NULL,
+    PRIMARY KEY (robot, place, kind)) WITHOUT ROWID;
 CREATE TABLE cameras (
     robot INTEGER NOT NULL REFERENCES robots, frame_id INTEGER NOT NULL,
     epoch INTEGER NOT NULL, revision INTEGER NOT NULL, x_m REAL NOT NULL, y_m REAL NOT NULL, z_m REAL NOT NULL,
@@ -66,7 +69,11 @@ CREATE TABLE revisions (
 
 UPGRADES = {  # statements that bring a file of the version before to this one
     2: "ALTER TABLE regions ADD COLUMN message BLOB;"
-    "ALTER TABLE beliefs ADD COLUMN predicted INTEGER NOT NULL DEFAULT 0;"
+    "ALTER TABLE beliefs ADD COLUMN predicted INTEGER NOT NULL DEFAULT 0;",
+    3: """CREATE TABLE place_details (
+    robot INTEGER NOT NULL REFERENCES robots, place INTEGER NOT NULL, kind TEXT NOT NULL, numbers BLOB NOT NULL,
+    PRIMARY KEY (robot, place, kind)) WITHOUT ROWID;
+""",
 }
 
 
@@ -142,6 +149,8 @@ class Database:
             setattr(graph, f"{topic}_cursor", core.Cursor(*cursor))
         for place, x, y, z, *rest in self._select("id, x_m, y_m, z_m, radius_m, basis_points FROM places", robot):
             graph.places[place] = core.Place((x, y, z), *rest)
+        for place, kind, numbers in self._select("place, kind, numbers FROM place_details", robot):
+            getattr(graph, kind)[place] = np.frombuffer(numbers, "<f4")
         for a, b, clearance_m in self._select("a, b, clearance_m FROM edges", robot):
             core.link(graph, (a, b), clearance_m)
         for frame, epoch, revision, *xyz in self._select(
@@ -201,6 +210,7 @@ class Database:
             if changes.replaced:
                 self._sql.execute("DELETE FROM places WHERE robot = ?", (robot,))
                 self._sql.execute("DELETE FROM edges WHERE robot = ?", (robot,))
+                self._sql.execute("DELETE FROM place_details WHERE robot = ?", (robot,))
                 self._sql.execute(
                     "DELETE FROM cameras WHERE robot = ? AND epoch < ?", (robot, graph.place_cursor.epoch)
                 )
@@ -212,10 +222,20 @@ class Database:
             self._delete("places", "id", robot, gone_places)
             kept = ((place, graph.places[place]) for place in sorted(changes.places & graph.places.keys()))
             self._put("places", ((robot, place, *at.position_m, at.radius_m, at.basis_points) for place, at in kept))
+            self._put_details(robot, graph, changes)
             edges = sorted(changes.edges & graph.edges.keys())
             self._put("edges", ((robot, *edge, graph.edges[edge]) for edge in edges))
             self._put_cameras(robot, cameras)
             self._put_cursor(robot, "place", graph.place_cursor, graph)
+
+    def _put_details(self, robot: int, graph: core.Graph, changes: core.Changes) -> None:
+        self._delete("place_details", "place", robot, sorted(changes.places))
+        for kind in ("frontiers", "surfaces"):
+            numbers = getattr(graph, kind)
+            rows = (
+                (robot, p, kind, numbers[p].astype("<f4").tobytes()) for p in sorted(changes.places & numbers.keys())
+            )
+            self._put("place_details", rows)
 
     def put_regions(self, graph: core.Graph, changes: core.Changes) -> None:
         """Make one applied region delta durable."""
