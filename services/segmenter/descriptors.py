@@ -14,6 +14,7 @@ from scipy import ndimage
 from schemas.features import Pyramid
 from schemas.frames import Intrinsics
 from services.geometry import inverse
+from services.segmenter.kernels import accumulate, weigh
 
 PAIRS_PER_BLOCK = 1 << 19  # frame-place pairs tested at once; bounds the memory of the visibility test
 
@@ -43,7 +44,7 @@ class Frame(NamedTuple):
     sigmas_px: np.ndarray  # (crop,) float32
     layer_starts: np.ndarray  # (layer,) first crop of each layer
     embeddings: np.ndarray  # (crop, dim) float16
-    surface_m: np.ndarray  # (row, column) float32, holes filled
+    surface_m: np.ndarray  # (row, column) float16, holes filled
 
 
 def compact(pyramid: Pyramid) -> Frame:
@@ -56,7 +57,7 @@ def compact(pyramid: Pyramid) -> Frame:
         sigmas_px=pyramid.sigmas_px[order],
         layer_starts=np.unique(pyramid.layers[order], return_index=True)[1],
         embeddings=pyramid.embeddings[order],
-        surface_m=fill_holes(pyramid.surface_m),
+        surface_m=fill_holes(pyramid.surface_m).astype(np.float16),
     )
 
 
@@ -107,13 +108,10 @@ def kernel(frame: Frame, positions_m: np.ndarray, query_radius_m: float, gamma: 
     """
     pixels, depths_m = project(frame, positions_m)
     focal_px = 0.5 * (frame.intrinsics.fx_px + frame.intrinsics.fy_px)
-    sigmas_px = (focal_px * query_radius_m / depths_m).astype(np.float32)[:, None]
-    offsets_px = pixels.astype(np.float32)[:, None, :] - frame.centers_px
-    spatial = (offsets_px**2).sum(axis=2) / (2 * (sigmas_px**2 + frame.sigmas_px**2))
-    scale = (np.log(sigmas_px) - np.log(frame.sigmas_px)) ** 2 / np.float32(gamma)
-    weights = np.exp(-(spatial + scale))
-    trust = np.maximum.reduceat(weights, frame.layer_starts, axis=1).sum(axis=1)
-    return weights, trust
+    sigmas_px = (focal_px * query_radius_m / depths_m).astype(np.float32)
+    return weigh(
+        pixels.astype(np.float32), sigmas_px, frame.centers_px, frame.sigmas_px, frame.layer_starts, float(gamma)
+    )
 
 
 class Evidence:
@@ -159,7 +157,7 @@ class Evidence:
         """Add one frame's observation of the places in `slots` (eqs. single_observation_feature,
         temporal_fusion_places)."""
         self._reserve(self._used, frame.embeddings.shape[1])
-        self.sums[slots] += (weights * trust[:, None]) @ frame.embeddings.astype(np.float32)
+        accumulate(self.sums, slots, weights, trust, frame.embeddings.astype(np.float32))
         self.trust[slots] += trust
         self.frames[slots] += 1
 

@@ -1,0 +1,59 @@
+"""Compiled loops of the integration kernel; what they compute stands in `descriptors` (pure)."""
+
+import numpy as np
+from numba import njit
+
+ROWS_PER_BLOCK = 128  # places multiplied at once: their sums stay in the processor's cache
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def weigh(
+    pixels: np.ndarray,
+    sigmas_px: np.ndarray,
+    crop_centers_px: np.ndarray,
+    crop_sigmas_px: np.ndarray,
+    layer_starts: np.ndarray,
+    gamma: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Weights (place, crop) and trust (place,), float32: eqs. spatial_affinity, scale_trust, observation_trust.
+
+    `pixels` (place, 2) and `sigmas_px` (place,) are the query states; all inputs but the starts and gamma float32.
+    """
+    places, crops, layers = len(pixels), len(crop_sigmas_px), len(layer_starts)
+    weights, trust = np.empty((places, crops), np.float32), np.zeros(places, np.float32)
+    crop_logs, sharpness = np.log(crop_sigmas_px), np.float32(1.0 / gamma)
+    for place in range(places):
+        u, v = pixels[place]
+        area, log = sigmas_px[place] ** 2, np.log(sigmas_px[place])
+        for layer in range(layers):
+            end = layer_starts[layer + 1] if layer + 1 < layers else crops
+            best = np.float32(0.0)
+            for crop in range(layer_starts[layer], end):
+                du, dv = u - crop_centers_px[crop, 0], v - crop_centers_px[crop, 1]
+                spatial = (du * du + dv * dv) / (np.float32(2.0) * (area + crop_sigmas_px[crop] ** 2))
+                scale = (log - crop_logs[crop]) ** 2 * sharpness
+                weight = np.exp(-(spatial + scale))
+                weights[place, crop] = weight
+                best = max(best, weight)
+            trust[place] += best
+    return weights, trust
+
+
+@njit(cache=True, nogil=True)
+def accumulate(
+    sums: np.ndarray, slots: np.ndarray, weights: np.ndarray, trust: np.ndarray, embeddings: np.ndarray
+) -> None:
+    """sums[slots] += (trust * weights) @ embeddings, float32, in blocks of rows; no slot twice."""
+    dim = embeddings.shape[1]
+    scaled = np.empty((ROWS_PER_BLOCK, weights.shape[1]), np.float32)
+    products = np.empty((ROWS_PER_BLOCK, dim), np.float32)
+    for start in range(0, len(slots), ROWS_PER_BLOCK):
+        count = min(ROWS_PER_BLOCK, len(slots) - start)
+        for row in range(count):
+            for crop in range(weights.shape[1]):
+                scaled[row, crop] = weights[start + row, crop] * trust[start + row]
+        np.dot(scaled[:count], embeddings, products[:count])
+        for row in range(count):
+            target = sums[slots[start + row]]
+            for column in range(dim):
+                target[column] += products[row, column]
