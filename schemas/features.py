@@ -36,6 +36,7 @@ class Backfill(Message, frozen=True, kw_only=True):
     robot: str
     space: str
     frame_ids: Annotated[np.ndarray, Shape("int64", "frame")]  # those it has
+    settled: bool = False  # nothing has come for a while: what it lacks is not just on its way
 
 
 class TextRequest(Message, frozen=True, kw_only=True):

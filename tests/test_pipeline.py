@@ -22,6 +22,7 @@ from deploy.replay import compare, open_log
 from deploy.run import Job, run
 from schemas.codec import DecodeError, decode
 from schemas.topics import ENCODE, JOURNAL, KEYFRAME, PYRAMID, TOPICS, worker_keys
+from services.runtime.jobs import CREDITS
 from services.runtime.record import LogWriter, read_log, summary
 from services.runtime.zenoh_bus import ZenohBus
 
@@ -160,7 +161,8 @@ def test_all_places_are_labelled_with_the_new_task(disturbed):
 def test_the_task_switch_encoded_nothing_again(disturbed):
     result, _, trouble = disturbed
     assert "regions for 'hospitality service' after" in trouble.task_output
-    assert sum(result.counts.pyramids.values()) - FRAMES <= 2  # only what the killed worker had in hand may repeat
+    repeated = sum(result.counts.pyramids.values()) - FRAMES
+    assert repeated <= CREDITS  # only what the killed worker had in hand, or a slow one seemed to have dropped
 
 
 def test_garbage_is_counted_per_topic(disturbed):

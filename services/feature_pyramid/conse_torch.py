@@ -12,6 +12,8 @@ from transformers import BertConfig, BertModel
 
 from services.feature_pyramid.encoders import package
 
+PIXEL_MEAN, PIXEL_SCALE = 127.0, 128.0  # what the EfficientNet-Lite weights were trained with
+
 
 class Classifier:
     """EfficientNet-Lite."""
@@ -21,18 +23,29 @@ class Classifier:
             torch.set_num_threads(threads)
         network = package("efficientnet_lite_pytorch").EfficientNet.from_name(name)
         network.load_state_dict(torch.load(_weights_path(name), map_location="cpu", weights_only=True))
-        self.network = _folded(network.eval()).to(memory_format=torch.channels_last)
+        self.network = _Normalised(_folded(network.eval())).eval().to(memory_format=torch.channels_last)
 
     def __call__(self, pixels: np.ndarray) -> np.ndarray:
-        """Class logits (crop, class) of normalised pixels, float32 (crop, 3, h, w)."""
+        """Class logits (crop, class) of RGB pixels, uint8 (crop, side, side, 3)."""
         with torch.inference_mode():
-            return self.network(torch.from_numpy(pixels).to(memory_format=torch.channels_last)).numpy()
+            return self.network(torch.from_numpy(pixels)).numpy()
 
     def export(self, path: Path, side_px: int) -> None:
         """Write the network as ONNX: `pixels` to `logits`."""
-        example = (torch.zeros(2, 3, side_px, side_px),)
+        example = (torch.zeros(2, side_px, side_px, 3, dtype=torch.uint8),)
         network = self.network.to(memory_format=torch.contiguous_format)
         _export(network, example, path, {"pixels": {0: "crop"}}, "logits")
+
+
+class _Normalised(torch.nn.Module):
+    """The network behind what its pixels go through first."""
+
+    def __init__(self, network: Any) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, pixels: torch.Tensor) -> torch.Tensor:
+        return self.network((pixels.permute(0, 3, 1, 2).to(torch.float32) - PIXEL_MEAN) / PIXEL_SCALE)
 
 
 class Sentences:

@@ -4,6 +4,7 @@ import msgspec
 import numpy as np
 
 from schemas.frames import Intrinsics
+from services.feature_pyramid.medians import patch_medians
 
 
 class Config(msgspec.Struct, frozen=True, kw_only=True):
@@ -78,7 +79,8 @@ def select_crops(depth_m: np.ndarray, camera: Intrinsics, cfg: Config) -> Select
     size is unknown.
     """
     crops = pyramid_crops(camera.width_px, camera.height_px, cfg)
-    depths_m = np.array([median_depth(patch) for patch in crops.cut(depth_m)], np.float32)
+    boxes = np.stack((crops.left_px, crops.top_px, crops.side_px), axis=1)
+    depths_m = patch_medians(np.ascontiguousarray(depth_m, np.float32), boxes)
     keep = (depths_m > 0.0) & (physical_area(crops.sigmas_px, depths_m, camera) >= cfg.min_area_m2)
     return Selection(crops.take(keep), depths_m[keep], len(crops))
 
@@ -109,12 +111,6 @@ def crop_starts(length_px: int, side_px: int, overlap: float) -> list[int]:
     stride = max(1, int(side_px * (1.0 - overlap)))
     steps = -(-(length_px - side_px) // stride)
     return [round(index * (length_px - side_px) / steps) for index in range(steps + 1)] if steps else [0]
-
-
-def median_depth(patch_m: np.ndarray) -> float:
-    """Median of the measured depths, 0 when there is none."""
-    valid = patch_m[patch_m > 0.0]
-    return float(np.median(valid)) if valid.size else 0.0
 
 
 def physical_area(sigmas_px: np.ndarray, depths_m: np.ndarray, camera: Intrinsics) -> np.ndarray:

@@ -32,6 +32,7 @@ from schemas.status import JobDone
 from schemas.topics import CAMERA_STATE, ENCODE, INGEST_STATE, KEYFRAME, POSE_UPDATE, Topic
 from services.geometry import inverse, rotation_angle_rad
 
+ON_THE_WAY = 16  # keyframes whose pyramids may overtake each other
 Written = tuple[Topic, Message]
 
 
@@ -210,9 +211,14 @@ def encoded(state: State, done: JobDone) -> Iterator[Written]:
 
 
 def backfill(state: State, wish: Backfill) -> Iterator[Written]:
-    """Encode archived keyframes again, in one space: those that the asking reader lacks. They give way to new ones."""
+    """Encode archived keyframes again, in one space: those that the asking reader lacks. They give way to new ones.
+
+    Unless the reader has settled, the newest ones are left out: their pyramids may be on the way to it.
+    """
     known = set(wish.frame_ids.tolist())
-    for keyframe in state.archive:
+    newest = max(known, default=-1)
+    settled = [k for k in state.archive if k.frame_id <= newest][:-ON_THE_WAY] if not wish.settled else state.archive
+    for keyframe in settled:
         if keyframe.frame_id not in known:
             yield ENCODE, msgspec.structs.replace(keyframe, space=wish.space)
 

@@ -108,10 +108,9 @@ def kernel(frame: Frame, positions_m: np.ndarray, query_radius_m: float, gamma: 
     """
     pixels, depths_m = project(frame, positions_m)
     focal_px = 0.5 * (frame.intrinsics.fx_px + frame.intrinsics.fy_px)
-    sigmas_px = (focal_px * query_radius_m / depths_m).astype(np.float32)
-    return weigh(
-        pixels.astype(np.float32), sigmas_px, frame.centers_px, frame.sigmas_px, frame.layer_starts, float(gamma)
-    )
+    query_states = np.column_stack((pixels, focal_px * query_radius_m / depths_m)).astype(np.float32)
+    crop_states = np.column_stack((frame.centers_px, frame.sigmas_px))
+    return weigh(query_states, crop_states, frame.layer_starts, float(gamma))
 
 
 class Evidence:

@@ -8,29 +8,24 @@ ROWS_PER_BLOCK = 128  # places multiplied at once: their sums stay in the proces
 
 @njit(cache=True, nogil=True, fastmath=True)
 def weigh(
-    pixels: np.ndarray,
-    sigmas_px: np.ndarray,
-    crop_centers_px: np.ndarray,
-    crop_sigmas_px: np.ndarray,
-    layer_starts: np.ndarray,
-    gamma: float,
+    query_states: np.ndarray, crop_states: np.ndarray, layer_starts: np.ndarray, gamma: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Weights (place, crop) and trust (place,), float32: eqs. spatial_affinity, scale_trust, observation_trust.
 
-    `pixels` (place, 2) and `sigmas_px` (place,) are the query states; all inputs but the starts and gamma float32.
+    States are float32 (n, 3): pixel u, v and scale sigma in pixels.
     """
-    places, crops, layers = len(pixels), len(crop_sigmas_px), len(layer_starts)
+    places, crops, layers = len(query_states), len(crop_states), len(layer_starts)
     weights, trust = np.empty((places, crops), np.float32), np.zeros(places, np.float32)
-    crop_logs, sharpness = np.log(crop_sigmas_px), np.float32(1.0 / gamma)
+    crop_logs, sharpness = np.log(crop_states[:, 2]), np.float32(1.0 / gamma)
     for place in range(places):
-        u, v = pixels[place]
-        area, log = sigmas_px[place] ** 2, np.log(sigmas_px[place])
+        u, v, sigma = query_states[place]
+        area, log = sigma**2, np.log(sigma)
         for layer in range(layers):
             end = layer_starts[layer + 1] if layer + 1 < layers else crops
             best = np.float32(0.0)
             for crop in range(layer_starts[layer], end):
-                du, dv = u - crop_centers_px[crop, 0], v - crop_centers_px[crop, 1]
-                spatial = (du * du + dv * dv) / (np.float32(2.0) * (area + crop_sigmas_px[crop] ** 2))
+                du, dv = u - crop_states[crop, 0], v - crop_states[crop, 1]
+                spatial = (du * du + dv * dv) / (np.float32(2.0) * (area + crop_states[crop, 2] ** 2))
                 scale = (log - crop_logs[crop]) ** 2 * sharpness
                 weight = np.exp(-(spatial + scale))
                 weights[place, crop] = weight

@@ -21,7 +21,7 @@ class SpacesConfig(msgspec.Struct, frozen=True, kw_only=True):
 
     follow: bool = True  # take up a space whose workers join; False = stay with `space` for good
     coverage: float = 0.98  # share of the observed places that the new space must have observed too
-    backfill_ticks: int = 6  # after a start or a newcomer, before asking for keyframes: late ones may yet arrive
+    backfill_ticks: int = 6  # after a start, a newcomer, or the last pyramid, before asking: late ones may yet arrive
     repeat_ticks: int = 40  # between questions while keyframes are missing
     patience_ticks: int = 20  # without growth, after which a newcomer is tried although keyframes are missing
     silent_frames: int = (
@@ -49,6 +49,7 @@ class Spaces:
     rivals: dict[str, Rival] = field(default_factory=dict)
     left: set[str] = field(default_factory=set)
     ticks: int = 0
+    still_ticks: int = 0  # since the space in force was last heard
 
 
 def hear(spaces: Spaces, pyramid: Pyramid, in_force: descriptors.Archive, cfg: SpacesConfig) -> bool:
@@ -68,6 +69,7 @@ def hear(spaces: Spaces, pyramid: Pyramid, in_force: descriptors.Archive, cfg: S
 
 def heard_in_force(spaces: Spaces) -> None:
     """The space in force lives."""
+    spaces.still_ticks = 0
     for rival in spaces.rivals.values():
         rival.heard = 0
 
@@ -75,6 +77,7 @@ def heard_in_force(spaces: Spaces) -> None:
 def tick(spaces: Spaces) -> None:
     """Half a second has passed."""
     spaces.ticks += 1
+    spaces.still_ticks += 1
     for rival in spaces.rivals.values():
         rival.ticks += 1
         rival.still_ticks += 1
@@ -87,13 +90,15 @@ def move(spaces: Spaces, frame_id: int, world_from_camera: np.ndarray) -> None:
 
 
 def questions(spaces: Spaces, in_force: descriptors.Archive, robot: str, cfg: SpacesConfig) -> Iterator[Backfill]:
-    """Ask for keyframes: once after the start for what this process has missed, and for newcomers until they cover."""
-    if spaces.ticks == cfg.backfill_ticks and len(in_force):
-        yield _backfill(spaces.force, in_force, robot)
+    """Ask for keyframes: what this process has missed, after its start and whenever the stream rests; and for newcomers
+    until they cover."""
+    started, rests = spaces.ticks == cfg.backfill_ticks, spaces.still_ticks == cfg.backfill_ticks
+    if rests or (started and len(in_force)):
+        yield _backfill(spaces.force, in_force, robot, rests)
     for name, rival in spaces.rivals.items():
         due = rival.ticks >= cfg.backfill_ticks and (rival.ticks - cfg.backfill_ticks) % cfg.repeat_ticks == 0
         if due and _comes(rival, cfg) and not in_force.frame_ids <= rival.archive.frame_ids:
-            yield _backfill(name, rival.archive, robot)
+            yield _backfill(name, rival.archive, robot, rival.still_ticks >= cfg.backfill_ticks)
 
 
 def successor(spaces: Spaces, in_force: descriptors.Archive, cfg: SpacesConfig) -> str | None:
@@ -129,5 +134,6 @@ def _comes(rival: Rival, cfg: SpacesConfig) -> bool:
     return not rival.waits or rival.heard >= cfg.silent_frames
 
 
-def _backfill(space: str, archive: descriptors.Archive, robot: str) -> Backfill:
-    return Backfill(robot=robot, space=space, frame_ids=np.array(sorted(archive.frame_ids), np.int64))
+def _backfill(space: str, archive: descriptors.Archive, robot: str, settled: bool) -> Backfill:
+    frame_ids = np.array(sorted(archive.frame_ids), np.int64)
+    return Backfill(robot=robot, space=space, frame_ids=frame_ids, settled=settled)
