@@ -12,6 +12,8 @@ import msgspec
 import zenoh
 
 from deploy import bench_segmenter
+from deploy.benches import features as bench_features
+from deploy.benches.kernel import kernel
 from deploy.benches.swap import swap_bench
 from schemas.codec import decode, encode
 from schemas.frames import Keyframe
@@ -63,17 +65,13 @@ def places() -> tuple[dict, dict]:
 
 
 def features() -> tuple[dict, dict]:
-    """Crops encoded per second by one worker, selection and decoding included."""
-    keyframes, service = _sample_keyframes()[:24], BY_NAME["feature_pyramid"]
-    cfg: Any = service.config()
-    state = service.init(cfg, Identity("*", "b", 1))
-    list(service.step(state, keyframes[0], cfg))
-    started_s, crops = time.perf_counter(), 0
-    for keyframe in keyframes:
-        outputs: list[Any] = list(service.step(state, keyframe, cfg))
-        crops += sum(len(pyramid.embeddings) for _, pyramid in outputs)
-    seconds = time.perf_counter() - started_s
-    return {"crops_per_s": crops / seconds, "ms_per_keyframe": 1e3 * seconds / len(keyframes)}, {"space": cfg.space}
+    """The pool of feature workers against the bare model."""
+    return bench_features.features(_sample_keyframes())
+
+
+def attacked_pool(seconds: float) -> tuple[dict, dict]:
+    """A pool whose workers are killed, frozen, slowed and added at random."""
+    return bench_features.attacked(_sample_keyframes(), seconds, rate_hz=4.0)
 
 
 def bus() -> tuple[dict, dict]:
@@ -183,6 +181,7 @@ BENCHES: dict[str, Callable[[], tuple[dict, dict]]] = {
     "bus": bus,
     "places": places,
     "features": features,
+    "kernel": kernel,
     "swap": swap_bench,
     "segmenter": bench_segmenter.updates,
     "task": bench_segmenter.switch,
@@ -190,7 +189,10 @@ BENCHES: dict[str, Callable[[], tuple[dict, dict]]] = {
 }
 
 
-def run(name: str) -> dict[str, Any]:
-    """One measurement as the object that `--json` prints."""
-    metrics, settings = BENCHES[name]()
+POOL = "pool"  # lasts as long as it is told to, so it is no part of `all`
+
+
+def run(name: str, seconds: float) -> dict[str, Any]:
+    """One measurement as the object that `--json` prints; `seconds` are those of the attacked pool."""
+    metrics, settings = attacked_pool(seconds) if name == POOL else BENCHES[name]()
     return {"bench": name, "metrics": metrics, "machine": machine(), "settings": settings}

@@ -184,7 +184,8 @@ def _add_tools(command: Command) -> None:
     )
 
     bench = command("bench", "measure one part, or all", "prior-sg bench places --json")
-    bench.add_argument("name", help="bus, places, features, swap, segmenter, task, e2e, or all")
+    bench.add_argument("name", help="bus, places, features, kernel, swap, segmenter, task, e2e, all of these, or pool")
+    bench.add_argument("--seconds", type=float, default=300.0, help="how long pool lasts (default: %(default)s)")
     bench.add_argument("--json", action="store_true", help="print one JSON object per measurement")
 
     priors = command("priors", "list the curated priors", "prior-sg priors list")
@@ -556,11 +557,13 @@ def cmd_bench(arguments: argparse.Namespace) -> int:
     """Measure."""
     from deploy import bench
 
-    if arguments.name not in (*bench.BENCHES, "all"):
-        raise UserError(f"there is no measurement {arguments.name!r}; known: {', '.join(bench.BENCHES)}, all")
+    if arguments.name not in (*bench.BENCHES, bench.POOL, "all"):
+        raise UserError(
+            f"there is no measurement {arguments.name!r}; known: {', '.join((*bench.BENCHES, bench.POOL))}, all"
+        )
     for name in bench.BENCHES if arguments.name == "all" else [arguments.name]:
         with console.status(f"measuring {name}"):
-            found = bench.run(name)
+            found = bench.run(name, arguments.seconds)
         if arguments.json:
             print(json.dumps(found))
         else:

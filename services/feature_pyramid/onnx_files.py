@@ -33,14 +33,14 @@ class Session:
         return self._session.run(None, dict(zip(self.inputs, arrays, strict=True)))[0]
 
 
-def cached(name: str, made_of: list[str], export: Callable[[Path], None]) -> Path:
-    """The exported network `name`, made at first use.
+def cached(name: str, made_of: list[str], export: Callable[[Path], None], suffix: str = ".onnx") -> Path:
+    """The exported network `name`, or another file that takes long to make, made at first use.
 
     `made_of` is everything that determines it (versions, weights): whatever changes gets a file of its own. Several
     processes may export at once; a half-written file is never seen.
     """
     digest = hashlib.blake2b("\n".join(made_of).encode(), digest_size=8).hexdigest()
-    path = cache_folder() / f"{name}-{digest}.onnx"
+    path = cache_folder() / f"{name}-{digest}{suffix}"
     if not path.exists():
         partial = path.with_name(f".{path.name}.{os.getpid()}")
         try:
