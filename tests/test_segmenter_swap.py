@@ -103,7 +103,7 @@ def test_as_low_as_gco_on_random_fields(metric):
     assert np.mean(ratios) < 1.01
 
 
-@pytest.mark.parametrize("settings", [Settings(), Settings(passes=0), Settings(compiled_up_to=0, min_cut="scipy")])
+@pytest.mark.parametrize("settings", [Settings(), Settings(round_trips=0), Settings(compiled_up_to=0, min_cut="scipy")])
 def test_no_cut_of_the_whole_field_improves_the_result(settings):
     """Pairs solved core by core end where cuts of all places of a pair find nothing more."""
     for seed in range(4):

@@ -33,7 +33,6 @@ from services.segmenter.maxflow import CUTS
 from services.segmenter.messages import empty_messages, lay_down, run_pass, take_up
 
 Expired = Callable[[], bool]
-FIRST_PROPOSAL = 2  # number of the first pass whose labels are worth a look
 
 
 class Settings(msgspec.Struct, frozen=True, kw_only=True):
@@ -41,14 +40,17 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True):
 
     min_cut: Literal["pymaxflow", "scipy"] = "pymaxflow"  # library for large cuts; PyMaxflow is under the GPL
     compiled_up_to: int = 2_000  # free places in a cut that compiled code solves itself
-    passes: int = 12  # of message passing, there and back counted as two
+    round_trips: int = 6  # of message passing
+    worn_share: float = 0.2  # changed places, of all, after which an idle solver proposes for the whole field again
     reach: int = 5  # steps from a changed place within which message passing may propose labels
     near: int = 150  # places of a swap's local problem
     chunk: int = 20_000  # visits of places between two looks at the clock
 
     def __post_init__(self) -> None:
-        if not (self.passes >= 0 and self.reach >= 0 and self.near > 0 and self.chunk > 0 and self.compiled_up_to >= 0):
-            raise ValueError("passes, reach, near, chunk or compiled_up_to is out of range")
+        if not (
+            self.round_trips >= 0 and self.reach >= 0 and self.near > 0 and self.chunk > 0 and self.compiled_up_to >= 0
+        ):
+            raise ValueError("round_trips, reach, near, chunk or compiled_up_to is out of range")
 
 
 def never() -> bool:
@@ -67,12 +69,13 @@ class Solver:
         self._unary = np.zeros((0, 0))
         self._work = moves.empty_work(0, 0, 0)
         self._least_gain = 0.0
+        self._changes = 0  # places reported dirty since message passing last went over the whole field
         self._unproposed = np.zeros(0, np.int64)  # rows around which message passing has yet to propose
 
     @property
     def pending(self) -> int:
-        """Places at which a swap is still to be tried, or around which labels are to be proposed."""
-        return moves.waiting(self._work, moves.DEEP) + len(self._unproposed)
+        """Places at which a swap is still to be tried or around which labels are to be proposed; 0 when settled."""
+        return moves.waiting(self._work, moves.DEEP) + len(self._unproposed) + self._worn
 
     def update(
         self,
@@ -85,15 +88,23 @@ class Solver:
     ) -> np.ndarray:
         """Labels (place,) for `field`, starting from `labels`, by work near the change only; see the module."""
         self.take(field, labels, dirty=dirty, previous=previous)
-        self._propose(expired)
+        self._propose_near(expired)
         self._swap(moves.NEAR, expired)
         return self.labels.copy()
 
     def drain(self, expired: Expired = never) -> np.ndarray:
         """Go on with what is pending, on the whole field; the labels (place,) so far."""
-        self._propose(expired)
+        self._propose_near(expired)
         self._swap(moves.DEEP, expired)
+        if self._worn and not expired() and self._propose(np.arange(len(self.labels)), expired):
+            self._changes = 0
+            self._swap(moves.DEEP, expired)
         return self.labels.copy()
+
+    @property
+    def _worn(self) -> bool:
+        """Whether so much changed since message passing went over the whole field that it may well find better."""
+        return self._changes > self.settings.worn_share * len(self.labels)
 
     def _swap(self, depth: int, expired: Expired) -> None:
         settings, arrays = self.settings, (self._graph, self._unary, self._pairwise, self.labels, self._work)
@@ -136,6 +147,7 @@ class Solver:
         _label_new(self.labels, graph, unary, self._pairwise)
         moves.flag_all(dirty, moves.NEAR if before is not None else moves.DEEP, self._work)
         self._unproposed = np.union1d(waiting, dirty).astype(np.int64)
+        self._changes = 0 if before is None else self._changes + len(dirty)
         self._least_gain = max(self._least_gain if before is not None else 0.0, least_gain(unary[dirty]))
 
     def _carry(
@@ -155,28 +167,34 @@ class Solver:
         waiting[self._unproposed] = True
         return known[waiting[origin[known]]]
 
-    def _propose(self, expired: Expired) -> None:
-        """Message passing around the waiting places; takes the parts of its proposals that lower the energy."""
-        if not len(self._unproposed) or not self.settings.passes:
-            self._unproposed = self._unproposed[:0]
-            return
-        graph, messages, labels = self._graph, self._messages, self.labels
-        rows = _ball(self._unproposed, self.settings.reach, graph, messages.inside)
+    def _propose(self, rows: np.ndarray, expired: Expired) -> bool:
+        """Message passing on `rows` (ascending) takes what lowers the energy; True unless the budget ended it."""
+        graph, messages, labels, trips = self._graph, self._messages, self.labels, 0
+        scene = (graph, self._unary, self._pairwise)
         messages.pairwise[: len(self._pairwise), : len(self._pairwise)] = self._pairwise
         take_up(rows, graph, self._unary, labels, messages)
-        before, done = labels[rows], False
-        for number in range(self.settings.passes):
-            if expired():
-                break
-            run_pass(rows, number % 2 == 0, graph, messages, True)
-            done = number == self.settings.passes - 1
-            if done or number >= FIRST_PROPOSAL:
-                scene = (graph, self._unary, self._pairwise, self._work.mark)
-                fuse(rows, messages.proposed, labels, *scene, self._least_gain)
+        before = labels[rows]
+        while trips < self.settings.round_trips and not expired():
+            round_trip(rows, labels, *scene, messages, self._work.mark, self._least_gain)
+            trips += 1
         lay_down(rows, messages)
         moves.flag_around(rows[labels[rows] != before], moves.NEAR, graph, self._work)
-        if done:
-            self._unproposed = self._unproposed[:0]
+        return trips == self.settings.round_trips
+
+    def _propose_near(self, expired: Expired) -> None:
+        """Proposals around the places that changed."""
+        if len(self._unproposed):
+            rows = ball(self._unproposed, self.settings.reach, self._graph, self._messages.inside)
+            if self._propose(rows, expired):
+                self._unproposed = self._unproposed[:0]
+
+
+@njit(cache=True, nogil=True)
+def round_trip(rows, labels, graph, unary, pairwise, messages, mark, least_gain):  # noqa: PLR0917, ANN001, ANN201
+    """Pass messages there and back over `rows`; fuse the labels of both passes into `labels`."""
+    for forward in (True, False):
+        run_pass(rows, forward, graph, messages, True)
+        fuse(rows, messages.proposed, labels, graph, unary, pairwise, mark, least_gain)
 
 
 @njit(cache=True, nogil=True)
@@ -230,7 +248,7 @@ def _label_new(labels, graph, unary, pairwise):  # noqa: ANN001, ANN202
 
 
 @njit(cache=True, nogil=True)
-def _ball(centers, reach, graph, inside):  # noqa: ANN001, ANN202
+def ball(centers, reach, graph, inside):  # noqa: ANN001, ANN201
     """Rows, ascending, within `reach` steps of `centers`; `inside` is scratch, all False before and after."""
     found = np.empty(len(inside), np.int64)
     count = 0
