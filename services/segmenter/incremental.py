@@ -168,7 +168,10 @@ class Solver:
         return known[waiting[origin[known]]]
 
     def _propose(self, rows: np.ndarray, expired: Expired) -> bool:
-        """Message passing on `rows` (ascending) takes what lowers the energy; True unless the budget ended it."""
+        """Message passing on `rows` (ascending) takes what lowers the energy; False if there was no budget for it.
+
+        A budget that ends it early is not made up for: the swaps go first then, lest nothing ever gets done.
+        """
         graph, messages, labels, trips = self._graph, self._messages, self.labels, 0
         scene = (graph, self._unary, self._pairwise)
         messages.pairwise[: len(self._pairwise), : len(self._pairwise)] = self._pairwise
@@ -179,7 +182,7 @@ class Solver:
             trips += 1
         lay_down(rows, messages)
         moves.flag_around(rows[labels[rows] != before], moves.NEAR, graph, self._work)
-        return trips == self.settings.round_trips
+        return trips > 0 or not self.settings.round_trips
 
     def _propose_near(self, expired: Expired) -> None:
         """Proposals around the places that changed."""

@@ -1,0 +1,228 @@
+"""The solver that follows changes, the dual bound and the marginals."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+from services.segmenter import swap
+from services.segmenter.adjacency import adjacency
+from services.segmenter.bound import lower_bound
+from services.segmenter.field import Field, conditional_costs, energy
+from services.segmenter.incremental import Settings, Solver, changed_rows
+from services.segmenter.marginals import marginals, min_marginals
+from tests.segmenter_fields import all_energies, best_swap, random_field, random_tree
+
+
+def is_swap_optimal(field, labels):
+    pairs = itertools.combinations(range(field.unary.shape[1]), 2)
+    return all(energy(field, best_swap(field, labels, pair)) >= energy(field, labels) - 1e-6 for pair in pairs)
+
+
+class Changes:
+    """A field that changes in every way there is; tells which rows are dirty and where each row comes from."""
+
+    def __init__(self, seed, places=60, labels=5):
+        self.rng = np.random.default_rng(seed)
+        self.field = random_field(seed, places, labels, degree=5)
+
+    def costs(self):
+        rows = self.rng.integers(len(self.field.unary), size=4)
+        unary = self.field.unary.copy()
+        unary[rows] = self.rng.uniform(0, 4, (len(rows), unary.shape[1]))
+        self.field = self.field._replace(unary=unary)
+        return rows, None
+
+    def weights(self):
+        chosen = self.rng.integers(len(self.field.edges), size=4)
+        weights = self.field.weights.copy()
+        weights[chosen] = self.rng.uniform(0, 1, len(chosen))
+        self.field = self.field._replace(weights=weights)
+        return np.unique(self.field.edges[chosen]), None
+
+    def edges(self):
+        kept = self.rng.random(len(self.field.edges)) < 0.95
+        dirty = self.field.edges[~kept]
+        self.field = self.field._replace(edges=self.field.edges[kept], weights=self.field.weights[kept])
+        return np.unique(dirty), None
+
+    def places(self):
+        """Two places go; three come, somewhere among the rows."""
+        field, count = self.field, len(self.field.unary)
+        gone = np.zeros(count, bool)
+        gone[self.rng.choice(count, 2, replace=False)] = True
+        previous = np.insert(np.flatnonzero(~gone), self.rng.integers(count - 2, size=3), -1)
+        new = np.flatnonzero(previous < 0)
+        row_now = np.full(count, -1)
+        row_now[previous[previous >= 0]] = np.flatnonzero(previous >= 0)
+        edges = row_now[field.edges]
+        kept = (edges >= 0).all(axis=1)
+        added = np.stack((np.repeat(new, 3), self.rng.choice(np.flatnonzero(previous >= 0), 9)), axis=1)
+        unary = self.rng.uniform(0, 4, (len(previous), field.unary.shape[1]))
+        unary[previous >= 0] = field.unary[previous[previous >= 0]]
+        weights = np.concatenate((field.weights[kept], self.rng.uniform(0, 1, len(added))))
+        self.field = Field(unary, np.concatenate((edges[kept], added)), weights, field.pairwise)
+        orphans = edges[~kept].reshape(-1)
+        return np.unique(np.concatenate((new, added.reshape(-1), orphans[orphans >= 0]))), previous
+
+    def pairwise(self):
+        self.field = self.field._replace(pairwise=random_field(self.rng.integers(1000), 9, 5).pairwise)
+        return np.zeros(0, np.int64), None
+
+
+@pytest.mark.parametrize("settings", [Settings(), Settings(near=3), Settings(near=5, round_trips=0)])
+@pytest.mark.parametrize("told", [True, False])
+def test_a_changing_field_is_followed_to_its_swap_optimum(settings, told):
+    """Whatever changes, said by the caller or found by the solver: energy never rises, and idle time finishes."""
+    changes, solver = Changes(seed=3), Solver(settings)
+    labels = solver.update(changes.field, changes.field.unary.argmin(axis=1))
+    labels = solver.drain()
+    for kind in ["costs", "weights", "edges", "places", "pairwise"] * 6:
+        dirty, previous = getattr(changes, kind)()
+        start = labels if previous is None else np.where(previous >= 0, labels[previous], -1)
+        begun = np.where(start >= 0, start, changes.field.unary.argmin(axis=1))
+        labels = solver.update(changes.field, start, dirty=dirty if told else None, previous=previous)
+        after_update = energy(changes.field, labels)
+        if (start >= 0).all():
+            assert after_update <= energy(changes.field, begun) + 1e-9
+        labels = solver.drain()
+        assert energy(changes.field, labels) <= after_update + 1e-9
+        assert solver.pending == 0
+        assert is_swap_optimal(changes.field, labels), kind
+
+
+@pytest.mark.parametrize("kind", ["costs", "weights", "edges", "places"])
+def test_changed_rows_are_those_that_were_changed(kind):
+    changes = Changes(seed=5)
+    before = changes.field
+    dirty, previous = getattr(changes, kind)()
+    graphs = [adjacency(len(field.unary), field.edges, field.weights) for field in (before, changes.field)]
+    origin = np.arange(len(before.unary)) if previous is None else previous
+    found = changed_rows(graphs[0], before.unary, graphs[1], changes.field.unary, origin)
+    assert sorted(found) == sorted(set(dirty.tolist()))
+
+
+def test_a_spent_budget_leaves_valid_labels_that_idle_time_completes():
+    field = random_field(1, places=200, labels=6, degree=6)
+    solver, looks = Solver(Settings(chunk=20)), [0]
+
+    def expired():
+        looks[0] += 1
+        return looks[0] > 2
+
+    start = field.unary.argmin(axis=1)
+    solver.take(field, start)
+    labels = solver.drain(expired)
+    assert solver.pending > 0
+    assert ((labels >= 0) & (labels < 6)).all()
+    energies = [energy(field, start), energy(field, labels)]
+    while solver.pending:
+        looks[0] = 0
+        energies.append(energy(field, solver.drain(expired)))
+    assert (np.diff(energies) <= 1e-9).all()
+    assert energies[-1] < energies[1]
+    assert is_swap_optimal(field, solver.drain())
+
+
+def test_nothing_changed_changes_nothing_and_the_callers_arrays_stay():
+    field = random_field(2, places=100, labels=4)
+    solver = Solver()
+    start = field.unary.argmin(axis=1)
+    kept = start.copy(), field.unary.copy()
+    solver.take(field, start)
+    labels = solver.drain()
+    again = solver.update(field, labels, dirty=np.zeros(0, np.int64))
+    assert np.array_equal(again, labels)
+    assert np.array_equal(start, kept[0])
+    assert np.array_equal(field.unary, kept[1])
+
+
+def test_another_number_of_places_needs_their_origin():
+    solver = Solver()
+    solver.update(random_field(0, 20, 3), np.zeros(20, int))
+    with pytest.raises(ValueError, match="previous"):
+        solver.update(random_field(0, 21, 3), np.zeros(21, int))
+
+
+def test_a_far_change_costs_nothing_here():
+    """Only labels near the change move, and the work does not depend on the rest of the field."""
+    small, big = random_field(1, places=50, labels=4), random_field(2, places=400, labels=4)
+    joined = Field(
+        np.concatenate((small.unary, big.unary)),
+        np.concatenate((small.edges, big.edges + 50)),
+        np.concatenate((small.weights, big.weights)),
+        small.pairwise,
+    )
+    solver = Solver()
+    solver.take(joined, joined.unary.argmin(axis=1))
+    labels = solver.drain()
+    changed = joined._replace(unary=joined.unary.copy())
+    changed.unary[:10, 2] -= 3.0
+    after = solver.update(changed, labels, dirty=np.arange(10))
+    assert (after != labels)[:50].any()
+    assert np.array_equal(after[50:], labels[50:])
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_the_dual_bound_is_one(seed):
+    field = random_field(seed, places=7, labels=3, degree=4)
+    best, bound = all_energies(field)[1].min(), lower_bound(field)
+    assert bound <= best * (1 + 1e-9)
+    assert bound >= 0.9 * best
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_on_trees_the_bound_and_the_marginals_are_exact(seed):
+    field = random_tree(seed, places=7, labels=3)
+    every, energies = all_energies(field)
+    assert lower_bound(field) == pytest.approx(energies.min(), rel=1e-6)
+    assert energy(field, swap.minimise(field, field.unary.argmin(axis=1))) == pytest.approx(energies.min())
+    np.testing.assert_allclose(min_marginals(field, reweighted=False), least_energies(every, energies, 3), atol=1e-4)
+    np.testing.assert_allclose(marginals(field), shares(every, energies, 3), atol=1e-3)
+    flat = marginals(field, temperature=2.0)
+    np.testing.assert_allclose(flat, shares(every, energies / 2.0, 3), atol=1e-3)
+
+
+def least_energies(every, energies, labels):
+    least = [[energies[every[:, p] == label].min() for label in range(labels)] for p in range(every.shape[1])]
+    return np.array(least) - energies.min()
+
+
+def shares(every, energies, labels):
+    weights = np.exp(energies.min() - energies)
+    weights /= weights.sum()
+    return np.array([[weights[every[:, p] == label].sum() for label in range(labels)] for p in range(every.shape[1])])
+
+
+def test_marginals_of_small_fields_with_cycles():
+    """Reweighted sums come close, far closer than costs with the neighbours fixed, which err on the sure side."""
+    errors, fixed_errors, low, high = [], [], [], []
+    for seed in range(40):
+        field = random_field(seed, places=7, labels=3, degree=4)
+        every, energies = all_energies(field)
+        exact, least = shares(every, energies, 3), least_energies(every, energies, 3)
+        fixed = conditional_costs(field, every[energies.argmin()])
+        fixed -= fixed.min(axis=1, keepdims=True)
+        odds = np.exp(-fixed)
+        errors.append(np.abs(marginals(field, passes=30) - exact).mean())
+        fixed_errors.append(np.abs(odds / odds.sum(axis=1, keepdims=True) - exact).mean())
+        low.append((min_marginals(field, passes=200) - least).mean())
+        high.append((fixed - least).min())
+    assert np.mean(errors) < 0.07
+    assert np.mean(errors) < 0.5 * np.mean(fixed_errors)
+    assert np.mean(low) <= 1e-3
+    assert min(high) > -1e-9
+
+
+def test_marginals_of_some_places_given_the_others():
+    field = random_field(4, places=30, labels=3)
+    labels = swap.minimise(field, field.unary.argmin(axis=1))
+    rows = np.array([3])
+    costs = conditional_costs(field, labels)[rows]
+    np.testing.assert_allclose(
+        min_marginals(field, labels=labels, rows=rows), costs - costs.min(axis=1, keepdims=True), atol=1e-4
+    )
+    expected = np.exp(costs.min() - costs)
+    np.testing.assert_allclose(marginals(field, labels=labels, rows=rows), expected / expected.sum(), atol=1e-4)
+    with pytest.raises(ValueError, match="labels"):
+        marginals(field, rows=rows)
