@@ -8,6 +8,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections import Counter
 
 import numpy as np
 import pytest
@@ -21,7 +22,7 @@ from deploy.client import Client
 from deploy.replay import compare, open_log
 from deploy.run import Job, run
 from schemas.codec import DecodeError, decode
-from schemas.topics import ENCODE, JOURNAL, KEYFRAME, PYRAMID, TOPICS, worker_keys
+from schemas.topics import ENCODE, JOURNAL, KEYFRAME, PYRAMID, REGION_DELTA, TOPICS, worker_keys
 from services.runtime.jobs import CREDITS
 from services.runtime.record import LogWriter, read_log, summary
 from services.runtime.zenoh_bus import ZenohBus
@@ -236,6 +237,25 @@ def test_exports_agree(disturbed):
     assert places.num_nodes() == len(scene["places"]) and places.num_edges() == len(scene["edges"])
     assert rooms.num_nodes() == len(scene["regions"])
     assert (out / "map.png").stat().st_size > 10_000
+
+
+def test_regions_that_survive_an_update_keep_their_ids(disturbed):
+    """A region survives where its places and those of one region after the update are mostly the same."""
+    place_regions, survivals = {}, 0
+    for logged in read_log(disturbed[1] / "log.mcap", [REGION_DELTA]):
+        delta, before = decode(REGION_DELTA.type, logged.payload), dict(place_regions)
+        place_regions = {} if delta.snapshot else place_regions
+        for place in delta.removed_place_ids.tolist():
+            place_regions.pop(place, None)
+        place_regions.update(zip(delta.place_ids.tolist(), delta.place_regions.tolist(), strict=True))
+        both = before.keys() & place_regions.keys()
+        pairs = Counter((before[place], place_regions[place]) for place in both)
+        then, now = Counter(before[place] for place in both), Counter(place_regions[place] for place in both)
+        for (old, new), count in pairs.items():
+            if 2 * count > then[old] and 2 * count > now[new]:
+                assert old == new
+                survivals += 1
+    assert survivals > 20
 
 
 def test_explain_from_the_log_adds_up(disturbed, capsys):
