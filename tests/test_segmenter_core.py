@@ -320,6 +320,17 @@ def test_a_spent_budget_leaves_a_valid_labelling_and_an_idle_tick_finishes():
     assert sorted(region.label for region in run.reader.regions.values()) == sorted(ROOMS)
 
 
+@pytest.mark.parametrize("end", ["first", "last", "both"])
+def test_places_may_leave_at_either_end_of_the_list(end):
+    run, positions = finished()
+    gone = {"first": [0, 1], "last": [len(positions) - 1], "both": [0, len(positions) - 1]}[end]
+    run.feed(no_places(revision=1, removed_ids=np.array(gone)), TICK)
+    assert set(run.reader.beliefs) == set(range(len(positions))) - set(gone)
+    field = core.field_of(run.state)
+    fresh = swap.minimise(field, run.state.places.labels)
+    assert swap.energy(field, fresh) == pytest.approx(swap.energy(field, run.state.places.labels))
+
+
 def test_following_the_deltas_equals_the_snapshot():
     rng = np.random.default_rng(0)
     positions, edges, frames = world()

@@ -500,7 +500,7 @@ def _segment(state: State, switched: bool, idle: bool, cfg: Config) -> Iterator[
 def settle(state: State, budget: Budget, whole: bool) -> None:
     """Better labels around the places whose costs changed; with `whole`, until no swap on the whole field gains."""
     places, rows = state.places, np.arange(len(state.places.labels))
-    same_rows = np.array_equal(places.solved, rows)
+    same_rows = len(rows) == len(state.solver.labels) and np.array_equal(places.solved, rows)
     labels = state.solver.update(
         field_of(state),
         places.labels,
