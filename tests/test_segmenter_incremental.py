@@ -137,6 +137,24 @@ def test_nothing_changed_changes_nothing_and_the_callers_arrays_stay():
     assert np.array_equal(field.unary, kept[1])
 
 
+def test_labels_from_elsewhere_are_settled_too():
+    field = random_field(6, places=100, labels=4, degree=5)
+    solver = Solver(Settings(round_trips=0))
+    solver.take(field, field.unary.argmin(axis=1))
+    labels = solver.drain()
+    labels[20:40] = 3
+    solver.update(field, labels, dirty=np.zeros(0, np.int64))
+    assert is_swap_optimal(field, solver.drain())
+
+
+def test_another_number_of_labels_starts_afresh():
+    solver = Solver()
+    solver.update(random_field(0, 20, 3), np.zeros(20, int))
+    field = random_field(0, 25, 5)
+    solver.update(field, np.full(25, -1))
+    assert is_swap_optimal(field, solver.drain())
+
+
 def test_another_number_of_places_needs_their_origin():
     solver = Solver()
     solver.update(random_field(0, 20, 3), np.zeros(20, int))

@@ -39,6 +39,8 @@ def swap_bench() -> tuple[dict[str, Any], dict[str, Any]]:
         metrics |= suffixed(stream(places, int(CHANGED_SHARE * places), steps), places)
         constant = stream(places, CHANGED_PLACES, steps, against_cold=False)
         metrics[f"update_ms_of_{CHANGED_PLACES}_places_{places}"] = constant["incremental_ms_p50"]
+        rewired = stream(places, CHANGED_PLACES, steps, against_cold=False, rewired=True)
+        metrics[f"update_ms_of_{CHANGED_PLACES}_places_rewired_{places}"] = rewired["incremental_ms_p50"]
     settings = {"labels": LABELS, "places": SIZES, "changed_share": CHANGED_SHARE, "steps": list(STEPS.values())}
     return metrics, settings | {"repeats": REPEATS, "bound_fields": BOUND_FIELDS}
 
@@ -92,8 +94,11 @@ def dual_bound() -> dict[str, float]:
     return {"dual_bound_ratio": statistics.mean(ratios), "dual_bound_ratio_worst": max(ratios)}
 
 
-def stream(places: int, changed: int, steps: int, against_cold: bool = True) -> dict[str, float]:
-    """Updates that each change the costs of `changed` places around one; the queue is drained between two updates."""
+def stream(places: int, changed: int, steps: int, against_cold: bool = True, rewired: bool = False) -> dict[str, float]:
+    """Updates that each change the costs of `changed` places around one; the solver is drained between two updates.
+
+    `rewired`, the weights of their edges change too, so that the solver has to take up the whole graph again.
+    """
     rng, field = np.random.default_rng([places, changed]), bench_field(places, 0)
     graph, solver = adjacency(places, field.edges, field.weights), Solver()
     solver.take(field, field.unary.argmin(axis=1))
@@ -102,7 +107,14 @@ def stream(places: int, changed: int, steps: int, against_cold: bool = True) -> 
     for _step in range(steps):
         rows = around(int(rng.integers(places)), changed, graph)
         field = field._replace(unary=revised(field.unary, rows, rng))
-        seconds, updated = timed(lambda: solver.update(field, labels, dirty=rows))  # noqa: B023 (called at once)
+        if rewired:
+            weights = field.weights.copy()
+            weights[np.isin(field.edges, rows).any(axis=1)] *= rng.uniform(0.8, 1.25)
+            field = field._replace(weights=weights)
+            dirty = np.union1d(rows, field.edges[np.isin(field.edges, rows).any(axis=1)])
+        else:
+            dirty = rows
+        seconds, updated = timed(lambda: solver.update(field, labels, dirty=dirty))  # noqa: B023 (called at once)
         update_s.append(seconds)
         if against_cold:
             seconds, fresh = timed(lambda: swap.minimise(field, field.unary.argmin(axis=1)))  # noqa: B023 (at once)

@@ -7,7 +7,8 @@
 The caller says which places changed (`dirty`: those with another unary cost, other edges, other weights or a
 neighbour that is gone; new places too), or leaves it to the solver, which then compares the field with the last one.
 Row numbers may change between updates: `previous` says which row each place had (-1: a new place), as
-`graph.Step.previous` does. A place without a label yet has label -1.
+`graph.Step.previous` does. A place without a label yet has label -1; labels may be others than the solver's last. The
+solver keeps references to the field's arrays, not copies: where they are changed in place, `dirty` must be given.
 
 The change is solved as a local problem with fixed surroundings, which grows while labels at its border change:
 
@@ -58,6 +59,10 @@ def never() -> bool:
     return False
 
 
+def _same_edges(one: Field, other: Field) -> bool:
+    return one.edges is other.edges and one.weights is other.weights
+
+
 class Solver:
     """Labels of the last field, and what is still to be tried on it."""
 
@@ -67,6 +72,7 @@ class Solver:
         self._field: Field | None = None
         self._graph: Adjacency = adjacency(0, np.zeros((0, 2)), np.zeros(0))
         self._unary = np.zeros((0, 0))
+        self._pairwise = np.zeros((0, 0))
         self._work = moves.empty_work(0, 0, 0)
         self._least_gain = 0.0
         self._changes = 0  # places reported dirty since message passing last went over the whole field
@@ -122,50 +128,51 @@ class Solver:
     ) -> None:
         """Only note the change; `drain` does the work."""
         before, count = self._field, len(field.unary)
-        same_rows = before is not None and previous is None and len(before.unary) == count
-        if before is None or before.unary.shape[1] != field.unary.shape[1]:
-            before, dirty = None, np.arange(count)
-        if before is not None and not np.array_equal(before.pairwise, field.pairwise):
-            dirty = np.arange(count)
-        origin = np.arange(count) if previous is None and same_rows else previous
-        if before is not None and origin is None:
+        if before is not None and before.unary.shape[1] != field.unary.shape[1]:
+            before = None
+        if before is not None and previous is None and len(before.unary) != count:
             raise ValueError("the number of places changed: `previous` must say which row each place had")
-        same_edges = same_rows and before is not None and field.edges is before.edges
-        same_edges = same_edges and before is not None and field.weights is before.weights
+        same_edges = before is not None and previous is None and _same_edges(before, field)
         graph = self._graph if same_edges else adjacency(count, field.edges, field.weights)
         unary = np.ascontiguousarray(field.unary, dtype=np.float64)
-        if dirty is None:
+        pairwise = np.ascontiguousarray(field.pairwise, dtype=np.float64)
+        everything = before is None or not np.array_equal(self._pairwise, pairwise)
+        origin = np.arange(count) if previous is None else previous
+        if everything:
+            dirty = np.arange(count)
+        elif dirty is None:
             dirty = changed_rows(self._graph, self._unary, graph, unary, origin)
         elif dirty.dtype == np.bool_:
             dirty = np.flatnonzero(dirty)
-        waiting = self._unproposed
         if not same_edges:
-            waiting = self._carry(before, origin, count, field, graph)
-        self._graph, self._unary, self._field = graph, unary, field
-        self._pairwise = np.ascontiguousarray(field.pairwise, dtype=np.float64)
-        self.labels = np.array(labels, dtype=np.int64)
-        _label_new(self.labels, graph, unary, self._pairwise)
-        moves.flag_all(dirty, moves.NEAR if before is not None else moves.DEEP, self._work)
-        self._unproposed = np.union1d(waiting, dirty).astype(np.int64)
+            self._carry(before, origin, field, graph)
+        given, found = np.asarray(labels), self.labels
+        self._graph, self._unary, self._pairwise, self._field = graph, unary, pairwise, field
+        self.labels = np.array(given, dtype=np.int64)
+        label_new(self.labels, graph, unary, pairwise)
+        if not everything:
+            known = np.flatnonzero(origin >= 0)
+            moves.flag_around(known[given[known] != found[origin[known]]], moves.NEAR, graph, self._work)
+        moves.flag_all(dirty, moves.DEEP if before is None else moves.NEAR, self._work)
+        self._unproposed = np.union1d(self._unproposed, dirty).astype(np.int64)
         self._changes = 0 if before is None else self._changes + len(dirty)
-        self._least_gain = max(self._least_gain if before is not None else 0.0, least_gain(unary[dirty]))
+        self._least_gain = max(0.0 if before is None else self._least_gain, least_gain(unary[dirty]))
 
-    def _carry(
-        self, before: Field | None, origin: np.ndarray | None, count: int, field: Field, graph: Adjacency
-    ) -> np.ndarray:
-        """Scratch space for the new rows with the old flags on them; returns the waiting rows."""
-        old_work = self._work if before is not None else None
-        arcs, label_count = len(graph.neighbours), field.unary.shape[1]
+    def _carry(self, before: Field | None, origin: np.ndarray, field: Field, graph: Adjacency) -> None:
+        """Scratch space for new rows and arcs, with what was pending before on the rows where it is now."""
+        old_work, old_unproposed = self._work, self._unproposed
+        arcs, (count, label_count) = len(graph.neighbours), field.unary.shape
         self._work = moves.empty_work(count, label_count, arcs)
         self._messages = empty_messages(count, arcs, field.pairwise, np.float32)
-        if old_work is None or origin is None:
-            return np.zeros(0, np.int64)
+        self._unproposed = np.zeros(0, np.int64)
+        if before is None:
+            return
         known = np.flatnonzero(origin >= 0)
         self._work.pending[known] = old_work.pending[origin[known]]
         moves.requeue(self._work)
-        waiting = np.zeros(len(old_work.mark), np.bool_)
-        waiting[self._unproposed] = True
-        return known[waiting[origin[known]]]
+        waits = np.zeros(len(old_work.mark), np.bool_)
+        waits[old_unproposed] = True
+        self._unproposed = known[waits[origin[known]]]
 
     def _propose(self, rows: np.ndarray, expired: Expired) -> bool:
         """Message passing on `rows` (ascending) takes what lowers the energy; False if there was no budget for it.
@@ -236,7 +243,7 @@ def _has_arc(graph, row, neighbour, weight):  # noqa: ANN001, ANN202
 
 
 @njit(cache=True, nogil=True)
-def _label_new(labels, graph, unary, pairwise):  # noqa: ANN001, ANN202
+def label_new(labels, graph, unary, pairwise):  # noqa: ANN001, ANN201
     """Give each place without a label the cheapest one, its labelled neighbours considered."""
     costs = np.empty(unary.shape[1])
     for place in range(len(labels)):
