@@ -14,6 +14,7 @@ import zenoh
 from deploy import bench_segmenter
 from deploy.benches import features as bench_features
 from deploy.benches.kernel import kernel
+from deploy.benches.places import place_bench
 from deploy.benches.swap import swap_bench
 from schemas.codec import decode, encode
 from schemas.frames import Keyframe
@@ -48,20 +49,8 @@ def _percentiles(milliseconds: list[float]) -> dict[str, float]:
 
 
 def places() -> tuple[dict, dict]:
-    """Place extraction per keyframe of the sample, image decoding included."""
-    keyframes, service = _sample_keyframes(), BY_NAME["place_graph"]
-    metrics: dict[str, float] = {}
-    for voxel_m in (0.2, 0.1):
-        cfg = service.config(voxel_m=voxel_m)
-        for _ in range(2):  # the first round loads the compiled kernels
-            state, spent = service.init(cfg, Identity("bench", "b", 1)), []
-            for keyframe in keyframes:
-                started_s = time.perf_counter()
-                list(service.step(state, keyframe, cfg))
-                spent.append(1e3 * (time.perf_counter() - started_s))
-        suffix = "" if voxel_m == 0.2 else f"_{voxel_m}m"
-        metrics |= {f"{name}{suffix}": value for name, value in _percentiles(spent).items()}
-    return metrics, {"keyframes": len(keyframes), "image": "640x480", "voxel_m": 0.2}
+    """The place graph per keyframe of the sample; see `deploy.benches.places`."""
+    return place_bench(_sample_keyframes())
 
 
 def features() -> tuple[dict, dict]:

@@ -57,8 +57,18 @@ def _add_run_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--speed", type=float, default=0.0, help="replay speed; 0 = as fast as the pipeline drains (default)"
     )
+    parser.add_argument(
+        "--places",
+        choices=("3d", "2d"),
+        help="spheres of free space, or pieces of ground for large and unbounded spaces (default: 3d)",
+    )
     parser.add_argument("--config", default="", help="TOML file with a section per service")
     parser.add_argument("--set", action="append", default=[], metavar="SERVICE.FIELD=VALUE", help="one setting")
+
+
+def _settings(arguments: argparse.Namespace) -> list[str]:
+    """Settings that run options stand for, then those given by --set."""
+    return [*([f"place_graph.places={arguments.places}"] if arguments.places else []), *arguments.set]
 
 
 Command = Callable[[str, str, str], argparse.ArgumentParser]
@@ -235,7 +245,7 @@ def cmd_run(arguments: argparse.Namespace) -> int:
         connect=arguments.connect,
         workers=arguments.workers,
         speed=arguments.speed,
-        settings=arguments.set,
+        settings=_settings(arguments),
         config=arguments.config,
         in_process=getattr(arguments, "in_process", False),
         on_started=lambda endpoint, pids: console.print(
@@ -264,7 +274,7 @@ def cmd_up(arguments: argparse.Namespace) -> int:
     if arguments.source:
         report.truth_of(arguments.source)  # finds out at once whether the source is of a known layout
         settings.append(f"ingest.source={arguments.source}")
-    settings += arguments.set
+    settings += _settings(arguments)
     check_settings(arguments.config, settings)
     if arguments.no_router:
         _client(arguments.connect).bus.close()  # finds out at once whether a router is there

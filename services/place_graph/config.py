@@ -26,6 +26,8 @@ PRESETS: dict[str, dict[str, Any]] = {
         "freespace_max_length_m": 5.0,
         "freespace_min_clearance_m": 0.5,
         "map_window_max_radius_m": 45.0,
+        "min_cluster_area_m2": 10.0,
+        "pure_final_place_size_m": 3.0,
         "max_speed_m_s": 25.0,
         "jump_slack_m": 3.0,
     },
@@ -117,6 +119,16 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
     min_component_size: int = 3  # smaller connected parts of the graph are not published
     min_diff_m: float = 0.01  # smaller changes of a position, radius or clearance are not published (habitat 0.1)
     frontier_min_area_m2: float = 0.1  # smaller openings to unobserved space are not told: holes in the depth
+
+    # 2D places.
+    surface_min_clearance_m: float = 1.0  # free height above ground
+    surface_max_step_m: float = 0.2  # greatest difference in height of neighbouring ground
+    surface_max_slope: float = 0.6  # greatest rise over run: 31 degrees
+    min_cluster_area_m2: float = 2.0  # smaller connected ground is an outlier: table tops (Hydra: 600 mesh vertices)
+    pure_final_place_size_m: float = 1.0  # pieces with a longer side are halved ... (uhumans2; in the code 3)
+    min_final_place_points: int = 10  # ... if they have more voxels than this (uhumans2; in the code 1000 vertices)
+    place_overlap_threshold_m: float = 0.1  # smallest overlap of ellipses that are joined
+    place_max_neighbor_z_diff_m: float = 0.5  # greatest difference in height of such
 
     # Poses and cameras that cannot be true.
     max_speed_m_s: float = 3.0  # of a camera carried or driven indoors; a faster pose is a jump; 0 = believe everything

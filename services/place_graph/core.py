@@ -1,7 +1,8 @@
 """The place graph of one robot: keyframes in, changes of the graph out (pure).
 
-Hydra's 3D places (Hughes et al. 2022), kept up to date where the map changed: fuse the depth image, recompute distances
-and the Voronoi diagram around changed voxels, re-extract places there, give them their old ids, and say what differs.
+Hydra's 3D places (Hughes et al. 2022), kept up to date where the map changed: fuse the depth image, repair distances
+and the Voronoi diagram around changed voxels, extract places there again, give them their old ids, say what differs.
+Or its 2D places, pieces of ground, which need the map only.
 """
 
 from collections.abc import Iterator, Sequence
@@ -18,6 +19,7 @@ from services.place_graph.config import Config
 from services.place_graph.frontiers import Openings
 from services.place_graph.graph import Changes, PlaceGraph, Rules
 from services.place_graph.grid import BLOCK, FREE, OCCUPIED, Box, VoxelGrid
+from services.place_graph.ground import GroundGraph, GroundRules
 from services.place_graph.published import Published
 from services.place_graph.track import Track
 
@@ -49,6 +51,24 @@ class State:
 
 def empty(robot: str, epoch: int, cfg: Config) -> State:
     """A map without observations."""
+    openings = Openings(int(1.5 * cfg.cell_voxels))
+    return State(robot, epoch, _no_places(cfg), Archive(cfg.archive_mb * 1e6), openings)
+
+
+def _no_places(cfg: Config) -> PlaceGraph:
+    if cfg.places == "2d":
+        return GroundGraph(
+            GroundRules(
+                clearance=round(cfg.voxels(cfg.surface_min_clearance_m)),
+                step=max(1, round(cfg.voxels(cfg.surface_max_step_m))),
+                slope=cfg.surface_max_slope,
+                piece=cfg.voxels(cfg.pure_final_place_size_m),
+                points=cfg.min_final_place_points,
+                cluster=round(cfg.min_cluster_area_m2 / cfg.voxel_m**2),
+                overlap=cfg.voxels(cfg.place_overlap_threshold_m),
+                rise=cfg.voxels(cfg.place_max_neighbor_z_diff_m),
+            )
+        )
     rules = Rules(
         cell=cfg.cell_voxels,
         merge=cfg.voxels(cfg.node_merge_distance_m),
@@ -60,7 +80,7 @@ def empty(robot: str, epoch: int, cfg: Config) -> State:
         overlap=cfg.voxels(cfg.overlap_min_clearance_m),
         overlap_check=cfg.overlap_num_neighbors_to_check if cfg.add_overlap_edges else 0,
     )
-    return State(robot, epoch, PlaceGraph(rules), Archive(cfg.archive_mb * 1e6), Openings(int(1.5 * cfg.cell_voxels)))
+    return PlaceGraph(rules)
 
 
 def integrate(state: State, keyframe: Keyframe, cfg: Config) -> PlaceDelta:
@@ -131,20 +151,26 @@ def fuse(state: State, keyframe: Keyframe, depth_m: np.ndarray, cfg: Config, sig
 
 def refresh(state: State, changed: np.ndarray, cfg: Config) -> Changes:
     """Bring distances, places and edges up to date after the labels of the voxels (n, 3) changed."""
-    boxes = [_renewed_field(state, part, cfg) for part in _tiles(changed)]
     changes = Changes()
+    if isinstance(state.graph, GroundGraph):
+        boxes: list[Box] = [Box(part.min(axis=0), part.max(axis=0) + 1) for part in _tiles(changed)]
+        for box in boxes:
+            changes.add(state.graph.renew(state.grid, box))
+    else:
+        fields = [_renewed_field(state, part, cfg) for part in _tiles(changed)]
+        boxes = [box for box in fields if box is not None]
+        for box in boxes:
+            changes.add(_renewed_places(state, state.graph, box, cfg))
     for box in boxes:
-        if box is not None:
-            changes.add(_renewed_places(state, box, cfg))
-    for box in boxes:
-        if box is not None:
-            changes.opened |= state.openings.renew(state.grid, state.graph, box)
+        changes.opened |= state.openings.renew(state.grid, state.graph, box)
     return changes
 
 
 def snapshot(state: State, cfg: Config) -> PlaceDelta:
     """Everything published so far as one delta, ids ascending, at the last revision."""
     fields = state.published.snapshot(cfg.voxel_m) | state.openings.all(cfg.voxel_m)
+    if isinstance(state.graph, GroundGraph):
+        fields |= state.graph.tell(state.published.places, cfg.voxel_m)
     return PlaceDelta(
         robot=state.robot,
         epoch=state.epoch,
@@ -254,7 +280,7 @@ def _renewed_field(state: State, changed: np.ndarray, cfg: Config) -> Box | None
     )
 
 
-def _renewed_places(state: State, changed: Box, cfg: Config) -> Changes:
+def _renewed_places(state: State, graph: PlaceGraph, changed: Box, cfg: Config) -> Changes:
     cell_voxels = cfg.cell_voxels
     everything = places.whole_cells(state.grid.bounds, cell_voxels)
     # A changed group may win or lose a neighbour, one cell on, from or to a place one further. Places that touch lie up
@@ -268,7 +294,7 @@ def _renewed_places(state: State, changed: Box, cfg: Config) -> Changes:
         cfg.voxels(cfg.node_merge_distance_m) ** 2,
         cfg.merge_policy == "distance",
     )
-    return state.graph.update(state.grid, extraction, region, changed)
+    return graph.update(state.grid, extraction, region, changed)
 
 
 def _publish(state: State, keyframe: Keyframe, changes: Changes, cfg: Config, event: str) -> PlaceDelta:
@@ -300,6 +326,8 @@ def _delta(
     gone = (*fields["removed_ids"].tolist(), *fields["merged_ids"][:, 0].tolist())
     looked_at = changes.opened.union(fields["place_ids"].tolist(), gone)
     fields |= state.openings.tell(looked_at, shown, cfg.voxel_m, cfg.frontier_min_area_m2)
+    if isinstance(state.graph, GroundGraph):
+        fields |= state.graph.tell(shown.keys() & changes.touched.union(fields["place_ids"].tolist()), cfg.voxel_m)
     state.openings.forget(i for i in changes.touched if i not in state.graph.places)
     return PlaceDelta(
         robot=state.robot,
