@@ -10,7 +10,7 @@ from services.segmenter.adjacency import adjacency
 from services.segmenter.bound import lower_bound
 from services.segmenter.field import Field, conditional_costs, energy
 from services.segmenter.incremental import Settings, Solver, changed_rows
-from services.segmenter.marginals import marginals, min_marginals
+from services.segmenter.marginals import marginals, marginals_near, min_marginals
 from tests.segmenter_fields import all_energies, best_swap, random_field, random_tree
 
 
@@ -244,3 +244,13 @@ def test_marginals_of_some_places_given_the_others():
     np.testing.assert_allclose(marginals(field, labels=labels, rows=rows), expected / expected.sum(), atol=1e-4)
     with pytest.raises(ValueError, match="labels"):
         marginals(field, rows=rows)
+
+
+def test_marginals_near_some_places_are_those_of_the_whole_field():
+    field = random_field(8, places=300, labels=4, degree=3)
+    field = field._replace(weights=0.5 * field.weights)
+    labels = swap.minimise(field, field.unary.argmin(axis=1))
+    centers = np.array([250, 3, 120])
+    near = marginals_near(field, labels, centers, reach=6, passes=40)
+    np.testing.assert_allclose(near, marginals(field, passes=40)[centers], atol=0.03)
+    assert np.abs(near - marginals_near(field, labels, centers, reach=0)).max() > 0.05

@@ -47,3 +47,29 @@ def _build(places, edges, weights):  # noqa: ANN001, ANN202
         arc_weights[back] = weights[edge]
         twins[there], twins[back] = back, there
     return starts, neighbours, arc_weights, twins
+
+
+@njit(cache=True, nogil=True)
+def ball(centers, reach, graph, inside):  # noqa: ANN001, ANN201
+    """Rows, ascending, within `reach` steps of `centers`; `inside` is scratch, all False before and after."""
+    found = np.empty(len(inside), np.int64)
+    count = 0
+    for place in centers:
+        if not inside[place]:
+            inside[place] = True
+            found[count] = place
+            count += 1
+    first = 0
+    for _ in range(reach):
+        last = count
+        for index in range(first, last):
+            for arc in range(graph.starts[found[index]], graph.starts[found[index] + 1]):
+                neighbour = graph.neighbours[arc]
+                if not inside[neighbour]:
+                    inside[neighbour] = True
+                    found[count] = neighbour
+                    count += 1
+        first = last
+    for index in range(count):
+        inside[found[index]] = False
+    return np.sort(found[:count])

@@ -28,7 +28,7 @@ import numpy as np
 from numba import njit
 
 from services.segmenter import moves
-from services.segmenter.adjacency import Adjacency, adjacency
+from services.segmenter.adjacency import Adjacency, adjacency, ball
 from services.segmenter.field import Field, least_gain
 from services.segmenter.maxflow import CUTS
 from services.segmenter.messages import empty_messages, lay_down, run_pass, take_up
@@ -45,7 +45,7 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True):
     worn_share: float = 0.2  # changed places, of all, after which an idle solver proposes for the whole field again
     reach: int = 5  # steps from a changed place within which message passing may propose labels
     near: int = 150  # places of a swap's local problem
-    chunk: int = 20_000  # visits of places between two looks at the clock
+    chunk: int = 8_000  # visits of places between two looks at the budget, 2 ms or so
 
     def __post_init__(self) -> None:
         if not (
@@ -255,32 +255,6 @@ def label_new(labels, graph, unary, pairwise):  # noqa: ANN001, ANN201
             if label >= 0:
                 costs += graph.weights[arc] * pairwise[label]
         labels[place] = np.argmin(costs)
-
-
-@njit(cache=True, nogil=True)
-def ball(centers, reach, graph, inside):  # noqa: ANN001, ANN201
-    """Rows, ascending, within `reach` steps of `centers`; `inside` is scratch, all False before and after."""
-    found = np.empty(len(inside), np.int64)
-    count = 0
-    for place in centers:
-        if not inside[place]:
-            inside[place] = True
-            found[count] = place
-            count += 1
-    first = 0
-    for _ in range(reach):
-        last = count
-        for index in range(first, last):
-            for arc in range(graph.starts[found[index]], graph.starts[found[index] + 1]):
-                neighbour = graph.neighbours[arc]
-                if not inside[neighbour]:
-                    inside[neighbour] = True
-                    found[count] = neighbour
-                    count += 1
-        first = last
-    for index in range(count):
-        inside[found[index]] = False
-    return np.sort(found[:count])
 
 
 @njit(cache=True, nogil=True)
