@@ -32,6 +32,7 @@ def from_log(path: Path, robot: str, place_id: int) -> PosteriorReply:
 
 def show(reply: PosteriorReply, console: Console) -> None:
     """A sentence, the labels with what speaks for each, the experts, and the neighbours."""
+    console.width = max(console.width, 100)  # lines that wrap are better than cells cut short
     seen = f"seen in {reply.frames} keyframes with trust {reply.trust:.1f}" if reply.frames else "never seen"
     position = ", ".join(f"{value:.2f}" for value in reply.position_m)
     chance = reply.posterior[reply.labels.index(reply.label)]

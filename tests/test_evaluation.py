@@ -19,8 +19,8 @@ from deploy.evaluation.perception import Cache, EvaluationError, Perception, sou
 from deploy.evaluation.plots import line_plot
 from schemas.codec import encode
 from schemas.places import VoxelMap
-from services.segmenter.core import Config
 from services.segmenter.experts import REGISTRY
+from services.segmenter.state import Config
 
 NAMES = ["kitchen", "hall"]
 SIDE_VOXELS = 20  # voxels of 0.2 m

@@ -37,11 +37,13 @@ from schemas.topics import (
     TEXT,
 )
 from services.runtime.service import Ask, Identity
-from services.segmenter import core, swap
+from services.segmenter import core, inference, report, swap
+from services.segmenter.balance import BalanceConfig
 from services.segmenter.experts.context import ObjectView
 from services.segmenter.service import SERVICE
+from services.segmenter.state import Config
 
-CFG = core.Config()
+CFG = Config()
 ROOMS = ["kitchen", "hall", "bedroom"]
 TICK = Tick(stamp_ns=10**18)
 
@@ -300,7 +302,7 @@ def test_removed_places_and_regions_leave_the_followers_too():
 
 
 def test_a_spent_budget_leaves_a_valid_labelling_and_an_idle_tick_finishes():
-    cfg = core.Config(budget_ms=1e-3)
+    cfg = Config(budget_ms=1e-3)
     positions, edges, frames = world()
     run = Run(cfg=cfg).feed(place_delta(positions, edges), task(), prior(ROOMS))
     waited = False
@@ -311,10 +313,10 @@ def test_a_spent_budget_leaves_a_valid_labelling_and_an_idle_tick_finishes():
         assert state.dirty or not state.solver.pending
         waited |= state.solver.pending > 0
     assert waited
-    hurried = swap.energy(core.field_of(run.state), run.state.places.labels)
+    hurried = swap.energy(inference.field_of(run.state), run.state.places.labels)
     run.feed(TICK, TICK)
     assert not (run.state.dirty or run.state.solver.pending)
-    field = core.field_of(run.state)
+    field = inference.field_of(run.state)
     energy = swap.energy(field, run.state.places.labels)
     assert energy <= hurried + 1e-9
     assert swap.energy(field, swap.minimise(field, run.state.places.labels)) == pytest.approx(energy)
@@ -327,7 +329,7 @@ def test_places_may_leave_at_either_end_of_the_list(end):
     gone = {"first": [0, 1], "last": [len(positions) - 1], "both": [0, len(positions) - 1]}[end]
     run.feed(no_places(revision=1, removed_ids=np.array(gone)), TICK)
     assert set(run.reader.beliefs) == set(range(len(positions))) - set(gone)
-    field = core.field_of(run.state)
+    field = inference.field_of(run.state)
     fresh = swap.minimise(field, run.state.places.labels)
     assert swap.energy(field, fresh) == pytest.approx(swap.energy(field, run.state.places.labels))
 
@@ -354,7 +356,7 @@ def test_following_the_deltas_equals_the_snapshot():
 def test_what_is_kept_up_to_date_equals_what_is_found_afresh(seed):
     """After any history, asking every expert again and describing every region again changes nothing."""
     rng = np.random.default_rng(seed)
-    cfg = core.Config(balance=core.BalanceConfig(tolerance=0.0))
+    cfg = Config(balance=BalanceConfig(tolerance=0.0))
     positions, edges, frames = world()
     run = Run(cfg=cfg).feed(task(), prior(ROOMS), place_delta(positions, edges))
     oven = ObjectView(ids=np.array([3]), positions_m=np.array([(2.0, 2.0, 1.0)]), concepts=np.array([(1.0, 0.0)]))
@@ -365,7 +367,7 @@ def test_what_is_kept_up_to_date_equals_what_is_found_afresh(seed):
         merged = rng.choice(np.setdiff1d(alive, removed), (1, 2), replace=False) if revision % 4 == 0 else none
         back = np.arange(len(positions)) if revision % 7 == 0 else none
         if revision == 5:
-            core.see_objects(run.state, oven, cfg)
+            inference.see_objects(run.state, oven, cfg)
         fields = {"removed_ids": removed, "merged_ids": merged.reshape(-1, 2), "place_ids": back, "revision": revision}
         run.feed(place_delta(positions[back], edges if len(back) else edges[:0], **fields), frame)
     run.feed(TICK)
@@ -374,12 +376,12 @@ def test_what_is_kept_up_to_date_equals_what_is_found_afresh(seed):
     kept = {name: getattr(places, name).copy() for name in columns}
     before, beliefs = dict(run.reader.regions), dict(run.reader.beliefs)
     places.stale[:] = places.reshaped[:] = places.doubtful[:] = places.unbelieved[:] = True
-    state.weights = core.edge_weights(state.graph, cfg)
-    core.evaluate_experts(state, True, cfg)
-    core.believe(state, cfg)
+    state.weights = inference.edge_weights(state.graph, cfg)
+    inference.evaluate_experts(state, True, cfg)
+    inference.believe(state, cfg)
     for name, column in kept.items():
         np.testing.assert_allclose(getattr(state.places, name), column, atol=1e-5, err_msg=name)
-    core.publish(state, [], True, cfg)
+    report.publish(state, [], True, cfg)
     assert {number: (region.neighbour_ids, region.object_ids) for number, region in state.regions.items()} == {
         number: (region.neighbour_ids, region.object_ids) for number, region in before.items()
     }
@@ -498,7 +500,7 @@ def test_posterior_explains_the_label():
 
 
 def test_beta_zero_labels_each_place_by_its_own_evidence():
-    run, _ = finished(cfg=core.Config(beta=0.0))
+    run, _ = finished(cfg=Config(beta=0.0))
     np.testing.assert_array_equal(run.state.places.labels, run.state.places.unary.argmin(axis=1))
 
 
@@ -506,9 +508,9 @@ def test_beta_zero_labels_each_place_by_its_own_evidence():
 def test_pairwise_costs_by_hand(clearance_m, factor):
     """Two places 1 m apart with clearance 0.4: beta exp(-1 / 2) (-log 0.3) = 2 x 0.60653 x 1.20397 = 1.46049."""
     positions = np.array([(0.0, 0.0, 1.0), (1.0, 0.0, 1.0)])
-    cfg = core.Config(edge_clearance_m=clearance_m, edge_sum=0.0)
+    cfg = Config(edge_clearance_m=clearance_m, edge_sum=0.0)
     run = Run(cfg=cfg).feed(place_delta(positions, np.array([(0, 1)])), task(), prior(ROOMS[:2]))
-    mrf = core.field_of(run.state)
+    mrf = inference.field_of(run.state)
     assert mrf.weights[0] * mrf.pairwise[0, 1] == pytest.approx(1.46049 * factor, abs=1e-4)
     assert mrf.pairwise[0, 0] == 0
 
@@ -519,14 +521,14 @@ def test_edge_weights_by_hand(scale):
     positions = scale * np.array([(0.0, 0.0, 1.0), (1.0, 0.0, 1.0), (2.0, 0.0, 1.0), (1.0, 1.0, 1.0)])
     positions[:, 2] = 1.0
     run = Run().feed(place_delta(positions, np.array([(0, 1), (1, 2), (1, 3)])))
-    np.testing.assert_allclose(core.edge_weights(run.state.graph, CFG), np.sqrt(3.0), rtol=1e-6)
+    np.testing.assert_allclose(inference.edge_weights(run.state.graph, CFG), np.sqrt(3.0), rtol=1e-6)
 
 
 def test_edge_weights_fall_with_length():
     """Path of 1 m and 3 m: w = 0.60653, 0.22313; 3 w / sqrt(d_u d_v) = 3 sqrt(w / 0.82966) = 2.5651, 1.5558."""
     positions = np.array([(0.0, 0.0, 1.0), (1.0, 0.0, 1.0), (4.0, 0.0, 1.0)])
     run = Run().feed(place_delta(positions, np.array([(0, 1), (1, 2)])))
-    np.testing.assert_allclose(core.edge_weights(run.state.graph, CFG), (2.5651, 1.5558), atol=1e-4)
+    np.testing.assert_allclose(inference.edge_weights(run.state.graph, CFG), (2.5651, 1.5558), atol=1e-4)
 
 
 def test_a_label_the_encoder_favours_everywhere_does_not_take_the_map():
@@ -535,7 +537,7 @@ def test_a_label_the_encoder_favours_everywhere_does_not_take_the_map():
     shifted = text(np.eye(len(ROOMS)), background_mean=np.array((0.0, -0.8, 0.0), dtype=np.float32))
     right = {}
     for limit in (0.0, 10.0):
-        cfg = core.Config(beta=0.0, balance=core.BalanceConfig(limit=limit, half_places=1.0))
+        cfg = Config(beta=0.0, balance=BalanceConfig(limit=limit, half_places=1.0))
         run = Run(cfg=cfg).feed(place_delta(positions, edges), task(), prior(ROOMS), answer_text=False)
         run.feed(shifted, *frames, TICK)
         inside = positions[:, 0] % 4.0 != 0
@@ -566,4 +568,4 @@ def test_text_is_asked_in_the_configured_space():
 )
 def test_impossible_settings_are_refused(fields):
     with pytest.raises(ValueError):
-        core.Config(**fields)
+        Config(**fields)

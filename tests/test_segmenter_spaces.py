@@ -9,12 +9,12 @@ from test_segmenter_core import ROOMS, TICK, Run, finished, world
 from schemas.codec import decode, encode
 from schemas.topics import BACKFILL, TEXT
 from services.runtime.service import Ask
-from services.segmenter import core
 from services.segmenter.service import SERVICE
 from services.segmenter.spaces import SpacesConfig
+from services.segmenter.state import Config
 
 NEW = "new/space"
-CFG = core.Config(spaces=SpacesConfig(backfill_ticks=2, repeat_ticks=4, patience_ticks=6, silent_frames=3))
+CFG = Config(spaces=SpacesConfig(backfill_ticks=2, repeat_ticks=4, patience_ticks=6, silent_frames=3))
 
 
 def turned(frames, space=NEW):
@@ -143,7 +143,7 @@ def test_another_space_that_was_there_from_the_start_waits():
 
 
 def test_following_can_be_switched_off():
-    cfg = core.Config(spaces=SpacesConfig(follow=False))
+    cfg = Config(spaces=SpacesConfig(follow=False))
     run, _ = finished(cfg=cfg)
     run.feed(*turned(walk(3)), TICK)
     assert run.state.spaces.force == SPACE and not run.state.spaces.rivals

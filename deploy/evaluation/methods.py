@@ -26,8 +26,10 @@ from schemas.status import Tick
 from services.registry import BY_NAME
 from services.runtime.service import Ask, Identity
 from services.scene_store import core as store
-from services.segmenter.core import Config, State, region_concepts, see_objects
+from services.segmenter.core import region_concepts
 from services.segmenter.experts import REGISTRY
+from services.segmenter.inference import see_objects
+from services.segmenter.state import Config, State
 
 OURS = "ours"
 BASELINES = ("clio", "hovsg", "hydra", "argmax")

@@ -23,7 +23,8 @@ from schemas.topics import (
     TEXT,
 )
 from services.runtime.service import Ask, Identity, Output, Service
-from services.segmenter import core
+from services.segmenter import core, report
+from services.segmenter.state import Config, State, empty
 
 QUESTIONS = {
     SnapshotRequest: PLACE_SNAPSHOT,
@@ -34,33 +35,33 @@ QUESTIONS = {
 PUBLISHED = {RegionDelta: REGION_DELTA, Backfill: BACKFILL}
 
 
-def init(cfg: core.Config, identity: Identity) -> core.State:
+def init(cfg: Config, identity: Identity) -> State:
     """Nothing is known yet."""
-    return core.empty(cfg, identity.robot, identity.epoch)
+    return empty(cfg, identity.robot, identity.epoch)
 
 
-def step(state: core.State, message: Message, cfg: core.Config) -> Iterator[Output]:
+def step(state: State, message: Message, cfg: Config) -> Iterator[Output]:
     """One input; regions go to their topic, requests become questions."""
     for output in core.update(state, message, cfg):
         topic = PUBLISHED.get(type(output))
         yield (topic, output) if topic is not None else Ask(QUESTIONS[type(output)], output)
 
 
-def answer_snapshot(state: core.State, request: SnapshotRequest, cfg: core.Config) -> RegionDelta:
+def answer_snapshot(state: State, request: SnapshotRequest, cfg: Config) -> RegionDelta:
     """Everything published so far."""
-    return core.snapshot(state)
+    return report.snapshot(state)
 
 
-def answer_posterior(state: core.State, request: PosteriorRequest, cfg: core.Config) -> PosteriorReply:
+def answer_posterior(state: State, request: PosteriorRequest, cfg: Config) -> PosteriorReply:
     """Why a place carries its label."""
-    return core.explain(state, request, cfg)
+    return report.explain(state, request, cfg)
 
 
 SERVICE = Service(
     "segmenter",
     purpose="Aligns places with the prior: a label and a belief for each place, and regions with lasting ids.",
     scope="robot",
-    config=core.Config,
+    config=Config,
     init=init,
     step=step,
     reads=(PLACE_DELTA, PYRAMID, POSE_UPDATE, TASK, PRIOR),
