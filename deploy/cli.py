@@ -62,13 +62,17 @@ def _add_run_options(parser: argparse.ArgumentParser) -> None:
         choices=("3d", "2d"),
         help="spheres of free space, or pieces of ground for large and unbounded spaces (default: 3d)",
     )
+    parser.add_argument(
+        "--encoder", default="", help="conse/…, open_clip/MODEL/PRETRAINED or onnx:FOLDER (docs/encoders.md)"
+    )
     parser.add_argument("--config", default="", help="TOML file with a section per service")
     parser.add_argument("--set", action="append", default=[], metavar="SERVICE.FIELD=VALUE", help="one setting")
 
 
 def _settings(arguments: argparse.Namespace) -> list[str]:
     """Settings that run options stand for, then those given by --set."""
-    return [*([f"place_graph.places={arguments.places}"] if arguments.places else []), *arguments.set]
+    places = [f"place_graph.places={arguments.places}"] if arguments.places else []
+    return [*places, *_encoder_settings(arguments.encoder), *arguments.set]
 
 
 Command = Callable[[str, str, str], argparse.ArgumentParser]
@@ -211,6 +215,16 @@ def _client(connect: str) -> "Client":
 
 def _names(text: str) -> list[str]:
     return [name.strip() for name in text.split(",") if name.strip()]
+
+
+def _encoder_settings(choice: str) -> list[str]:
+    """Settings of workers and segmenter for one choice of an encoder. Raises UserError."""
+    from services.feature_pyramid.encoders import EncoderUnavailable, space_of
+
+    try:
+        return [f"feature_pyramid.space={choice}", f"segmenter.space={space_of(choice)}"] if choice else []
+    except EncoderUnavailable as error:
+        raise UserError(str(error)) from error
 
 
 def cmd_demo(arguments: argparse.Namespace) -> int:

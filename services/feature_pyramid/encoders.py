@@ -1,5 +1,6 @@
 """What an encoder is, and which family of encoders serves an embedding space."""
 
+import re
 from importlib import import_module
 from typing import Any, NamedTuple, Protocol
 
@@ -67,6 +68,11 @@ def package(module: str, name: str = "") -> Any:
     except ImportError as error:
         name = name or module.replace("_", "-")
         raise EncoderUnavailable(f"the package {name} is not installed; run `pip install {name}`.") from error
+
+
+def key_chunk(name: str) -> str:
+    """A name as it may stand in a key and in the name of a space."""
+    return re.sub(r"[^\w.-]+", "-", name)
 
 
 def unit(vectors: np.ndarray) -> np.ndarray:
