@@ -17,7 +17,8 @@ The change is solved as a local problem with fixed surroundings, which grows whi
 2. The alpha-beta-swaps that the change can have made profitable are tried, then those that their own changes can have.
 
 Both stop when `expired()` says so; the labels are valid at any time and the energy of the field in hand never rises.
-Once `pending` is 0, no alpha-beta-swap on the whole field lowers the energy (see `moves`), as after a cold solve.
+Once `pending` is 0, no alpha-beta-swap on the whole field lowers the energy (see `moves`), as after a fresh solve.
+Idle time also goes into longer message passing over the whole field, at the start and whenever much has changed.
 """
 
 from collections.abc import Callable
@@ -42,7 +43,8 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True):
     min_cut: Literal["pymaxflow", "scipy"] = "pymaxflow"  # library for large cuts; PyMaxflow is under the GPL
     compiled_up_to: int = 2_000  # free places in a cut that compiled code solves itself
     round_trips: int = 6  # of message passing
-    worn_share: float = 0.2  # changed places, of all, after which an idle solver proposes for the whole field again
+    idle_round_trips: int = 20  # of message passing over the whole field when all else is done
+    worn_share: float = 0.2  # changed places, of all, after which that is due again
     reach: int = 5  # steps from a changed place within which message passing may propose labels
     near: int = 150  # places of a swap's local problem
     chunk: int = 8_000  # visits of places between two looks at the budget, 2 ms or so
@@ -102,8 +104,9 @@ class Solver:
         """Go on with what is pending, on the whole field; the labels (place,) so far."""
         self._propose_near(expired)
         self._swap(moves.DEEP, expired)
-        if self._worn and not expired() and self._propose(np.arange(len(self.labels)), expired):
-            self._changes = 0
+        if self._worn and not expired():
+            if self._propose(np.arange(len(self.labels)), self.settings.idle_round_trips, expired):
+                self._changes = 0
             self._swap(moves.DEEP, expired)
         return self.labels.copy()
 
@@ -155,7 +158,7 @@ class Solver:
             moves.flag_around(known[given[known] != found[origin[known]]], moves.NEAR, graph, self._work)
         moves.flag_all(dirty, moves.DEEP if before is None else moves.NEAR, self._work)
         self._unproposed = np.union1d(self._unproposed, dirty).astype(np.int64)
-        self._changes = 0 if before is None else self._changes + len(dirty)
+        self._changes += len(dirty)
         self._least_gain = max(0.0 if before is None else self._least_gain, least_gain(unary[dirty]))
 
     def _carry(self, before: Field | None, origin: np.ndarray, field: Field, graph: Adjacency) -> None:
@@ -174,7 +177,7 @@ class Solver:
         waits[old_unproposed] = True
         self._unproposed = known[waits[origin[known]]]
 
-    def _propose(self, rows: np.ndarray, expired: Expired) -> bool:
+    def _propose(self, rows: np.ndarray, round_trips: int, expired: Expired) -> bool:
         """Message passing on `rows` (ascending) takes what lowers the energy; False if there was no budget for it.
 
         A budget that ends it early is not made up for: the swaps go first then, lest nothing ever gets done.
@@ -184,18 +187,18 @@ class Solver:
         messages.pairwise[: len(self._pairwise), : len(self._pairwise)] = self._pairwise
         take_up(rows, graph, self._unary, labels, messages)
         before = labels[rows]
-        while trips < self.settings.round_trips and not expired():
+        while trips < round_trips and not expired():
             round_trip(rows, labels, *scene, messages, self._work.mark, self._least_gain)
             trips += 1
         lay_down(rows, messages)
         moves.flag_around(rows[labels[rows] != before], moves.NEAR, graph, self._work)
-        return trips > 0 or not self.settings.round_trips
+        return trips > 0 or not round_trips
 
     def _propose_near(self, expired: Expired) -> None:
         """Proposals around the places that changed."""
         if len(self._unproposed):
             rows = ball(self._unproposed, self.settings.reach, self._graph, self._messages.inside)
-            if self._propose(rows, expired):
+            if self._propose(rows, self.settings.round_trips, expired):
                 self._unproposed = self._unproposed[:0]
 
 

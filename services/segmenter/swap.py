@@ -3,6 +3,7 @@
 `minimise` is for a field met for the first time; a field that changes is followed by `incremental.Solver`.
 """
 
+import msgspec
 import numpy as np
 
 from services.segmenter.field import Field, conditional_costs, energy
@@ -15,8 +16,8 @@ def minimise(field: Field, labels: np.ndarray, settings: Settings | None = None)
     """Labels (place,) from which no alpha-beta-swap lowers the energy; it is at most that of `labels`.
 
     Message passing proposes a labelling for the whole field, which replaces `labels` wherever that lowers the energy;
-    then swaps run until none is left that gains.
+    then swaps run until none is left that gains. (An idle `Solver` goes on from there.)
     """
-    solver = Solver(settings)
+    solver = Solver(msgspec.structs.replace(settings or Settings(), worn_share=np.inf))
     solver.take(field, labels)
     return solver.drain()
