@@ -159,7 +159,9 @@ def _add_tools(command: Command) -> None:
     """What is done with results, logs and the system itself."""
     export = command("export", "write the scene graph as a file", "prior-sg export --format spark-dsg --out dsg.json")
     export.add_argument("--format", choices=("json", "spark-dsg", "png"), default="json")
-    export.add_argument("--out", type=Path, required=True, help="the file to write")
+    export.add_argument(
+        "--out", type=Path, required=True, help="the file to write; png: the map, and places in 3D in NAME-3d.png"
+    )
     export.add_argument("--database", type=Path, help="read this scene.sqlite instead of the running store")
     _add_bus(export)
 
@@ -435,7 +437,8 @@ def cmd_export(arguments: argparse.Namespace) -> int:
     if not len(scene.place_ids):
         raise UserError(f"the store holds no places of {arguments.robot}; name another with --robot")
     report.export(scene, voxels, arguments.format, arguments.out)
-    console.print(f"{len(scene.place_ids)} places, {len(scene.regions)} regions: {arguments.out}")
+    also = f" and {report.picture_of_places(arguments.out)}" if arguments.format == "png" else ""
+    console.print(f"{len(scene.place_ids)} places, {len(scene.regions)} regions: {arguments.out}{also}")
     return 0
 
 

@@ -25,6 +25,7 @@ import spark_dsg
 
 from deploy.evaluation.metrics import GroundTruth
 from deploy.map_image import draw_map, label_colors
+from deploy.place_image import draw_places
 from schemas.places import VoxelMap
 from schemas.regions import Region
 from schemas.scene import Scene
@@ -179,6 +180,11 @@ def map_png(scene: Scene, voxel_map: VoxelMap | None, path: str | Path, truth: G
     """Write the scene from above as a PNG picture, with ground truth dashed where given. Raises OSError."""
     outlines = [region.polygon_m for region in truth.regions] if truth else []
     Path(path).write_bytes(draw_map(scene, voxel_map, outlines))
+
+
+def places_png(scene: Scene, voxel_map: VoxelMap | None, path: str | Path) -> None:
+    """Write places, edges and openings in three dimensions as a PNG picture. Raises OSError."""
+    Path(path).write_bytes(draw_places(scene, voxel_map))
 
 
 def _place_node(scene: Scene, row: int) -> spark_dsg.PlaceNodeAttributes:

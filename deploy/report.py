@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.table import Table
 
 from deploy.evaluation.metrics import GroundTruth, evaluate
-from deploy.export import map_png, scene_json, spark_dsg_graph
+from deploy.export import map_png, places_png, scene_json, spark_dsg_graph
 from deploy.replay import Log, message_differences, undisturbed
 from deploy.run import Result
 from schemas.codec import decode, encode
@@ -50,7 +50,7 @@ def region_table(scene: Scene) -> Table:
 
 
 def write(result: Result, out: Path, truth: dict[str, Any] | None, console: Console) -> None:
-    """Print the regions and the scores, and write scene.json, dsg.json, map.png and metrics.json."""
+    """Print the regions and the scores, and write scene.json, dsg.json, map.png, map-3d.png and metrics.json."""
     scene = result.scene
     console.print(region_table(scene))
     labelled = int((scene.place_regions >= 0).sum())
@@ -67,7 +67,7 @@ def write(result: Result, out: Path, truth: dict[str, Any] | None, console: Cons
         (out / "metrics.json").write_text(json.dumps(metrics, indent=1))
     for kind, name in (("json", "scene.json"), ("spark-dsg", "dsg.json"), ("png", "map.png")):
         export(scene, result.voxels, kind, out / name, truth)
-    names = ", ".join(("scene.json", "dsg.json", "map.png", result.log_path.name))
+    names = ", ".join(("scene.json", "dsg.json", "map.png", "map-3d.png", result.log_path.name))
     console.print(f"written to {out}: {names} ({result.seconds:.0f} s)")
 
 
@@ -89,6 +89,12 @@ def _write(scene: Scene, voxels: VoxelMap | None, kind: str, path: Path, truth: 
         spark_dsg_graph(scene).save(str(path))
     else:
         map_png(scene, voxels, path, GroundTruth.from_json(truth) if truth else None)
+        places_png(scene, voxels, picture_of_places(path))
+
+
+def picture_of_places(path: Path) -> Path:
+    """The file of the three-dimensional picture beside a map."""
+    return path.with_stem(f"{path.stem}-3d")
 
 
 def scene_in(database: Path, robot: str) -> Scene:

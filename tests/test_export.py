@@ -11,8 +11,9 @@ import spark_dsg
 from scipy.spatial.transform import Rotation
 
 from deploy.evaluation.metrics import GroundTruth
-from deploy.export import map_png, save_json, save_spark_dsg, scene_json, spark_dsg_graph
+from deploy.export import map_png, places_png, save_json, save_spark_dsg, scene_json, spark_dsg_graph
 from deploy.map_image import FREE, PALETTE, UNLABELLED, WALL, label_colors
+from deploy.place_image import OPENING
 from schemas.places import VoxelMap
 from schemas.regions import Region
 from schemas.scene import Scene
@@ -300,3 +301,20 @@ def test_picture_of_real_ground_truth(tmp_path):
     map_png(scene, None, tmp_path / "map.png", truth)
     _, share = shares(tmp_path / "map.png")
     assert all(share(tinted(color)) > 0.02 for color in label_colors(scene).values())
+
+
+def test_picture_of_places_in_three_dimensions(tmp_path):
+    for name, scene in (("balls", flat()), ("ground", with_details())):
+        places_png(scene, flat_map(), tmp_path / f"{name}.png")
+        picture = cv2.imread(str(tmp_path / f"{name}.png"))
+        assert picture.shape == (1100, 1600, 3)
+        shown = {tuple(color) for color in picture.reshape(-1, 3)[:, ::-1].tolist()}
+        expected = label_colors(scene)["kitchen"]
+        assert (expected in shown) == (name == "balls")  # ellipses let the floor shine through
+        assert picture.mean() < 254
+    places_png(flat(), flat_map(), tmp_path / "again.png")
+    assert (tmp_path / "again.png").read_bytes() == (tmp_path / "balls.png").read_bytes()
+    arrows = msgspec.structs.replace(with_details(), **{k: getattr(flat(), k) for k in GROUND})
+    places_png(arrows, None, tmp_path / "arrows.png")
+    picture = cv2.imread(str(tmp_path / "arrows.png"))[..., ::-1].astype(int)
+    assert (np.abs(picture - OPENING).sum(axis=2) < 30).sum() > 50
