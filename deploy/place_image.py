@@ -29,8 +29,9 @@ def draw_places(scene: Scene, voxel_map: VoxelMap | None) -> bytes:
     view = _View(np.concatenate((occupied_m, scene.positions_m, np.zeros((0, 3)))))
     if voxel_map is not None:
         _paint_obstacles(canvas, view, occupied_m, voxel_map.voxel_m)
-    _draw_edges(canvas, view, scene)
-    _draw_places(canvas, view, scene)
+    over = (_draw_edges, _draw_places) if not len(scene.surface_ids) else (_draw_places, _draw_edges)
+    for draw in over:
+        draw(canvas, view, scene)
     _draw_openings(canvas, view, scene)
     _write(canvas, scene)
     small = cv2.resize(canvas, (WIDTH_PX, HEIGHT_PX), interpolation=cv2.INTER_AREA)
