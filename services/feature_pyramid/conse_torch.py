@@ -8,9 +8,13 @@ import numpy as np
 import torch
 from safetensors.torch import load_file
 from torch.nn.utils.fusion import fuse_conv_bn_eval
-from transformers import BertConfig, BertModel
 
+from services.feature_pyramid import torchvision_parts
 from services.feature_pyramid.encoders import package
+
+torchvision_parts.load_if_installed()
+
+from transformers import BertConfig, BertModel  # noqa: E402
 
 PIXEL_MEAN, PIXEL_SCALE = 127.0, 128.0  # what the EfficientNet-Lite weights were trained with
 

@@ -1,11 +1,13 @@
 """Lets torchvision's Python parts load where its compiled operators do not fit the installed PyTorch.
 
-open_clip imports torchvision for transforms written in Python. Wheels of torchvision for graphics cards do not load
-beside a PyTorch for processors: they fail when they describe operators that their library did not bring. We name those
-operators, so the description succeeds; whoever calls one gets PyTorch's error that it has no implementation.
+open_clip imports torchvision for transforms written in Python, and transformers imports it wherever it is installed.
+Wheels of torchvision for graphics cards do not load beside a PyTorch for processors: they fail when they describe
+operators that their library did not bring. We name those operators, so the description succeeds; whoever calls one gets
+PyTorch's error that it has no implementation.
 """
 
 import importlib
+import importlib.util
 import re
 import sys
 from typing import Any
@@ -27,6 +29,12 @@ def load() -> Any:
                 raise
             _name(missing.group(1))
     raise RuntimeError("torchvision does not load")
+
+
+def load_if_installed() -> None:
+    """For packages that import torchvision when it is there; to be called before them."""
+    if importlib.util.find_spec("torchvision") is not None:
+        load()
 
 
 def _name(operator: str) -> None:

@@ -261,7 +261,8 @@ class Owed:
 
 class Board:
     """The groups of a pool. A job without a group goes to every group that has workers; the first group that comes
-    gets those that found none.
+    gets those that found none. A group that comes later gets the newest job, so that readers of the results hear of it
+    even when nothing new is submitted.
     """
 
     def __init__(self, credits: int = CREDITS, limit: int = 0) -> None:
@@ -271,6 +272,7 @@ class Board:
         self._empty_since_s: dict[str, float] = {}
         self._owed: dict[Hashable, Owed] = {}
         self._homeless: deque[tuple[Hashable, bytes, bool]] = deque()
+        self._newest: tuple[Hashable, bytes] | None = None
 
     @property
     def outstanding(self) -> int:
@@ -284,6 +286,8 @@ class Board:
 
     def submit(self, job_id: Hashable, payload: bytes, group: str = "", later: bool = False) -> list[Ended]:
         """Line up one job, for one group or for all. Returns what ends by that."""
+        if not group:
+            self._newest = (job_id, payload)
         names = [group] if group else [name for name, members in self.groups.items() if members.workers]
         if not names:
             self._homeless.append((job_id, payload, later))
@@ -300,11 +304,14 @@ class Board:
     def worker_up(self, name: str, group: str) -> None:
         """A worker of a group has joined, or come back."""
         self._group_of[name] = group
+        new = group not in self.groups
         self._group(group).worker_up(name)
         self._empty_since_s.pop(group, None)
         while self._homeless:
             job_id, payload, later = self._homeless.popleft()
             self.submit(job_id, payload, later=later)
+        if new and self._newest is not None:
+            self.submit(*self._newest, group)
 
     def worker_down(self, name: str, now_s: float) -> list[Ended]:
         """A worker is gone."""
