@@ -91,6 +91,24 @@ def test_a_changing_field_is_followed_to_its_swap_optimum(settings, told):
         assert is_swap_optimal(changes.field, labels), kind
 
 
+@pytest.mark.parametrize("seed", range(20))
+def test_flags_alone_find_every_swap(seed):
+    """Without message passing, which would hide what the flags miss; small and large cuts, tight and loose fields."""
+    alone = Settings(
+        round_trips=0, idle_round_trips=0, near=[1, 3, 8, 150][seed % 4], compiled_up_to=[2000, 0][seed % 2]
+    )
+    changes, solver = Changes(seed, places=40, labels=3 + seed % 3), Solver(alone)
+    changes.field = changes.field._replace(weights=changes.field.weights * [0.3, 1.0, 2.0][seed % 3])
+    solver.take(changes.field, changes.field.unary.argmin(axis=1))
+    labels = solver.drain()
+    for kind in ["costs", "weights", "edges", "places"] * 3:
+        dirty, previous = getattr(changes, kind)()
+        start = labels if previous is None else np.where(previous >= 0, labels[previous], -1)
+        solver.update(changes.field, start, dirty=dirty, previous=previous)
+        labels = solver.drain()
+        assert is_swap_optimal(changes.field, labels), kind
+
+
 @pytest.mark.parametrize("kind", ["costs", "weights", "edges", "places"])
 def test_changed_rows_are_those_that_were_changed(kind):
     changes = Changes(seed=5)
@@ -135,6 +153,30 @@ def test_nothing_changed_changes_nothing_and_the_callers_arrays_stay():
     assert np.array_equal(again, labels)
     assert np.array_equal(start, kept[0])
     assert np.array_equal(field.unary, kept[1])
+
+
+@pytest.mark.parametrize("near", [1, 2, 150])
+def test_a_place_that_is_forced_over_takes_its_neighbours_along(near):
+    """One end of a row turns for itself; the others then follow one by one, though only the first is reported."""
+    count = 8
+    unary = np.tile([0.0, 0.5], (count, 1))
+    unary[0] = [0.0, 3.0]
+    edges = np.stack((np.arange(count - 1), np.arange(1, count)), axis=1)
+    field = Field(unary, edges, np.full(count - 1, 1.0), 1.0 - np.eye(2))
+    solver = Solver(Settings(round_trips=0, near=near))
+    solver.take(field, np.zeros(count, int))
+    labels = solver.drain()
+    assert not labels.any()
+    field = field._replace(unary=unary.copy())
+    field.unary[0] = [9.0, 0.0]
+    field.unary[1:] = [0.0, 0.1]
+    solver.update(field, labels, dirty=np.arange(count))
+    assert solver.drain().all()
+    unary = field.unary.copy()
+    unary[0] = [0.0, 9.0]
+    field = field._replace(unary=unary)
+    solver.update(field, np.ones(count, int), dirty=np.array([0]))
+    assert not solver.drain().any()
 
 
 def test_labels_from_elsewhere_are_settled_too():

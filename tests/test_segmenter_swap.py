@@ -123,7 +123,7 @@ def gco_swap(field, start):
 
 @pytest.mark.parametrize("metric", [False, True])
 def test_as_low_as_gco_on_random_fields(metric):
-    """Both end in local minima, now one and now the other lower by up to a few per cent; on average they are equal."""
+    """Each ends in a local minimum, ours lower by up to some per cent or as low but for a per mille or two."""
     ratios = []
     for seed in range(10):
         field = random_field(seed, places=300, labels=6, degree=6, metric=metric)
@@ -132,8 +132,8 @@ def test_as_low_as_gco_on_random_fields(metric):
         ours = swap.minimise(field, start)
         assert swap.energy(field, ours) < swap.energy(field, start)
         ratios.append(swap.energy(field, ours) / swap.energy(field, theirs))
-    assert max(ratios) < 1.05
-    assert np.mean(ratios) < 1.01
+    assert max(ratios) < 1.003
+    assert np.mean(ratios) < 0.998
 
 
 @pytest.mark.parametrize("settings", [Settings(), Settings(round_trips=0), Settings(compiled_up_to=0, min_cut="scipy")])

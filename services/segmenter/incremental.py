@@ -50,10 +50,9 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True):
     chunk: int = 8_000  # visits of places between two looks at the budget, 2 ms or so
 
     def __post_init__(self) -> None:
-        if not (
-            self.round_trips >= 0 and self.reach >= 0 and self.near > 0 and self.chunk > 0 and self.compiled_up_to >= 0
-        ):
-            raise ValueError("round_trips, reach, near, chunk or compiled_up_to is out of range")
+        counts = (self.round_trips, self.idle_round_trips, self.reach, self.compiled_up_to, self.worn_share)
+        if min(counts) < 0 or min(self.near, self.chunk) < 1:
+            raise ValueError("a count, a reach or a share is negative, or near or chunk less than 1")
 
 
 def never() -> bool:

@@ -4,7 +4,8 @@ The swap of one pair of labels falls apart. Let place p have label alpha or beta
 alpha against its neighbours of third labels, and S(p) the sum of w V(alpha, beta) over its neighbours with alpha or
 beta. If D(p) >= S(p), alpha is best for p whatever those neighbours take; if D(p) <= -S(p), beta is. Such a place is
 *forced*: it takes its label at no loss, and for its neighbours becomes one with a fixed label, which may force them in
-turn. What stays free are connected *cores*, each a minimum cut of its own.
+turn. What stays free are connected *cores*, each a minimum cut of its own; beyond a place that is forced to keep its
+label, nothing is different.
 
 A change of label, cost or edge can open a better swap only in a core that holds a place whose costs changed: any better
 swap is a sum of its connected parts, and a part without such a place was already tried. So each place carries one flag
@@ -208,7 +209,10 @@ def conditional(place, starts, neighbours, weights, unary, pairwise, labels, cos
 
 @njit(cache=True, nogil=True)
 def explore(graph, unary, pairwise, labels, work, limit):  # noqa: PLR0917, ANN001, ANN201
-    """Find the core around the place in hand: its free places, and the forced ones around them, into `seen`."""
+    """Find the core around the place in hand: its free places, and the forced ones around them, into `seen`.
+
+    It does not grow beyond places that are forced to keep their labels.
+    """
     starts, neighbours, weights = graph.starts, graph.neighbours, graph.weights
     mark, lean, hold, seen, stack, core = work.mark, work.lean, work.hold, work.seen, work.stack, work.core
     first, beta = core[PLACE], core[BETA]
@@ -237,7 +241,7 @@ def explore(graph, unary, pairwise, labels, work, limit):  # noqa: PLR0917, ANN0
                     hold[neighbour] -= cost * weights[arc]
                     stack[depth] = neighbour
                     depth += 1
-        if mark[place] == FREE:
+        if mark[place] == FREE or mark[place] != (TAKES_ALPHA if labels[place] == alpha else TAKES_BETA):
             for arc in range(starts[place], starts[place + 1]):
                 neighbour = neighbours[arc]
                 if mark[neighbour] == UNSEEN and (labels[neighbour] == alpha or labels[neighbour] == beta):
@@ -322,17 +326,18 @@ def commit(graph, unary, pairwise, labels, work, limits):  # noqa: PLR0917, ANN0
         return
     for index in range(changed):
         place = stack[index]
-        flag_others(place, alpha, beta, labels, work)
+        flag_after(place, alpha, beta, labels, work)
         for arc in range(starts[place], starts[place + 1]):
-            flag_others(neighbours[arc], alpha, beta, labels, work)
+            flag_after(neighbours[arc], alpha, beta, labels, work)
 
 
 @njit(cache=True, nogil=True)
-def flag_others(place, alpha, beta, labels, work):  # noqa: ANN001, ANN201
-    """Flag a place after a swap of alpha and beta nearby, by which that same swap is the only one not to change."""
+def flag_after(place, alpha, beta, labels, work):  # noqa: ANN001, ANN201
+    """Flag a place after a swap of alpha and beta nearby; that swap need not be tried again, unless it was ended."""
     kept_alpha, kept_beta = work.pending[place, alpha], work.pending[place, beta]
     flag(place, NEAR, work)
-    if labels[place] == alpha or labels[place] == beta:
+    in_pair = labels[place] == alpha or labels[place] == beta
+    if in_pair and work.core[CAPPED] == 0:
         work.pending[place, alpha], work.pending[place, beta] = kept_alpha, kept_beta
 
 
