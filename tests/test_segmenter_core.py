@@ -334,6 +334,22 @@ def test_places_may_leave_at_either_end_of_the_list(end):
     assert swap.energy(field, fresh) == pytest.approx(swap.energy(field, run.state.places.labels))
 
 
+def test_a_merge_tells_the_new_region_of_every_place():
+    """Two kitchens become one by an edge; places far from it change their region and nothing else."""
+    run, positions = finished(rooms=1)
+    apart = positions + np.array((0.0, 100.0, 0.0))
+    count = len(positions)
+    _, edges = place_grid(1)
+    run.feed(place_delta(apart, edges + count, place_ids=np.arange(count) + count, revision=1), TICK)
+    assert len(run.reader.regions) == 2
+    link = place_delta(positions[:0], np.array([(0, count)]), place_ids=np.zeros(0, dtype=np.int64), revision=2)
+    run.feed(link, TICK)
+    assert [event.kind for event in run.deltas[-1].events] == ["merged"]
+    assert {belief[0] for belief in run.reader.beliefs.values()} == set(run.reader.regions) and len(
+        run.reader.regions
+    ) == 1
+
+
 def test_following_the_deltas_equals_the_snapshot():
     rng = np.random.default_rng(0)
     positions, edges, frames = world()
@@ -386,6 +402,8 @@ def test_what_is_kept_up_to_date_equals_what_is_found_afresh(seed):
         number: (region.neighbour_ids, region.object_ids) for number, region in before.items()
     }
     assert state.regions == before
+    told = {place: belief[0] for place, belief in beliefs.items()}
+    assert told == dict(zip(state.graph.ids.tolist(), places.regions.tolist(), strict=True))
     fresh = Reader()
     fresh.apply(SERVICE.answers[REGION_SNAPSHOT](state, SnapshotRequest(robot=ROBOT), cfg))
     assert fresh.beliefs.keys() == beliefs.keys()

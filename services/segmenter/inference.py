@@ -179,6 +179,7 @@ def partition(state: State) -> list[RegionEvent]:
     component = regions.components(places.labels, state.graph.edges)
     places.regions, state.next_region_id = regions.track(component, previous, state.next_region_id)
     moved = places.regions != previous
+    places.unbelieved |= moved  # so that followers learn the region of places far from the change
     beside = with_neighbours(state.graph, moved)  # lists of neighbours name a region that came, went or grew
     state.disturbed.update(previous[moved].tolist(), places.regions[beside].tolist())
     state.reformed.update(previous[moved].tolist(), places.regions[moved].tolist())
