@@ -129,6 +129,14 @@ def ablations(config: Config) -> list[Method]:
     unscaled = msgspec.structs.replace(kernel, gamma=ANY_SCALE)
     unhidden = msgspec.structs.replace(kernel, occlusion_tolerance_m=NEVER_M)
     parts = {
+        "no sharing": (
+            Variant(msgspec.structs.replace(config, sharing=msgspec.structs.replace(config.sharing, steps=0))),
+            "each place is compared with the regions for itself",
+        ),
+        "no balance": (
+            Variant(msgspec.structs.replace(config, balance=msgspec.structs.replace(config.balance, limit=0.0))),
+            "labels that the encoder favours everywhere are not corrected",
+        ),
         "no pairwise term": (Variant(msgspec.structs.replace(config, beta=0.0)), "beta = 0"),
         "no scale trust": (Variant(msgspec.structs.replace(config, kernel=unscaled)), "crops of any scale count alike"),
         "no occlusion test": (Variant(msgspec.structs.replace(config, kernel=unhidden)), "hidden places count as seen"),
