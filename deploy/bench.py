@@ -60,7 +60,7 @@ def features() -> tuple[dict, dict]:
 
 def attacked_pool(seconds: float) -> tuple[dict, dict]:
     """A pool whose workers are killed, frozen, slowed and added at random."""
-    return bench_features.attacked(_sample_keyframes(), seconds, rate_hz=4.0)
+    return bench_features.attacked(_sample_keyframes(), seconds, rate_hz=40.0)
 
 
 def bus() -> tuple[dict, dict]:
