@@ -723,6 +723,17 @@ def test_after_a_pose_update_the_map_is_what_the_corrected_poses_make(two_rooms)
     assert play(state, [truth(TWO_ROOMS_WALK, WRONG)]) == []  # a repeat
 
 
+def test_keyframes_refused_beside_a_wrong_pose_are_fused_once_it_is_corrected():
+    clean, state = start(), start()
+    play(clean, ROOM_WALK[:3])
+    away = np.array(ROOM_WALK[0].world_from_camera)
+    away[0, 3] += 9.0
+    wrong = [msgspec.structs.replace(ROOM_WALK[0], world_from_camera=away), *ROOM_WALK[1:3]]
+    assert [bool(d.event) for d in play(state, wrong)] == [False, True, True]
+    play(state, [truth(ROOM_WALK, [0])])
+    assert canonical(state) == canonical(clean)
+
+
 def test_a_correction_may_come_before_its_keyframe(two_rooms):
     state = start()
     frames = disturbed(TWO_ROOMS_WALK, WRONG)

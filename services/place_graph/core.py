@@ -129,6 +129,7 @@ def correct(state: State, update: PoseUpdate, cfg: Config) -> PlaceDelta | None:
             moved_ids.append(frame_id)
         elif frame_id in state.cameras_m:
             lost += 1
+    changed += _reconsidered(state, cfg)
     event = f"{lost} of {len(poses)} keyframes are no longer archived and keep their poses" if lost else ""
     changes = refresh(state, np.concatenate(changed), cfg)
     return _delta(state, changes, cfg, stamp_ns=update.stamp_ns, event=event, moved_ids=moved_ids)
@@ -231,6 +232,14 @@ def _fuse_doubted(state: State, cfg: Config) -> Iterator[np.ndarray]:
         if kept is not None and not kept.fused:
             state.track.correct(kept.keyframe)
             yield _fuse_kept(state, kept.keyframe, images.depth_of(kept.keyframe, cfg.max_principal_offset), cfg)
+
+
+def _reconsidered(state: State, cfg: Config) -> Iterator[np.ndarray]:
+    """Fuse keyframes that were refused beside wrong poses and fit the corrected ones."""
+    for keyframe in list(state.archive.unfused()):
+        if not state.track.jump_m(keyframe, cfg.bounds):
+            state.track.believe(keyframe)
+            yield _fuse_kept(state, keyframe, images.depth_of(keyframe, cfg.max_principal_offset), cfg)
 
 
 def _move(state: State, kept: Kept, world_from_camera: np.ndarray, cfg: Config) -> Iterator[np.ndarray]:

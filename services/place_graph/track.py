@@ -76,7 +76,8 @@ class Track:
         self.contradictions.clear()
 
     def correct(self, keyframe: Keyframe) -> None:
-        """The keyframe is here too: what follows may go on from the corrected pose or from the old one."""
+        """The keyframe is here, wherever it was believed to be before."""
+        self.believed = [point for point in self.believed if point.frame_id != keyframe.frame_id]
         insort(self.believed, _point(keyframe))
 
 
@@ -93,8 +94,10 @@ def _leap_m(track: list[Point], keyframe: Keyframe, bounds: Bounds) -> float:
     nearest = {point.stamp_ns for point in track[max(0, after - 1) : after + 1]}
     leaps_m = []
     for stamp_ns, center_m, _ in track[max(0, after - 2) : after + 2]:
+        if stamp_ns not in nearest:
+            continue
         distance_m = float(np.linalg.norm(keyframe.world_from_camera[:3, 3] - center_m))
-        if stamp_ns in nearest and distance_m <= bounds.reachable_m((keyframe.stamp_ns - stamp_ns) / 1e9):
+        if distance_m <= bounds.reachable_m((keyframe.stamp_ns - stamp_ns) / 1e9):
             return 0.0
         leaps_m.append(distance_m)
     return min(leaps_m)
