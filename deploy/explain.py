@@ -88,6 +88,8 @@ def expert_table(reply: PosteriorReply) -> Table:
         favourite = (reply.labels[best], f"{math.exp(vote.log_probabilities[best]):.2f}")
         if vote.confidence == 0:
             favourite = ("says nothing", "")
+        elif max(vote.log_probabilities) - min(vote.log_probabilities) < 1e-6:
+            favourite = ("all alike", favourite[1])
         table.add_row(vote.expert, f"{vote.confidence:.2f}", f"{vote.weight:.2f}", *favourite)
     return table
 
