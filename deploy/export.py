@@ -7,6 +7,7 @@
     regions       [{id, label, parent, probability, unknown, predicted, area_m2, position_m [x, y, z], hull_m [[x, y]],
                     places [id], objects [id], adjacent [region id],
                     transitions [{region, edge [place id inside, outside], position_m, clearance_m, door}]}]
+    zones         [{label, regions [id]}]         layer above: adjacent regions whose labels share a parent in the prior
     places        [{id, position_m [x, y, z], radius_m, region, label, posterior {label: p}, unknown, predicted,
                     frontier {direction [x, y, z], area_m2}, ellipse {half_axes_m, angle_rad}, hull_m [[x, y]]}]
     edges         [{a, b, clearance_m}]           between places
@@ -68,6 +69,7 @@ def scene_json(scene: Scene) -> dict[str, Any]:
             }
             for region in scene.regions
         ],
+        "zones": [{"label": label, "regions": ids} for label, ids in zones(scene)],
         "places": [
             _place_json(scene, row, names, predicted)
             | _opening_json(frontiers.get(place_id))
@@ -80,6 +82,22 @@ def scene_json(scene: Scene) -> dict[str, Any]:
         ],
         "trajectory_m": _short(scene.trajectory),
     }
+
+
+def zones(scene: Scene) -> list[tuple[str, list[int]]]:
+    """The layer above the regions: label and region ids of each connected set of regions with one parent, sorted by
+    the smallest id. Regions without a parent belong to none.
+    """
+    parents = {region.id: region.parent for region in scene.regions if region.parent}
+    zone_of = {region: region for region in parents}
+    for a, b in sorted(_adjacent(scene)):
+        if a in parents and b in parents and parents[a] == parents[b]:
+            kept, gone = sorted((zone_of[a], zone_of[b]))
+            zone_of = {region: kept if zone == gone else zone for region, zone in zone_of.items()}
+    members: dict[int, list[int]] = {}
+    for region, zone in sorted(zone_of.items()):
+        members.setdefault(zone, []).append(region)
+    return [(parents[zone], ids) for zone, ids in sorted(members.items())]
 
 
 def _place_json(scene: Scene, row: int, names: dict[int, str], predicted: set[int]) -> dict[str, Any]:

@@ -11,7 +11,7 @@ import spark_dsg
 from scipy.spatial.transform import Rotation
 
 from deploy.evaluation.metrics import GroundTruth
-from deploy.export import map_png, places_png, save_json, save_spark_dsg, scene_json, spark_dsg_graph
+from deploy.export import map_png, places_png, save_json, save_spark_dsg, scene_json, spark_dsg_graph, zones
 from deploy.map_image import FREE, PALETTE, UNLABELLED, WALL, label_colors
 from deploy.place_image import OPENING
 from schemas.places import VoxelMap
@@ -119,6 +119,20 @@ def test_json_by_hand():
     assert data["edges"][1] == {"a": 13, "b": 16, "clearance_m": 0.375} and len(data["edges"]) == 5
     assert data["trajectory_m"] == [[0.0, 1.0, 1.2], [5.0, 1.0, 1.2]]
     assert (data["robot"], data["task"], data["environment"]) == ("spot", "tidy up", "a flat")
+
+
+def test_zones_are_adjacent_regions_with_one_parent():
+    """Six regions of one place each in a row: day, day, night, day, day, none; the second pair is apart."""
+    parents = ["day", "day", "night", "day", "day", ""]
+    regions = [region(index, "hall", parent=parent) for index, parent in enumerate(parents)]
+    positions = [(index, 0, 1) for index in range(6)]
+    links = [(index, index + 1, 0.5) for index in range(5)]
+    scene = make_scene(positions, [0.5] * 6, range(6), regions, edges=links)
+    assert zones(scene) == [("day", [0, 1]), ("night", [2]), ("day", [3, 4])]
+    assert scene_json(scene)["zones"][0] == {"label": "day", "regions": [0, 1]}
+    ring = make_scene(positions, [0.5] * 6, range(6), regions, edges=[*links, (0, 4, 0.5)])
+    assert zones(ring) == [("day", [0, 1, 3, 4]), ("night", [2])]
+    assert zones(empty()) == []
 
 
 @pytest.mark.parametrize("name", ["dsg.json", "dsg.sparkdsg"])
