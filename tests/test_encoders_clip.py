@@ -108,6 +108,25 @@ def test_a_broken_weight_file_is_told_in_one_sentence(tiny, tmp_path):
     assert "\n" not in str(failure.value)
 
 
+@pytest.mark.usefixtures("tiny")
+def test_the_measurement_for_graphics_cards_on_a_processor():
+    """Mechanics only: operations of one picture by hand, and every figure there."""
+    import open_clip
+
+    from deploy.benches import graphics
+
+    model = open_clip.create_model("tiny-test").eval()
+    tokens, width = 17, 64
+    block = 2 * tokens * (4 * width * width + 2 * width * 4 * width)  # projections and the two layers behind them
+    least = 2 * block + 2 * 16 * width * 3 * 64  # two blocks, and the patches; attention itself comes on top
+    counted = graphics.flops(model, torch.zeros(1, 3, 32, 32))
+    assert least <= counted <= 1.3 * least
+    found = graphics.measured("tiny-test", "cpu", 6, peak=1e12)
+    assert set(found) == {"crops_per_s", "peak_share", "openclip_ratio", "encode_image_ratio"}
+    assert all(value > 0 for value in found.values())
+    assert found["peak_share"] == pytest.approx(found["crops_per_s"] * counted / 1e12)
+
+
 class ImageNet(torch.nn.Module):
     def __init__(self):
         super().__init__()

@@ -18,6 +18,7 @@ from typing import Any, cast
 import msgspec
 import numpy as np
 
+from deploy.benches.graphics import on_card
 from deploy.supervisor import Supervisor
 from schemas.codec import decode, encode
 from schemas.features import Pyramid
@@ -174,6 +175,7 @@ def features(keyframes: list[Keyframe]) -> tuple[dict, dict]:
         metrics[f"crops_per_s_{workers}"] = statistics.median(delivered)
     metrics["pool_ratio"] = min(metrics["pool_ratio_1"], metrics["pool_ratio_2"])
     metrics["crops_per_s"] = metrics["crops_per_s_1"]
+    metrics |= on_card()
     return metrics, {"space": cfg.space, "crops": len(crops), "frames": POOL_FRAMES, "rounds": ROUNDS}
 
 

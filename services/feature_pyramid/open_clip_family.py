@@ -25,7 +25,7 @@ def space_of(choice: str) -> str:
 def load(choice: str, options: Options) -> ClipEncoder:
     """The encoder with its weights, which the model hub delivers at first use. Raises EncoderUnavailable."""
     name, pretrained = _parts(choice)
-    torch, open_clip = package("torch"), _open_clip()
+    torch, open_clip = package("torch"), library()
     _check(open_clip, name, pretrained)
     device = _device(torch, options.device)
     if options.threads and device == "cpu":
@@ -100,7 +100,8 @@ def _is_file(pretrained: str) -> bool:
     return "/" in pretrained or pretrained.endswith((".pt", ".pth", ".bin", ".safetensors"))
 
 
-def _open_clip() -> Any:
+def library() -> Any:
+    """The package open_clip. Raises EncoderUnavailable."""
     try:
         torchvision_parts.load()
     except ImportError as error:
