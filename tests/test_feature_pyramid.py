@@ -153,7 +153,7 @@ def test_coarse_surface_against_brute_force():
     assert surface[1, 1] == 0.0
 
 
-@pytest.mark.parametrize("bad", [{"overlap": 1.0}, {"layers": 0}, {"min_area_m2": -1.0}, {"batch_size": 0}])
+@pytest.mark.parametrize("bad", [{"overlap": 1.0}, {"layers": 0}, {"min_area_m2": -1.0}, {"batch_size": -1}])
 def test_bad_settings_are_refused(bad):
     with pytest.raises(ValueError, match="must"):
         Config(**bad)
@@ -252,17 +252,18 @@ def test_waiting_keyframes_are_read_ahead_and_share_a_batch(worker):
     depth = np.full((480, 640), 4000, np.uint16)
     frames = [keyframe(np.roll(checkered(), 40 * index, axis=1), depth, frame_id=index) for index in range(3)]
     alone = [only(service.step(worker, frame, CFG)) for frame in frames]
-    batched = Config(space=SPACE, threads=1, batch_size=64)
-    service.prepare(worker, frames, batched)
-    service.prepare(worker, frames[1:], batched)
+    service.prepare(worker, frames, CFG)
+    service.prepare(worker, frames[1:], CFG)
     for waiting in worker.views.values():
         waiting.result()
     calls, encode_images = [], worker.encoder.encode_images
     try:
+        worker.encoder.batch_size = 64
         worker.encoder.encode_images = lambda crops: calls.append(len(crops)) or encode_images(crops)
-        together = [only(service.step(worker, frame, batched)) for frame in frames]
+        together = [only(service.step(worker, frame, CFG)) for frame in frames]
     finally:
         worker.encoder.encode_images = encode_images
+        worker.encoder.batch_size = 4
     assert calls == [84] and not worker.views and not worker.encoded
     for one, other in zip(alone, together, strict=True):
         assert one.frame_id == other.frame_id

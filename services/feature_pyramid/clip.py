@@ -49,7 +49,7 @@ class ClipEncoder:
     """Two towers as one encoder."""
 
     def __init__(self, space: str, towers: "Towers", batch_size: int) -> None:
-        self.space, self.side_px, self._batch_size = space, towers.side_px, batch_size
+        self.space, self.side_px, self.batch_size = space, towers.side_px, batch_size
         self._images, self._texts = towers.images, towers.texts
         texts, logit_scale = towers.texts, towers.logit_scale
         background = self._encode(pictures_of_nothing())
@@ -75,8 +75,8 @@ class ClipEncoder:
         return calibrated(self.space, embeddings, self._calibration)
 
     def _encode(self, crops: list[np.ndarray]) -> np.ndarray:
-        starts = range(0, len(crops), self._batch_size)
-        return unit(np.concatenate([self._images(crops[first : first + self._batch_size]) for first in starts]))
+        starts = range(0, len(crops), self.batch_size)
+        return unit(np.concatenate([self._images(crops[first : first + self.batch_size]) for first in starts]))
 
 
 def calibrated(space: str, embeddings: np.ndarray, by: Calibration) -> TextEmbeddings:

@@ -72,7 +72,7 @@ def load(choice: str, options: Options) -> "ConseEncoder":
     classify, embed = networks(name, options.threads)
     sentences = SentenceModel(embed)
     classes = class_embeddings(sentences) if options.runtime == "onnx" else sentences.embed(class_names())
-    return ConseEncoder(choice, Classifier(name, classify, options.batch_size), sentences, classes)
+    return ConseEncoder(choice, Classifier(name, classify, options.batch_on("cpu")), sentences, classes)
 
 
 def _network_of(space: str) -> str:
@@ -183,7 +183,7 @@ class ConseEncoder:
         self._background = unit(self._classes)
         self._background_weights = scene_weights(raw, sentences.embed(list(SCENES)))
         self.dim = raw.shape[1]
-        self.side_px = classifier.side_px
+        self.side_px, self.batch_size = classifier.side_px, classifier.batch_size
 
     def encode_images(self, crops: list[np.ndarray]) -> np.ndarray:
         """Embeddings of RGB crops, each uint8 (h, w, 3): float32 (crop, dim), unit length."""
@@ -227,12 +227,12 @@ class Classifier:
     """EfficientNet-Lite: crops to class logits."""
 
     def __init__(self, name: str, classify: Classify, batch_size: int) -> None:
-        self.side_px, self._classify, self._batch_size = INPUT_PX[name], classify, batch_size
+        self.side_px, self._classify, self.batch_size = INPUT_PX[name], classify, batch_size
 
     def logits(self, crops: list[np.ndarray]) -> np.ndarray:
         """Class logits of RGB crops, each uint8 (h, w, 3): float32 (crop, class)."""
-        starts = range(0, len(crops), self._batch_size)
-        return np.concatenate([self._batch(crops[first : first + self._batch_size]) for first in starts])
+        starts = range(0, len(crops), self.batch_size)
+        return np.concatenate([self._batch(crops[first : first + self.batch_size]) for first in starts])
 
     def _batch(self, crops: list[np.ndarray]) -> np.ndarray:
         return self._classify(np.stack([resized(crop, self.side_px) for crop in crops]))

@@ -20,16 +20,16 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
     overlap: float = 0.5  # least share of a crop's side that its neighbour covers too
     min_area_m2: float = 2.25  # A_min: crops that see less physical area are not encoded
     surface_cell_px: int = 8  # cell size of the coarse depth surface
-    batch_size: int = 4  # crops per forward pass, of one or several keyframes
+    batch_size: int = 0  # crops per forward pass, of one or several keyframes; 0 = 4, on a graphics card 256
     threads: int = 0  # of the neural network library; 0 = its own choice (OMP_NUM_THREADS)
 
     def __post_init__(self) -> None:
-        if self.smallest_crop_px < 1 or self.layers < 1 or self.surface_cell_px < 1 or self.batch_size < 1:
-            raise ValueError("smallest_crop_px, layers, surface_cell_px and batch_size must be at least 1")
+        if self.smallest_crop_px < 1 or self.layers < 1 or self.surface_cell_px < 1:
+            raise ValueError("smallest_crop_px, layers and surface_cell_px must be at least 1")
         if not 0.0 <= self.overlap < 1.0:
             raise ValueError("overlap must be in [0, 1)")
-        if self.min_area_m2 < 0.0 or self.threads < 0:
-            raise ValueError("min_area_m2 and threads must not be negative")
+        if self.min_area_m2 < 0.0 or self.threads < 0 or self.batch_size < 0:
+            raise ValueError("min_area_m2, threads and batch_size must not be negative")
 
 
 class Crops(msgspec.Struct, frozen=True, eq=False):

@@ -26,9 +26,13 @@ class Options(NamedTuple):
     """How an encoder is to run."""
 
     threads: int = 0  # 0 = the library's own choice (OMP_NUM_THREADS)
-    batch_size: int = 4  # crops per forward pass
+    batch_size: int = 0  # crops per forward pass; 0 = what suits the device
     runtime: str = "onnx"  # or torch, where a family has both
     device: str = "auto"  # cpu, cuda, or auto: cuda where there is one
+
+    def batch_on(self, device: str) -> int:
+        """Crops per forward pass on cpu or cuda."""
+        return self.batch_size or (256 if device == "cuda" else 4)
 
 
 class Encoder(Protocol):
@@ -41,6 +45,7 @@ class Encoder(Protocol):
     space: str
     dim: int
     side_px: int  # of the square images that the network sees
+    batch_size: int  # crops per forward pass
 
     def encode_images(self, crops: list[np.ndarray]) -> np.ndarray:
         """Embeddings of RGB crops, each uint8 (h, w, 3): float32 (crop, dim), unit length."""

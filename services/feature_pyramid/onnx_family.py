@@ -70,7 +70,7 @@ def load(choice: str, options: Options) -> ClipEncoder:
         Session(text, options.threads, device),
         _tokenizer(tokens, manifest.text),
     )
-    return ClipEncoder(space_of(choice), towers, options.batch_size)
+    return ClipEncoder(space_of(choice), towers, options.batch_on(device))
 
 
 class Towers:

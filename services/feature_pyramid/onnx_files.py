@@ -10,8 +10,6 @@ import numpy as np
 
 from services.feature_pyramid.encoders import EncoderUnavailable
 
-TOLERANCE = 1e-3  # by which an export may differ from what was exported
-
 
 class Session:
     """One network, ready to run: arrays by input name to the first output."""

@@ -40,7 +40,7 @@ def load(choice: str, options: Options) -> ClipEncoder:
             f"the weights {pretrained!r} of open_clip's {name} cannot be loaded ({why}); fetch them once where the hub "
             "can be reached, or name a file with them as open_clip/MODEL/FILE."
         ) from error
-    return ClipEncoder(space_of(choice), Towers(torch, model.eval(), tokenizer, device), options.batch_size)
+    return ClipEncoder(space_of(choice), Towers(torch, model.eval(), tokenizer, device), options.batch_on(device))
 
 
 class Towers:

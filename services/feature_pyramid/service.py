@@ -63,7 +63,7 @@ def step(state: Worker, message: Message, cfg: Config) -> Iterator[Output]:
     waiting = state.views.pop(key, None)
     seen = waiting.result() if waiting is not None else view(message, cfg)
     state.broken += seen.broken
-    embeddings = state.encoded.pop(key) if key in state.encoded else encode(state, seen, cfg)
+    embeddings = state.encoded.pop(key) if key in state.encoded else encode(state, seen)
     yield PYRAMID, pyramid(state, message, seen, embeddings)
 
 
@@ -78,12 +78,12 @@ def view(frame: Keyframe, cfg: Config) -> View:
     return View(selection, selection.crops.cut(color), coarse_surface(depth_m, cfg.surface_cell_px), broken)
 
 
-def encode(state: Worker, seen: View, cfg: Config) -> np.ndarray:
+def encode(state: Worker, seen: View) -> np.ndarray:
     """Embeddings of the crops; a batch that they do not fill takes in those of keyframes that are ready and waiting."""
     joined: dict[tuple[str, int], View] = {}
     crops = list(seen.crops)
     for key, waiting in state.views.items():
-        if len(crops) >= cfg.batch_size or not waiting.done() or waiting.exception() is not None:
+        if len(crops) >= state.encoder.batch_size or not waiting.done() or waiting.exception() is not None:
             break
         if key not in state.encoded:
             joined[key] = waiting.result()
