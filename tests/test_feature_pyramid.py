@@ -263,7 +263,7 @@ def test_waiting_keyframes_are_read_ahead_and_share_a_batch(worker):
         together = [only(service.step(worker, frame, CFG)) for frame in frames]
     finally:
         worker.encoder.encode_images = encode_images
-        worker.encoder.batch_size = 4
+        worker.encoder.batch_size = 1
     assert calls == [84] and not worker.views and not worker.encoded
     for one, other in zip(alone, together, strict=True):
         assert one.frame_id == other.frame_id

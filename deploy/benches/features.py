@@ -121,8 +121,8 @@ def sample_crops(keyframes: list[Keyframe], count: int, side_px: int) -> np.ndar
 
 
 def bare_rate(run: Callable[[np.ndarray], Any], crops: np.ndarray, batches: tuple[int, ...]) -> dict[int, float]:
-    """Crops per second of a network alone, by batch size: the best of several rounds, interleaved."""
-    best = dict.fromkeys(batches, 0.0)
+    """Crops per second of a network alone, by batch size: the median of several rounds, turn by turn."""
+    rates: dict[int, list[float]] = {size: [] for size in batches}
     for size in batches:
         run(crops[:size])
     for _, size in itertools.product(range(ROUNDS), batches):
@@ -130,8 +130,8 @@ def bare_rate(run: Callable[[np.ndarray], Any], crops: np.ndarray, batches: tupl
         for first in range(0, len(crops) - size + 1, size):
             run(crops[first : first + size])
         done = len(crops) // size * size
-        best[size] = max(best[size], done / (time.perf_counter() - started_s))
-    return best
+        rates[size].append(done / (time.perf_counter() - started_s))
+    return {size: statistics.median(found) for size, found in rates.items()}
 
 
 def pool_rate(running: Pool, frames: Iterator[Keyframe], count: int) -> float:

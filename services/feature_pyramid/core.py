@@ -20,7 +20,7 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
     overlap: float = 0.5  # least share of a crop's side that its neighbour covers too
     min_area_m2: float = 2.25  # A_min: crops that see less physical area are not encoded
     surface_cell_px: int = 8  # cell size of the coarse depth surface
-    batch_size: int = 0  # crops per forward pass, of one or several keyframes; 0 = 4, on a graphics card 256
+    batch_size: int = 0  # crops per forward pass, of one or several keyframes; 0 = what suits encoder and device
     threads: int = 0  # of the neural network library; 0 = its own choice (OMP_NUM_THREADS)
 
     def __post_init__(self) -> None:
