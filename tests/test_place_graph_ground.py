@@ -79,6 +79,23 @@ def test_outlier_clusters_are_left_out():
     assert pieces and max(piece.voxels[:, 0].max() for piece in pieces) < 20
 
 
+def test_no_edge_where_the_straight_line_leaves_the_ground():
+    label = hall()
+    label[12:36, 12:36, 4:20] = OCCUPIED  # ground goes around a block
+    pieces = ground.divide(grid_of(label), Box(np.zeros(3, np.int64), np.array((48, 48, 32))), RULES)
+    low = [piece for piece in pieces if piece.middle[2] == 3]
+    joined = ground.touching_pieces(low, RULES.step)
+    assert len(joined) >= len(low) - 1
+    for a, b in joined:
+        line = np.linspace(low[a].middle, low[b].middle, 60)[:, :2]
+        assert not ((line > 13.5) & (line < 33.5)).all(axis=1).any()
+    corner = [  # two arms of an L: they touch at the corner, the line between their middles cuts it
+        ground._piece(np.argwhere(np.ones((30, 2, 1), bool))),
+        ground._piece(np.argwhere(np.ones((2, 30, 1), bool)) + np.array((0, 2, 0))),
+    ]
+    assert ground.touching_pieces(corner, RULES.step) == []
+
+
 def test_ellipses_overlap_by_hand():
     def piece(x: float, y: float, long: float, short: float, angle: float) -> ground.Piece:
         return ground.Piece(

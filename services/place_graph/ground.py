@@ -4,8 +4,8 @@ Hydra takes mesh vertices that a network has labelled as ground. Here the ground
 with enough free height above them, reached from their neighbours by small steps, on gentle slopes. It is cut into
 square tiles, so that a change concerns its tiles only; in each tile every connected part is halved across the long side
 of its smallest rectangle until the pieces are small. A piece becomes a place with its hull and with Hydra's ellipse,
-whose axes are those of the rectangle times the square root of two. Pieces whose ground touches and whose ellipses
-overlap are joined.
+whose axes are those of the rectangle times the square root of two. Pieces whose ground touches, all along the
+line between them, and whose ellipses overlap are joined.
 """
 
 from collections.abc import Iterable
@@ -111,7 +111,7 @@ class GroundGraph(PlaceGraph):
         """Edges between pieces near a box: smaller id, larger id, squared overlap."""
         ids = [i for i in self.within(box.grown(self.ground.tile)) if i not in self.frozen]
         found: dict[tuple[int, int], int] = {}
-        for one, two in touching_pieces([self.pieces[i].voxels for i in ids], self.ground.step):
+        for one, two in touching_pieces([self.pieces[i] for i in ids], self.ground.step):
             a, b = self.pieces[ids[one]], self.pieces[ids[two]]
             overlap = overlap_of(a, b)
             if overlap > self.ground.overlap and abs(a.middle[2] - b.middle[2]) < self.ground.rise:
@@ -200,15 +200,17 @@ def _radius(piece: Piece, direction: np.ndarray) -> float:
     return float(1 / np.hypot(along / piece.half_axes[0], across / piece.half_axes[1]))
 
 
-def touching_pieces(pieces: list[np.ndarray], step: int) -> list[tuple[int, int]]:
-    """Pairs of pieces (lists of voxels) with neighbouring ground, smaller index first, sorted."""
+def touching_pieces(pieces: list[Piece], step: int) -> list[tuple[int, int]]:
+    """Pairs of pieces with neighbouring ground and ground all along the line between their middles; sorted."""
     if not pieces:
         return []
-    voxels = np.concatenate(pieces)
+    voxels = np.concatenate([piece.voxels for piece in pieces])
+    low = voxels.min(axis=0)
     owner = np.full(np.ptp(voxels, axis=0) + 1, -1, np.int32)
-    owner[tuple((voxels - voxels.min(axis=0)).T)] = np.repeat(np.arange(len(pieces)), [len(p) for p in pieces])
-    pairs = _neighbours(owner, step)
-    return [(int(a), int(b)) for a, b in np.unique(np.sort(pairs, axis=1), axis=0)]
+    owner[tuple((voxels - low).T)] = np.repeat(np.arange(len(pieces)), [len(piece.voxels) for piece in pieces])
+    pairs = np.unique(np.sort(_neighbours(owner, step), axis=1), axis=0)
+    middles = np.array([piece.middle for piece in pieces], np.int64) - low
+    return [(int(a), int(b)) for a, b in pairs if _over_ground(owner, middles[a], middles[b], step)]
 
 
 def _continued(old: list[tuple[int, Piece]], new: list[Piece], reach: float) -> dict[int, int]:
@@ -334,3 +336,23 @@ def _neighbours(owner, step):  # noqa: ANN001, ANN202
                         pairs[count, 0], pairs[count, 1] = owner[i, j, k], owner[a, b, c]
                         count += 1
     return pairs[:count]
+
+
+@njit(cache=True, nogil=True)
+def _over_ground(owner, start, stop, step):  # noqa: ANN001, ANN202
+    """Whether all of a line lies over ground, or beside it by a voxel, at about its height."""
+    nx, ny, nz = owner.shape
+    steps = max(abs(stop[0] - start[0]), abs(stop[1] - start[1]), 1)
+    for n in range(steps + 1):
+        share = n / steps
+        x = int(np.floor(start[0] + (stop[0] - start[0]) * share + 0.5))
+        y = int(np.floor(start[1] + (stop[1] - start[1]) * share + 0.5))
+        z = int(np.floor(start[2] + (stop[2] - start[2]) * share + 0.5))
+        found = False
+        for a in range(max(0, x - 1), min(nx, x + 2)):
+            for b in range(max(0, y - 1), min(ny, y + 2)):
+                for c in range(max(0, z - step), min(nz, z + step + 1)):
+                    found = found or owner[a, b, c] >= 0
+        if not found:
+            return False
+    return True
