@@ -306,7 +306,7 @@ class Host:
         self.inbox.of(topic.name).published += 1
         if topic.delivery == "job":
             job_id = (message.robot, message.frame_id)  # type: ignore[attr-defined]
-            group = getattr(message, "space", "")
+            group = getattr(message, "space", "")  # of a back-fill, which gives way to the stream
             self._pools[topic].submit(job_id, encode(message), group, later=bool(group))
         else:
             self._put(topic, message)
