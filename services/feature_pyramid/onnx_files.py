@@ -18,7 +18,7 @@ class Session:
         runtime = _runtime()
         options = runtime.SessionOptions()
         options.log_severity_level = 3
-        options.intra_op_num_threads = threads or int(os.environ.get("OMP_NUM_THREADS", "0"))
+        options.intra_op_num_threads = threads_of(threads)
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # idle threads leave others the cores
         try:
             self._session = runtime.InferenceSession(str(path), options, providers=_providers(runtime, device))
@@ -29,6 +29,11 @@ class Session:
     def __call__(self, *arrays: np.ndarray) -> np.ndarray:
         """The first output; inputs in the network's own order."""
         return self._session.run(None, dict(zip(self.inputs, arrays, strict=True)))[0]
+
+
+def threads_of(threads: int) -> int:
+    """How many threads to use when so many are set; 0 = OMP_NUM_THREADS, or one a core."""
+    return threads or int(os.environ.get("OMP_NUM_THREADS", "0")) or os.cpu_count() or 1
 
 
 def cached(name: str, made_of: list[str], export: Callable[[Path], None], suffix: str = ".onnx") -> Path:
