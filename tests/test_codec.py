@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import strategies as st
 
-from schemas import features, frames, places, priors, regions, scene, status
+from schemas import features, frames, objects, places, priors, regions, scene, status
 from schemas.codec import ARRAY_EXT_CODE, DTYPES, DecodeError, Message, Shape, copied, decode, encode, schema_name
 from schemas.topics import QUERIES, TOPICS
 
@@ -124,6 +124,44 @@ GOLDEN: list[Message] = [
         energy=-1.5,
         predicted_ids=np.array([1]),
         events=[regions.RegionEvent(kind="split", region=4, label="kitchen", other=5, former_label="hall")],
+    ),
+    objects.Detections(
+        robot="r",
+        frame_id=1,
+        stamp_ns=2,
+        space="s",
+        detector="segments",
+        prompted=False,
+        worker="w",
+        intrinsics=CAMERA,
+        world_from_camera=POSE,
+        boxes_px=np.array([[10, 20, 50, 60]], np.float32),
+        scores=np.array([0.5], np.float32),
+        embeddings=np.array([[0.6, 0.8]], FLOAT16),
+        point_counts=np.array([2], np.int32),
+        points_camera_m=np.array([[0, 0, 1], [0.5, 0, 1]], FLOAT16),
+        surface_m=np.ones((2, 3), FLOAT16),
+    ),
+    objects.ObjectDelta(
+        robot="r",
+        epoch=1,
+        revision=2,
+        stamp_ns=3,
+        prior_digest="d",
+        objects=[
+            objects.SceneObject(
+                id=4,
+                label="stove",
+                probability=0.5,
+                known=0.75,
+                position_m=(1.0, 2.0, 0.5),
+                min_m=(0.5, 1.5, 0.0),
+                max_m=(1.5, 2.5, 1.0),
+                frames=3,
+            )
+        ],
+        removed_ids=np.array([7]),
+        merged_ids=np.array([[5, 4]]),
     ),
     status.Consumed(
         robot="r", service="s", instance="i", order=1, topic="T", frame_id=2, writer="w", sequence=3, inline=b"x"
@@ -255,6 +293,20 @@ def test_a_huge_announced_array_is_refused_without_being_made():
 def test_impossible_poses_are_refused(pose, why):
     with pytest.raises(ValueError, match=why):
         frames.CameraState(robot="r", stamp_ns=0, world_from_camera=pose)
+
+
+@pytest.mark.parametrize("counts", [[1], [3], [2, 0]])
+def test_detections_whose_counts_do_not_fit_their_points_are_refused(counts):
+    good = next(message for message in GOLDEN if isinstance(message, objects.Detections))
+    many = len(counts)
+    fields = {name: getattr(good, name) for name in good.__struct_fields__} | {
+        "boxes_px": np.repeat(good.boxes_px, many, axis=0),
+        "scores": np.repeat(good.scores, many),
+        "embeddings": np.repeat(good.embeddings, many, axis=0),
+        "point_counts": np.array(counts, np.int32),
+    }
+    with pytest.raises(ValueError, match="point_counts"):
+        objects.Detections(**fields)
 
 
 def test_prior_check_names_the_fault():

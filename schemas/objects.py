@@ -1,0 +1,70 @@
+"""Objects: what a detector saw in one keyframe, and what association over time made of it, as deltas."""
+
+from typing import Annotated
+
+import msgspec
+import numpy as np
+
+from schemas.codec import Message, Shape
+from schemas.frames import Intrinsics, Pose, check_pose
+
+_NO_MERGES = msgspec.field(default_factory=lambda: np.zeros((0, 2), np.int64))
+
+
+class Detections(Message, frozen=True, kw_only=True):
+    """The objects seen in one keyframe, lifted by its depth.
+
+    Everything stands in the camera frame, so that a corrected pose moves it without detecting again. The points of a
+    detection are a sample of its visible surface, one per cell of a grid; those of all detections follow each other.
+    """
+
+    robot: str
+    frame_id: int
+    stamp_ns: int
+    space: str  # embedding space
+    detector: str  # its setting, for example segments
+    prompted: bool  # whether the detector was asked for a prior's objects, so that each detection is one of them
+    worker: str
+    intrinsics: Intrinsics
+    world_from_camera: Pose
+    boxes_px: Annotated[np.ndarray, Shape("float32", "detection", 4)]  # left, top, right, bottom
+    scores: Annotated[np.ndarray, Shape("float32", "detection")]  # the detector's own, in [0, 1]
+    embeddings: Annotated[np.ndarray, Shape("float16", "detection", "dim")]  # unit length
+    point_counts: Annotated[np.ndarray, Shape("int32", "detection")]  # at least 1 each
+    points_camera_m: Annotated[np.ndarray, Shape("float16", "point", 3)]
+    surface_m: Annotated[np.ndarray, Shape("float16", "row", "column")]  # coarse depth image, 0 = no measurement
+
+    def check(self) -> None:
+        check_pose(self.world_from_camera)
+        if (self.point_counts < 1).any() or self.point_counts.sum() != len(self.points_camera_m):
+            raise ValueError("point_counts do not fit the points")
+
+
+class SceneObject(msgspec.Struct, frozen=True, kw_only=True):
+    """One object of the scene; world, metres."""
+
+    id: int
+    label: str  # the prior's most probable object; empty = none of them, or no prior yet
+    probability: float  # P(label | object), after what is none of the prior's objects
+    known: float  # probability that it is any of the prior's objects
+    position_m: tuple[float, float, float]  # middle of its box
+    min_m: tuple[float, float, float]  # axis-aligned box
+    max_m: tuple[float, float, float]
+    frames: int  # keyframes in which it was detected
+
+
+class ObjectDelta(Message, frozen=True, kw_only=True):
+    """Change of the objects since the previous revision; with `snapshot`, all of them.
+
+    Apply in this order: remove, merge (the first of a pair is gone, the second holds both), upsert.
+    """
+
+    robot: str
+    epoch: int
+    revision: int
+    stamp_ns: int
+    prior_digest: str  # of the prior whose objects the labels name, empty before the first
+    snapshot: bool = False
+    objects: list[SceneObject]
+    removed_ids: Annotated[np.ndarray, Shape("int64", "removed")]
+    merged_ids: Annotated[np.ndarray, Shape("int64", "merged", 2)] = _NO_MERGES  # (gone, into)
