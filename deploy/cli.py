@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 from rich.table import Table
 
-from deploy import serve
+from deploy import priors, serve
 from deploy.evaluation import command as evaluation
 
 if TYPE_CHECKING:
@@ -204,8 +204,9 @@ def _add_tools(command: Command) -> None:
     bench.add_argument("--seconds", type=float, default=300.0, help="how long pool lasts (default: %(default)s)")
     bench.add_argument("--json", action="store_true", help="print one JSON object per measurement")
 
-    priors = command("priors", "list the curated priors", "prior-sg priors list")
-    priors.add_argument("action", choices=("list",))
+    priors.add_arguments(
+        command("priors", "make, show, compare and exchange prior graphs", "prior-sg priors list"), _add_bus
+    )
 
 
 def _client(connect: str) -> "Client":
@@ -315,11 +316,12 @@ def cmd_up(arguments: argparse.Namespace) -> int:
 def cmd_task(arguments: argparse.Namespace) -> int:
     """Switch the task and wait for the new regions."""
     from deploy import report
+    from deploy.client import NoPriorError
     from schemas.codec import DecodeError, decode
-    from schemas.priors import PriorRequest, Task
+    from schemas.priors import Task
     from schemas.regions import RegionDelta
     from schemas.scene import SceneRequest
-    from schemas.topics import PRIORS, REGION_DELTA, SCENE, TASK
+    from schemas.topics import REGION_DELTA, SCENE
 
     with _client(arguments.connect) as client:
         environment = arguments.environment or client.ask(SCENE, SceneRequest(robot=arguments.robot)).environment
@@ -332,13 +334,7 @@ def cmd_task(arguments: argparse.Namespace) -> int:
             task=arguments.task,
             regions=_names(arguments.regions),
         )
-        reply = client.ask(
-            PRIORS, PriorRequest(environment=environment, task=arguments.task, regions=task.regions), arguments.timeout
-        )
-        if not reply.priors:
-            raise UserError(reply.reason)
-        digest = reply.priors[0].digest()
-        note = reply.priors[0].provenance.note
+        arrivals: dict[str, float] = {}
         changed = threading.Event()
         started_s, given_ns = time.monotonic(), time.time_ns()
 
@@ -346,15 +342,23 @@ def cmd_task(arguments: argparse.Namespace) -> int:
             """A delta sent after the task was given; the history may hold older ones of the same task."""
             with contextlib.suppress(DecodeError):
                 delta = decode(RegionDelta, sample.payload)
-                if sample.sent_ns > given_ns and delta.prior_digest == digest and delta.task == arguments.task:
+                if sample.sent_ns > given_ns and delta.task == arguments.task:
+                    arrivals.setdefault(delta.prior_digest, time.monotonic())
                     changed.set()
 
         client.listen(REGION_DELTA, arguments.robot, see)
-        console.print(f"prior: {note}")
-        client.publish(TASK, task)
-        if not changed.wait(arguments.timeout):
-            raise UserError(f"no regions for the new task within {arguments.timeout:.0f} s; see `prior-sg health`")
-        seconds = time.monotonic() - started_s
+        with console.status("asking for the prior") as status:
+            try:
+                prior = client.give_task(task, arguments.timeout, status.update)
+            except NoPriorError as error:
+                raise UserError(str(error)) from error
+        console.print(f"prior: {prior.provenance.note}")
+        digest, end_s = prior.digest(), time.monotonic() + arguments.timeout
+        while digest not in arrivals:
+            changed.clear()
+            if not changed.wait(max(end_s - time.monotonic(), 0)) and digest not in arrivals:
+                raise UserError(f"no regions for the new task within {arguments.timeout:.0f} s; see `prior-sg health`")
+        seconds = arrivals[digest] - started_s
         time.sleep(0.5)
         console.print(report.region_table(client.ask(SCENE, SceneRequest(robot=arguments.robot))))
         console.print(f"regions for {arguments.task!r} after {seconds:.2f} s")
@@ -612,11 +616,10 @@ def cmd_eval(arguments: argparse.Namespace) -> int:
 
 
 def cmd_priors(arguments: argparse.Namespace) -> int:
-    """List the curated library."""
-    from deploy import report
+    """Everything about priors."""
+    from services.runtime.zenoh_bus import ZenohBus
 
-    console.print(report.prior_table())
-    return 0
+    return priors.run(arguments, console, lambda endpoint: ZenohBus(endpoint, wait_s=2.0))
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -635,7 +638,7 @@ def main(argv: list[str] | None = None) -> int:
     except BrokenPipeError:  # the reader of a pipe has left
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
-    except (UserError, RunError, ExportError, ChildFailed, *serve.HOPELESS) as error:
+    except (UserError, priors.PriorError, RunError, ExportError, ChildFailed, *serve.HOPELESS) as error:
         print(f"prior-sg: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:

@@ -1,5 +1,6 @@
 """A program's end of the bus: publish, ask and listen with typed messages."""
 
+import contextlib
 import threading
 import time
 import uuid
@@ -8,11 +9,18 @@ from types import TracebackType
 from typing import Any, TypeVar
 
 from schemas.codec import DecodeError, Message, decode, encode
+from schemas.priors import Prior, PriorRequest, Task
 from schemas.status import ServiceStatus, StatusRequest
-from schemas.topics import Query, Topic, alive_key, status_key
+from schemas.topics import PRIOR, PRIORS, TASK, Query, Topic, alive_key, status_key
 from services.runtime.bus import Answer, Bus, BusError, Sample, pack_header
 
 R = TypeVar("R", bound=Message)
+POLL_S = 0.5
+PATIENT_POLLS = 4
+
+
+class NoPriorError(Exception):
+    """The task has no prior; the message is the gateway's reason."""
 
 
 class Client:
@@ -66,6 +74,35 @@ class Client:
             return decode(reply_type, answer.payload)
         except DecodeError as error:
             raise BusError(f"{name}: the answer is not valid: {error}") from error
+
+    def give_task(self, task: Task, timeout_s: float, waiting: Callable[[str], None] = lambda reason: None) -> Prior:
+        """Publish a task and wait for the prior that answers it; a model may take minutes, and `waiting` is told why
+        meanwhile. Raises NoPriorError, BusError."""
+        found: list[Prior] = []
+        arrived = threading.Event()
+        given_ns = time.time_ns()
+
+        def see(sample: Sample) -> None:
+            with contextlib.suppress(DecodeError):
+                prior = decode(Prior, sample.payload)
+                if sample.sent_ns >= given_ns and prior.answers(task):
+                    found.append(prior)
+                    arrived.set()
+
+        self.listen(PRIOR, "*", see)
+        self.publish(TASK, task)
+        request = PriorRequest(environment=task.environment, task=task.task, regions=task.regions)
+        end_s, polls = time.monotonic() + timeout_s, 0
+        while not arrived.wait(POLL_S):
+            reply, polls = self.ask(PRIORS, request), polls + 1
+            if not reply.priors and not reply.pending:
+                raise NoPriorError(reply.reason)
+            if reply.priors and not reply.pending and polls > PATIENT_POLLS:  # another clock may be behind ours
+                return reply.priors[0]
+            if time.monotonic() > end_s:
+                raise NoPriorError(f"no prior within {timeout_s:.0f} s: {reply.reason or 'see `prior-sg health`'}")
+            waiting(reply.reason)
+        return found[0]
 
     def alive(self, settle_s: float = 0.3) -> dict[str, str]:
         """Instance to service of everything alive now."""

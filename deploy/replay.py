@@ -82,8 +82,9 @@ class Log:
         """The message a journal entry means. Raises LogError when the log does not hold it."""
         if entry.topic == "Tick":
             return decode(Tick, entry.inline)
-        if entry.topic in QUERY_BY_NAME:
-            return decode(QUERY_BY_NAME[entry.topic].reply, entry.inline)
+        errands = {errand.name: errand for errand in self.service.errands}
+        if question := QUERY_BY_NAME.get(entry.topic) or errands.get(entry.topic):
+            return decode(question.reply, entry.inline)
         topic = TOPIC_BY_NAME[entry.topic]
         if topic.delivery == "job":
             logged = self.frames.get(entry.frame_id)

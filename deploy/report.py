@@ -16,7 +16,6 @@ from schemas.places import VoxelMap
 from schemas.scene import Scene, SceneRequest
 from schemas.topics import SCENE
 from services.ingest.sources import open_source
-from services.prior_gateway.library import environments
 from services.registry import BY_NAME
 from services.runtime.record import attachments
 
@@ -131,12 +130,3 @@ def final_scene_difference(log: Log, path: Path) -> str:
     if encode(again) == encode(recorded):
         return ""
     return "final scene: " + "; ".join(message_differences(recorded, again) or ["bytes differ below the tolerance"])
-
-
-def prior_table() -> Table:
-    """The curated library: environments, tasks and the regions each task asks for."""
-    table = Table("environment", "task", "regions", show_lines=True)
-    for listing in environments():
-        for task, regions in listing.tasks.items():
-            table.add_row(listing.name, task, ", ".join(regions))
-    return table

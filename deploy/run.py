@@ -12,7 +12,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TaskID, TextColumn, TimeElapsedColumn
 
-from deploy.client import Client
+from deploy.client import Client, NoPriorError
 from deploy.inprocess import InProcess
 from deploy.recorder import Recorder, Settling
 from deploy.serve import resolved_config
@@ -21,18 +21,16 @@ from schemas.codec import DecodeError, Message, decode, encode
 from schemas.features import Pyramid
 from schemas.frames import IngestState, Keyframe
 from schemas.places import MapRequest, VoxelMap
-from schemas.priors import Prior, PriorRequest, Task
+from schemas.priors import Prior, Task
 from schemas.regions import RegionDelta
 from schemas.scene import Scene, SceneRequest
 from schemas.topics import (
     INGEST_STATE,
     KEYFRAME,
     PLACE_DELTA,
-    PRIORS,
     PYRAMID,
     REGION_DELTA,
     SCENE,
-    TASK,
     VOXEL_MAP,
 )
 from services.registry import SERVICES
@@ -41,7 +39,7 @@ from services.runtime.zenoh_bus import ZenohBus, free_endpoint, open_router
 
 QUIET_S = 1.5
 START_TIMEOUT_S = 180.0
-PRIOR_TIMEOUT_S = 20.0
+PRIOR_TIMEOUT_S = 900.0  # a model may need minutes
 POLL_S = 0.1
 STALL_AFTER_S = 120.0
 
@@ -192,7 +190,7 @@ class Run:
             names = [service.name for service in SERVICES if service.name != "ingest"]
             self._start(names)
             progress.update(bar, description="asking for the prior")
-            prior = self._task()
+            prior = self._task(lambda reason: progress.update(bar, description=reason or "asking for the prior"))
             progress.console.print(f"prior: {prior.provenance.source}, {prior.provenance.note}")
             self._start(["ingest"])  # last: the stream must not begin before its readers stand
             self.job.on_started(self.supervisor.connect, self.supervisor.pids())
@@ -223,13 +221,9 @@ class Run:
                 raise RunError(f"not started within {START_TIMEOUT_S:.0f} s: {', '.join(missing)}; see {where}")
             time.sleep(POLL_S)
 
-    def _task(self) -> Prior:
+    def _task(self, say: Callable[[str], None]) -> Prior:
         """Give the task; returns the prior it gets. Raises RunError with the gateway's reason when there is none."""
         job = self.job
-        request = PriorRequest(environment=job.environment, task=job.task, regions=job.regions)
-        reply = self.client.ask(PRIORS, request, PRIOR_TIMEOUT_S)
-        if not reply.priors:
-            raise RunError(reply.reason)
         task = Task(
             robot=job.robot,
             stamp_ns=time.time_ns(),
@@ -237,8 +231,10 @@ class Run:
             task=job.task,
             regions=job.regions,
         )
-        self.client.publish(TASK, task)
-        return reply.priors[0]
+        try:
+            return self.client.give_task(task, PRIOR_TIMEOUT_S, say)
+        except NoPriorError as error:
+            raise RunError(str(error)) from error
 
     def _follow(self, progress: Progress, bar: TaskID) -> None:
         """Show progress until the source has ended and everything has settled, or the user interrupts."""

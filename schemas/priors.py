@@ -1,7 +1,8 @@
 """Tasks and prior graphs (paper, Prior Graph Extraction)."""
 
 import hashlib
-from typing import Annotated
+import math
+from typing import Annotated, Literal
 
 import msgspec
 import numpy as np
@@ -9,6 +10,9 @@ import numpy as np
 from schemas.codec import Message, Shape, encode
 
 SUM_TOLERANCE = 1e-3
+# No prior that somebody means is larger; a message beyond is refused wherever it arrives.
+MOST_REGIONS, MOST_OBJECTS, MOST_PHRASES = 64, 512, 64
+LONGEST_NAME, LONGEST_PHRASE = 80, 240
 
 
 class Task(Message, frozen=True, kw_only=True):
@@ -34,7 +38,7 @@ class TaskInForce(Message, frozen=True, kw_only=True):
     task: Task | None = None
 
 
-class RegionPrior(msgspec.Struct, frozen=True, kw_only=True):
+class RegionPrior(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     """One expected region with its prototypical place: appearance phrases, inclination to the horizontal, size."""
 
     name: str
@@ -46,24 +50,47 @@ class RegionPrior(msgspec.Struct, frozen=True, kw_only=True):
     parent: str = ""
 
 
-class ObjectPrior(msgspec.Struct, frozen=True, kw_only=True):
+class ObjectPrior(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     """One expected object."""
 
     name: str
     phrases: list[str]
 
 
-class Provenance(msgspec.Struct, frozen=True, kw_only=True):
-    """Who made a prior, from what."""
+class Provenance(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """Who made a prior, from what, when."""
 
     source: str  # library, or the model's name
     detail: str = ""
     parent_digest: str = ""
     note: str = ""  # for example: fell back to the library, and why
+    question: str = ""  # digest of what was asked of whom; empty where the library answered
+    prompts: str = ""  # version of the prompts
+    samples: int = 0  # generations averaged
+    made_by: str = ""  # instance of the gateway
+    made_ns: int = 0
+    signer: str = ""  # name of the key; empty = not signed
+    signature: str = ""  # Ed25519 over the prior's digest, in hexadecimal
 
 
-class Prior(Message, frozen=True, kw_only=True):
-    """Prior graph for one environment and task: complete and validated."""
+class Spread(Message, frozen=True, kw_only=True):
+    """Standard deviations over the samples that a prior is the mean of."""
+
+    existence: Annotated[np.ndarray, Shape("float32", "region")]
+    containment: Annotated[np.ndarray, Shape("float32", "region", "object")]
+    adjacency: Annotated[np.ndarray, Shape("float32", "region", "region")]
+    support: Annotated[np.ndarray, Shape("float32", "region")]  # share of the samples that named the region
+
+    def check(self) -> None:
+        if min(array.min(initial=0) for array in (self.existence, self.containment, self.adjacency, self.support)) < 0:
+            raise ValueError("spread is negative")
+
+
+class Prior(Message, frozen=True, kw_only=True, omit_defaults=True):
+    """Prior graph for one environment and task: complete and validated.
+
+    Fields left at their defaults are not written, so that a field added later changes no digest.
+    """
 
     environment: str
     task: str
@@ -73,17 +100,37 @@ class Prior(Message, frozen=True, kw_only=True):
     containment: Annotated[np.ndarray, Shape("float32", "region", "object")]  # P(o | r, E0)
     adjacency: Annotated[np.ndarray, Shape("float32", "region", "region")]  # P(ri <-> rj | E0), symmetric, in (0, 1]
     provenance: Provenance
+    spread: Spread | None = None
 
     def check(self) -> None:
-        names = [region.name for region in self.regions]
-        if not names:
+        """Whoever sent it: a model, a file or another robot."""
+        self._check_names()
+        self._check_matrices()
+        for region in self.regions:
+            _check_region(region)
+        existence = [region.existence for region in self.regions]
+        if abs(sum(existence) - 1) > SUM_TOLERANCE:
+            raise ValueError("existence must be positive and sum to one")
+
+    def _check_names(self) -> None:
+        if not self.regions:
             raise ValueError("a prior needs at least one region")
-        for kind, found in (("region", names), ("object", [item.name for item in self.objects])):
-            if len(set(found)) != len(found):
+        if len(self.regions) > MOST_REGIONS or len(self.objects) > MOST_OBJECTS:
+            raise ValueError(f"a prior has at most {MOST_REGIONS} regions and {MOST_OBJECTS} objects")
+        described = [(r.name, r.phrases) for r in self.regions] + [(o.name, o.phrases) for o in self.objects]
+        for kind, names in (("region", [r.name for r in self.regions]), ("object", [o.name for o in self.objects])):
+            if len(set(names)) != len(names):
                 raise ValueError(f"{kind} names are not unique")
-        if self.containment.shape != (len(names), len(self.objects)):
+        for name, phrases in described:
+            if not name or not phrases or not all(phrases):
+                raise ValueError(f"{name or 'an unnamed entry'} has no phrases")
+            if len(name) > LONGEST_NAME or max(map(len, phrases)) > LONGEST_PHRASE or len(phrases) > MOST_PHRASES:
+                raise ValueError(f"{name[:LONGEST_NAME]}: the name, a phrase or the list of phrases is too long")
+
+    def _check_matrices(self) -> None:
+        if self.containment.shape != (len(self.regions), len(self.objects)):
             raise ValueError("containment does not fit the regions and objects")
-        if self.adjacency.shape[0] != len(names):
+        if self.adjacency.shape[0] != len(self.regions):
             raise ValueError("adjacency does not fit the regions")
         if (self.containment < 0).any() or (self.containment > 1).any():
             raise ValueError("containment is not a probability")
@@ -91,21 +138,29 @@ class Prior(Message, frozen=True, kw_only=True):
             raise ValueError("adjacency must be in (0, 1]")
         if not np.allclose(self.adjacency, self.adjacency.T, atol=1e-6):
             raise ValueError("adjacency is not symmetric")
-        existence = [region.existence for region in self.regions]
-        if min(existence) <= 0 or abs(sum(existence) - 1) > SUM_TOLERANCE:
-            raise ValueError("existence must be positive and sum to one")
-        described = [(r.name, r.phrases) for r in self.regions] + [(o.name, o.phrases) for o in self.objects]
-        for name, phrases in described:
-            if not name or not phrases:
-                raise ValueError(f"{name or 'an unnamed entry'} has no phrases")
+        if self.spread is not None and self.spread.containment.shape != self.containment.shape:
+            raise ValueError("the spread does not fit the regions and objects")
 
     def digest(self) -> str:
-        """Content address, 128 bit in hexadecimal."""
-        return hashlib.blake2b(encode(self), digest_size=16).hexdigest()
+        """Content address, 128 bit in hexadecimal; of everything but the signature, which signs it."""
+        bare = msgspec.structs.replace(self.provenance, signer="", signature="")
+        return hashlib.blake2b(encode(msgspec.structs.replace(self, provenance=bare)), digest_size=16).hexdigest()
 
     def answers(self, task: Task) -> bool:
         """Whether this prior was made for that task."""
         return (self.environment, self.task, self.vocabulary) == (task.environment, task.task, task.regions)
+
+
+def _check_region(region: RegionPrior) -> None:
+    numbers = (region.existence, region.inclination_mean_rad, region.inclination_std_rad, region.query_radius_m)
+    if not all(map(math.isfinite, numbers)):
+        raise ValueError(f"{region.name}: not finite")
+    if region.existence <= 0:
+        raise ValueError("existence must be positive and sum to one")
+    if not (0 <= region.inclination_mean_rad <= math.pi / 2 and region.inclination_std_rad > 0):
+        raise ValueError(f"{region.name}: inclination must lie between 0 and a right angle, its spread above 0")
+    if not 0 < region.query_radius_m <= 100:
+        raise ValueError(f"{region.name}: the query radius must lie between 0 and 100 m")
 
 
 class PriorRequest(Message, frozen=True, kw_only=True):
@@ -122,3 +177,113 @@ class PriorList(Message, frozen=True, kw_only=True):
 
     priors: list[Prior]
     reason: str = ""
+    pending: bool = False  # somebody is at work on it: ask again
+
+
+class PriorClaim(Message, frozen=True, kw_only=True):
+    """A gateway wants to ask a model, or is asking; while it goes on saying so, the others wait."""
+
+    question: str
+    holder: str
+    state: Literal["wants", "works", "gave up"]
+
+
+class PriorEvidence(Message, frozen=True, kw_only=True):
+    """What one map has shown of its prior so far: totals, not increments, so that only a map's newest one counts."""
+
+    robot: str
+    epoch: int  # of the map
+    stamp_ns: int
+    prior_digest: str  # in force when it was seen
+    environment: str
+    task: str
+    vocabulary: list[str] = []
+    regions: list[str]
+    objects: list[str] = []  # empty = no objects were looked for
+    places: Annotated[np.ndarray, Shape("float32", "region")]  # sum of beliefs
+    instances: Annotated[np.ndarray, Shape("float32", "region")]  # regions of that name
+    holding: Annotated[np.ndarray, Shape("float32", "region", "object")]  # of those, how many hold the object
+    pairs: Annotated[np.ndarray, Shape("float32", "region", "region")]  # pairs of regions with these two names
+    touching: Annotated[np.ndarray, Shape("float32", "region", "region")]  # of those, how many touch
+
+    def check(self) -> None:
+        if len(self.regions) != len(self.places) or len(self.objects) != self.holding.shape[1]:
+            raise ValueError("counts do not fit the names")
+        if min(array.min(initial=0) for array in (self.places, self.instances, self.holding, self.touching)) < 0:
+            raise ValueError("a count is negative")
+        if (self.holding > self.instances[:, None] + 1e-4).any() or (self.touching > self.pairs + 1e-4).any():
+            raise ValueError("more hits than trials")
+
+
+class PriorRevision(Message, frozen=True, kw_only=True):
+    """Please revise the prior of this task from what has been observed, and publish the result."""
+
+    environment: str
+    task: str
+    regions: list[str] = []
+    by_model: bool = False  # show the model what was observed against what was expected, instead of counting
+
+
+class ModelRequest(Message, frozen=True, kw_only=True):
+    """One turn of a conversation with a language model. `schema` (JSON) constrains the answer; empty = plain text."""
+
+    conversation: str
+    turn: int
+    messages: list[tuple[str, str]]  # (role, text); roles are system, user, assistant
+    schema: str = ""
+    schema_name: str = "answer"
+    max_tokens: int = 4096
+
+
+class ModelReply(Message, frozen=True, kw_only=True):
+    """What the model said, or why it said nothing."""
+
+    conversation: str
+    turn: int
+    text: str = ""
+    failure: str = ""  # one word of the kind
+    reason: str = ""  # one sentence
+    attempts: int = 1
+    tokens_in: int = 0
+    tokens_out: int = 0
+
+
+class Recall(Message, frozen=True, kw_only=True):
+    """What does the archive know of this task?"""
+
+    question: str
+    environment: str
+    task: str
+    regions: list[str] = []
+
+
+class Recalled(Message, frozen=True, kw_only=True):
+    """The kept prior that answers a task from now on (imported or revised), the one that answers the very question,
+    the newest of all others, what a revised prior was before, and the evidence gathered."""
+
+    question: str
+    preferred: Prior | None = None
+    exact: Prior | None = None
+    newest: Prior | None = None
+    root: Prior | None = None
+    evidence: list[PriorEvidence] = []
+
+
+class Keep(Message, frozen=True, kw_only=True):
+    """Keep a prior or a piece of evidence; `own` dates and signs a prior that was made here, the signature of any other
+    is checked."""
+
+    prior: Prior | None = None
+    root: Prior | None = None  # the unrevised ancestor of a revised prior
+    preferred: bool = False  # it answers its task from now on, whatever provider is configured
+    own: bool = False
+    question: str = ""  # that it answers
+    evidence: PriorEvidence | None = None
+
+
+class Kept(Message, frozen=True, kw_only=True):
+    """Done: the prior as it is from now on, and what its signature says; no prior = it is not trusted."""
+
+    prior: Prior | None = None
+    question: str = ""
+    verdict: str = ""

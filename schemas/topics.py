@@ -15,7 +15,17 @@ from schemas.codec import Message
 from schemas.features import Backfill, Pyramid, TextEmbeddings, TextRequest
 from schemas.frames import ArchiveReply, ArchiveRequest, CameraState, IngestState, Keyframe, PoseUpdate
 from schemas.places import MapRequest, PlaceDelta, SnapshotRequest, VoxelMap
-from schemas.priors import Prior, PriorList, PriorRequest, Task, TaskInForce, TaskRequest
+from schemas.priors import (
+    Prior,
+    PriorClaim,
+    PriorEvidence,
+    PriorList,
+    PriorRequest,
+    PriorRevision,
+    Task,
+    TaskInForce,
+    TaskRequest,
+)
 from schemas.regions import PosteriorReply, PosteriorRequest, RegionDelta
 from schemas.scene import Scene, SceneRequest, SceneRevision
 from schemas.status import Consumed, ServiceStatus, StatusRequest
@@ -26,7 +36,7 @@ Delivery = Literal["latest", "every", "job"]
 
 @dataclass(frozen=True)
 class Topic:
-    """One row of the table. `key` may hold {robot} or {digest}, taken from the message."""
+    """One row of the table. `key` may hold {robot}, {digest} or {question}, taken from the message."""
 
     name: str
     type: type[Message]
@@ -38,14 +48,14 @@ class Topic:
 
     def key_of(self, message: Message) -> str:
         """The key this message is published on."""
-        fields = {"robot": getattr(message, "robot", "")}
+        fields = {"robot": getattr(message, "robot", ""), "question": getattr(message, "question", "")}
         if "{digest}" in self.key:
             fields["digest"] = message.digest()  # type: ignore[attr-defined]
         return self.key.format(**fields)
 
     def pattern(self, robot: str) -> str:
         """The key expression that matches this topic of `robot` (`*` = of all robots)."""
-        return self.key.format(robot=robot, digest="*")
+        return self.key.format(robot=robot, digest="*", question="*")
 
 
 @dataclass(frozen=True)
@@ -72,6 +82,15 @@ PYRAMID = Topic("PYRAMID", Pyramid, f"{ROOT}/{{robot}}/pyramid", "every", 2, rec
 BACKFILL = Topic("BACKFILL", Backfill, f"{ROOT}/{{robot}}/backfill", "every", 0.01, recorded=True, cache=4)
 TASK = Topic("TASK", Task, f"{ROOT}/{{robot}}/task", "every", 0.01, recorded=True, cache=4)
 PRIOR = Topic("PRIOR", Prior, f"{ROOT}/fleet/prior/{{digest}}", "every", 0.01, recorded=True, cache=4)
+PRIOR_CLAIM = Topic(
+    "PRIOR_CLAIM", PriorClaim, f"{ROOT}/fleet/prior_claim/{{question}}", "every", 0.1, recorded=True, cache=4
+)
+PRIOR_EVIDENCE = Topic(
+    "PRIOR_EVIDENCE", PriorEvidence, f"{ROOT}/{{robot}}/prior_evidence", "every", 0.05, recorded=True, cache=4
+)
+PRIOR_REVISION = Topic(
+    "PRIOR_REVISION", PriorRevision, f"{ROOT}/fleet/prior_revision", "every", 0.001, recorded=True, cache=1
+)
 REGION_DELTA = Topic("REGION_DELTA", RegionDelta, f"{ROOT}/{{robot}}/regions", "every", 2, recorded=True, cache=256)
 SCENE_REVISION = Topic("SCENE_REVISION", SceneRevision, f"{ROOT}/{{robot}}/scene", "latest", 4, recorded=False)
 JOURNAL = Topic("JOURNAL", Consumed, f"{ROOT}/{{robot}}/journal", "every", 20, recorded=True, cache=1024)
@@ -87,6 +106,9 @@ TOPICS = (
     BACKFILL,
     TASK,
     PRIOR,
+    PRIOR_CLAIM,
+    PRIOR_EVIDENCE,
+    PRIOR_REVISION,
     REGION_DELTA,
     SCENE_REVISION,
     JOURNAL,

@@ -6,6 +6,7 @@ import pytest
 
 os.environ.setdefault("HF_HUB_OFFLINE", "1")
 os.environ.setdefault("OMP_NUM_THREADS", "2")
+os.environ["PSG_PRIOR_GATEWAY__ARCHIVE"] = ""  # tests neither see nor touch the user's kept priors
 SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 

@@ -6,6 +6,7 @@ from typing import Annotated
 import hypothesis
 import hypothesis.extra.numpy as hnp
 import msgpack
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import strategies as st
@@ -83,7 +84,15 @@ GOLDEN: list[Message] = [
         objects=[priors.ObjectPrior(name="stove", phrases=["a stove"])],
         containment=np.array([[0.9]], np.float32),
         adjacency=np.array([[1.0]], np.float32),
-        provenance=priors.Provenance(source="library", note="n"),
+        provenance=priors.Provenance(
+            source="m", note="n", question="q", samples=2, made_ns=3, signer="s", signature="00"
+        ),
+        spread=priors.Spread(
+            existence=np.array([0.1], np.float32),
+            containment=np.array([[0.2]], np.float32),
+            adjacency=np.array([[0.3]], np.float32),
+            support=np.array([1.0], np.float32),
+        ),
     ),
     regions.RegionDelta(
         robot="r",
@@ -165,6 +174,27 @@ GOLDEN: list[Message] = [
     ),
     status.Consumed(
         robot="r", service="s", instance="i", order=1, topic="T", frame_id=2, writer="w", sequence=3, inline=b"x"
+    ),
+    priors.PriorEvidence(
+        robot="r",
+        epoch=1,
+        stamp_ns=2,
+        prior_digest="d",
+        environment="e",
+        task="t",
+        vocabulary=["kitchen"],
+        regions=["kitchen"],
+        objects=["stove"],
+        places=np.array([3.0], np.float32),
+        instances=np.array([1.0], np.float32),
+        holding=np.array([[1.0]], np.float32),
+        pairs=np.array([[2.0]], np.float32),
+        touching=np.array([[1.0]], np.float32),
+    ),
+    priors.PriorClaim(question="q", holder="g", state="works"),
+    priors.PriorRevision(environment="e", task="t", regions=["kitchen"], by_model=True),
+    priors.ModelReply(
+        conversation="c", turn=1, text="x", failure="f", reason="r", attempts=2, tokens_in=3, tokens_out=4
     ),
 ]
 
@@ -324,6 +354,39 @@ def test_prior_check_names_the_fault():
             fields |= {"containment": np.ones((0, 1), np.float32), "adjacency": np.ones((0, 0), np.float32)}
         with pytest.raises(ValueError, match=why):
             priors.Prior(**fields)
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "why"),
+    [
+        ("existence", float("nan"), "not finite"),
+        ("inclination_mean_rad", 2.0, "right angle"),
+        ("inclination_std_rad", 0.0, "above 0"),
+        ("query_radius_m", float("inf"), "not finite"),
+        ("query_radius_m", 0.0, "query radius"),
+        ("phrases", ["x" * 1000], "too long"),
+        ("phrases", [""], "no phrases"),
+        ("name", "x" * 100, "too long"),
+    ],
+)
+def test_a_prior_is_checked_alike_wherever_it_comes_from(field, value, why):
+    """Encoded without a check, as a faulty or hostile sender would."""
+    good = GOLDEN[3]
+    region = msgspec.structs.replace(good.regions[0], **{field: value})
+    raw = msgpack.unpackb(encode(good), ext_hook=msgpack.ExtType)
+    raw["regions"] = [msgspec.to_builtins(region)]
+    with pytest.raises(DecodeError, match=why):
+        decode(priors.Prior, msgpack.packb(raw))
+
+
+def test_a_signature_or_a_field_added_later_changes_no_digest():
+    good = GOLDEN[3]
+    signed = msgspec.structs.replace(good.provenance, signer="other", signature="ff")
+    assert msgspec.structs.replace(good, provenance=signed).digest() == good.digest()
+    moved = msgspec.structs.replace(good.provenance, note="another")
+    assert msgspec.structs.replace(good, provenance=moved).digest() != good.digest()
+    bare = priors.Provenance(source="library")
+    assert msgspec.msgpack.encode(bare) == msgspec.msgpack.encode({"source": "library"})
 
 
 def test_one_key_per_topic_and_type_names_are_versioned():

@@ -9,11 +9,12 @@ import pytest
 
 from schemas.codec import decode, encode
 from schemas.priors import Prior, PriorRequest, Task
-from schemas.topics import PRIOR
 from services.prior_gateway import core, library, service
-from services.prior_gateway.core import Config, Library, NoPrior, first_answer, with_article
+from services.prior_gateway.archive import PREFERRED, Archive
+from services.prior_gateway.core import Config, Library, NoPrior, with_article
 from services.prior_gateway.knowledge import Environment, RegionEntry, TaskEntry, check_environment
 from services.prior_gateway.matching import contains, match_environment, match_task, stems, words
+from tests.gateway import Gateway
 
 LIBRARY = library.load()
 CASES = [(environment, task) for environment in LIBRARY.environments for task in environment.tasks]
@@ -390,63 +391,55 @@ def test_digest_depends_on_the_question_and_nothing_else():
     assert prior_of("house", "serve drinks to guests", ["kitchen"]).digest() != one.digest()
 
 
-class Silent:
-    name = "silent"
-
-    def answer(self, task: Task, cfg: Config) -> Prior:
-        raise NoPrior("Nobody answers at this endpoint.")
-
-
-def test_the_next_provider_answers_and_tells_why_the_first_did_not():
-    prior = first_answer([Silent(), LIBRARY], asked("house", "clean"), Config())
-    assert prior.provenance.source == "library"
-    assert prior.provenance.note.startswith("Nobody answers at this endpoint. ")
-    with pytest.raises(NoPrior, match=r"endpoint\. The library knows no environment"):
-        first_answer([Silent(), LIBRARY], asked("coral reef"), Config())
-    with pytest.raises(NoPrior, match="No provider"):
-        first_answer([], asked("house"), Config())
-
-
 @pytest.fixture
-def state() -> service.State:
-    return service.State(providers=(LIBRARY,))
+def gateway() -> Gateway:
+    return Gateway(Config(archive=""))
 
 
-def test_step_publishes_one_prior_per_task(state):
+def test_step_publishes_one_prior_per_task(gateway):
     task = asked("house", "list this home for sale")
-    outputs = list(service.step(state, task, Config()))
-    assert [topic for topic, _ in outputs] == [PRIOR]
-    prior = outputs[0][1]
+    [prior] = gateway.feed(task)
     assert prior.answers(task)
-    again = list(service.step(state, task, Config()))
-    assert encode(again[0][1]) == encode(prior)
-    assert list(service.step(state, prior, Config())) == []
+    [again] = gateway.feed(task)
+    assert encode(again) == encode(prior)
+    assert gateway.feed(prior) == []
 
 
-def test_answers_by_digest_by_question_and_with_reasons(state):
-    [(_, prior)] = service.step(state, asked("house", "clean"), Config())
-    found = service.answer(state, PriorRequest(digest=prior.digest()), Config())
-    assert encode(found.priors[0]) == encode(prior)
-    by_question = service.answer(state, PriorRequest(environment="house", task="clean"), Config())
-    assert by_question.priors[0].digest() == prior.digest()
-    missing = service.answer(state, PriorRequest(digest="00"), Config())
+def test_answers_by_digest_by_question_and_with_reasons(gateway):
+    def ask(**fields):
+        return service.answer(gateway.state, PriorRequest(**fields), gateway.cfg)
+
+    [prior] = gateway.feed(asked("house", "clean"))
+    assert encode(ask(digest=prior.digest()).priors[0]) == encode(prior)
+    assert ask(environment="house", task="clean").priors[0].digest() == prior.digest()
+    missing = ask(digest="00")
     assert (missing.priors, "digest 00" in missing.reason) == ([], True)
-    assert list(service.step(state, asked("coral reef"), Config())) == []
-    for environment in ("coral reef", "another reef"):  # one asked for in a task, one only here
-        refused = service.answer(state, PriorRequest(environment=environment), Config())
+    assert gateway.feed(asked("coral reef")) == []
+    for environment, pending in (("coral reef", False), ("another reef", True)):  # one given as a task, one only here
+        refused = ask(environment=environment)
         assert (refused.priors, f"no environment like {environment!r}" in refused.reason) == ([], True)
+        assert refused.pending == pending, "a task may still come with an imported prior"
 
 
-def test_memory_forgets_the_oldest(state):
-    cfg = Config(remembered_priors=2)
-    digests = [
-        next(iter(service.step(state, asked("house", task), cfg)))[1].digest() for task in ("clean", "patrol", "sell")
-    ]
-    assert list(state.priors) == digests[1:]
+def test_memory_forgets_the_oldest():
+    gateway = Gateway(Config(remembered_priors=2, archive=""))
+    digests = [gateway.feed(asked("house", task))[0].digest() for task in ("clean", "patrol", "sell")]
+    assert list(gateway.state.priors) == digests[1:]
+    assert set(gateway.state.answers.values()) == set(digests[1:])
 
 
-def test_service_starts_with_the_library_and_the_library_first():
-    started = service.init(Config(), None)
-    assert [provider.name for provider in started.providers] == ["library"]
-    assert started.providers[0].version == LIBRARY.version
-    assert isinstance(started.providers[0], core.Library)
+def test_an_imported_prior_comes_before_the_library(tmp_path):
+    cfg = Config(archive=str(tmp_path))
+    other = core.noted(prior_of("house", "clean"), "another opinion")
+    Archive(cfg.archive).put(other, PREFERRED)
+    assert Gateway(cfg).feed(asked("house", "clean")) == [other]
+    assert Gateway(cfg).feed(asked("house", "patrol"))[0].provenance.source == "library"
+
+
+def test_a_damaged_archive_is_told_and_left_out(tmp_path, caplog):
+    cfg = Config(archive=str(tmp_path))
+    Archive(cfg.archive).put(prior_of("house", "clean"), PREFERRED)
+    [file] = tmp_path.glob("*/*.prior")
+    file.write_bytes(file.read_bytes()[:-5])
+    assert Gateway(cfg).feed(asked("house", "clean"))[0].provenance.source == "library"
+    assert "cannot be read" in caplog.text

@@ -1,7 +1,6 @@
 """From a task in plain words to a prior graph (paper, Prior Graph Extraction), by knowledge already written down.
 
-A *provider* answers a task with a prior; the curated library is the first. Tasks divide an environment by merging its
-base regions. With w_i = P(r_i | E0) of the members i of a merged region m:
+Tasks divide an environment by merging its base regions. With w_i = P(r_i | E0) of the members i of a merged region m:
 
     P(m | E0)     = sum_i w_i
     P(o | m)      = sum_i w_i P(o | r_i) / sum_i w_i    a place of m is a place of r_i with probability w_i / sum w
@@ -15,17 +14,24 @@ everywhere. A task that fixes its regions says that they are there, so their P(r
 is rare among homes, not small in a home that has one.
 """
 
+import hashlib
 import math
+import re
 from collections.abc import Sequence
-from typing import Protocol
+from typing import Literal
+from urllib.parse import urlsplit
 
 import msgspec
 import numpy as np
 
 from schemas.priors import ObjectPrior, Prior, Provenance, RegionPrior, Task
 from services.prior_gateway.knowledge import Chosen, Environment, RegionEntry, TaskEntry
+from services.prior_gateway.learning import LearningConfig
 from services.prior_gateway.matching import choose_regions, match_environment, match_task, words
+from services.prior_gateway.synthesis import SynthesisConfig
 
+DEFAULT_ENDPOINTS = {"openai": "https://api.openai.com/v1", "anthropic": "https://api.anthropic.com"}
+DEFAULT_KEYS = {"openai": "OPENAI_API_KEY", "anthropic": "ANTHROPIC_API_KEY"}
 # Nouns that take no article.
 MASS_NOUNS = frozenset(
     {"artwork", "bread", "clothing", "fruit", "furniture", "grass", "gravel", "laundry", "luggage", "machinery"}
@@ -33,8 +39,50 @@ MASS_NOUNS = frozenset(
 )
 
 
+class CallConfig(msgspec.Struct, frozen=True, kw_only=True):
+    """How patient and how thrifty the calls of a model are."""
+
+    timeout_s: float = 180.0  # of one attempt, from the first byte sent to the last received
+    connect_s: float = 10.0
+    deadline_s: float = 600.0  # no further attempt after this
+    attempts: int = 4
+    backoff_s: float = 1.0  # before the second attempt; doubles with each, with jitter
+    most_backoff_s: float = 60.0  # a server that asks for more gets no further attempt
+    requests_per_minute: float = 60.0
+    most_calls: int = 500  # of this process; 0 = no limit
+    most_usd: float = 0.0  # of this process; 0 = no limit. Needs the two prices
+    usd_per_million_in: float = 0.0
+    usd_per_million_out: float = 0.0
+    breaker_failures: int = 3  # calls given up in a row after which the endpoint is left alone
+    breaker_s: float = 60.0  # for so long
+    most_answer_bytes: int = 2_000_000
+
+    def __post_init__(self) -> None:
+        if min(self.timeout_s, self.connect_s, self.deadline_s, self.requests_per_minute, self.attempts) <= 0:
+            raise ValueError("timeout_s, connect_s, deadline_s, requests_per_minute and attempts must be above 0")
+        if self.most_usd and not (self.usd_per_million_in and self.usd_per_million_out):
+            raise ValueError("most_usd needs usd_per_million_in and usd_per_million_out")
+
+
 class Config(msgspec.Struct, frozen=True, kw_only=True):
-    """How priors are composed."""
+    """Who is asked for priors, and how they are composed and kept. Never holds a key."""
+
+    provider: Literal["library", "openai", "anthropic"] = "library"  # openai: any OpenAI-compatible chat endpoint
+    endpoint: str = ""  # base URL, such as http://127.0.0.1:8000/v1; default: the provider's own
+    model: str = ""
+    key_env: str = ""  # name of the variable that holds the key; default only for the provider's own endpoint
+    key_file: str = ""  # or the file
+    structured: Literal["json_schema", "json_object", "none"] = "json_schema"  # how the endpoint constrains answers
+    temperature: float | None = None  # default: the endpoint's
+    prompts: str = "v1"  # version, or a folder of one's own
+    synthesis: SynthesisConfig = msgspec.field(default_factory=SynthesisConfig)
+    calls: CallConfig = msgspec.field(default_factory=CallConfig)
+    archive: str = "~/.cache/prior-sg/priors"  # kept priors and evidence; empty = none
+    signing_key: str = ""  # PEM file (Ed25519); empty = priors are not signed
+    trusted_keys: str = ""  # folder of NAME.pub
+    require_signature: bool = False  # adopt no prior of another gateway without a good signature
+    lease_s: float = 5.0  # a gateway that has been silent for so long does not hold up the others
+    learning: LearningConfig = msgspec.field(default_factory=LearningConfig)
 
     # P(o | r) of an object that a region's entry does not list.
     unlisted_containment: float = 0.02
@@ -51,28 +99,44 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
     # Priors remembered for questions by digest; the oldest is forgotten first.
     remembered_priors: int = 256
 
-
-class NoPrior(Exception):
-    """A provider has no prior for a task; the message is one sentence for the user."""
-
-
-class Provider(Protocol):
-    """Something that answers a task with a prior."""
+    def __post_init__(self) -> None:
+        if self.provider != "library" and not self.model:
+            raise ValueError(f"model must name the model that {self.provider} is to use")
+        if self.key_env and not re.fullmatch(r"[A-Z][A-Z0-9_]*", self.key_env):
+            raise ValueError("key_env takes the name of an environment variable in capitals, never a key itself")
+        parts = urlsplit(self.endpoint)
+        if self.endpoint and (parts.scheme not in ("http", "https") or not parts.hostname):
+            raise ValueError("endpoint takes a URL such as http://127.0.0.1:8000/v1")
+        if parts.username or parts.password or parts.query:
+            raise ValueError("endpoint takes a bare URL; give a key with key_env or key_file")
+        if self.lease_s < 1:
+            raise ValueError("lease_s must be at least 1")
 
     @property
-    def name(self) -> str:
-        """What `Provenance.source` says."""
+    def base_url(self) -> str:
+        """Where the model is asked."""
+        return self.endpoint or DEFAULT_ENDPOINTS.get(self.provider, "")
 
-    def answer(self, task: Task, cfg: Config) -> Prior:
-        """A complete prior for `task`; raises NoPrior."""
+    @property
+    def key_variable(self) -> str:
+        """Which variable holds the key; empty = none is sent."""
+        return self.key_env or ("" if self.endpoint else DEFAULT_KEYS.get(self.provider, ""))
+
+    @property
+    def maker(self) -> str:
+        """Who answers, for the provenance."""
+        return self.model if self.provider != "library" else "library"
+
+
+class NoPrior(Exception):
+    """There is no prior for a task; the message is one sentence for the user."""
 
 
 class Library(msgspec.Struct, frozen=True, kw_only=True):
-    """The provider that knows by heart."""
+    """Answers by heart."""
 
     environments: tuple[Environment, ...]
     version: str  # content address of the files
-    name: str = "library"
 
     def answer(self, task: Task, cfg: Config) -> Prior:
         """The prior of a curated task, or of the regions that the task fixes; raises NoPrior."""
@@ -86,7 +150,7 @@ class Library(msgspec.Struct, frozen=True, kw_only=True):
         note = f"{_environment_note(task, environment)}; {match.note}"
         detail = f"{environment.name}/{match.task.name}@{self.version}"
         chosen = task_regions(match.task, environment)
-        return compose(task, chosen, match.task, Provenance(source=self.name, detail=detail, note=note), cfg)
+        return compose(task, chosen, match.task, Provenance(source="library", detail=detail, note=note), cfg)
 
     def _of_vocabulary(self, task: Task, environment: Environment | None, cfg: Config) -> Prior:
         if len(set(task.regions)) != len(task.regions) or not all(words(name) for name in task.regions):
@@ -95,24 +159,20 @@ class Library(msgspec.Struct, frozen=True, kw_only=True):
         note = "; ".join([_environment_note(task, environment), *(entry.how for entry in chosen)])
         detail = f"{environment.name if environment else '-'}/fixed vocabulary@{self.version}"
         fitting = match_task(task.task, environment).task if environment else None
-        return compose(task, chosen, fitting, Provenance(source=self.name, detail=detail, note=note), cfg)
+        return compose(task, chosen, fitting, Provenance(source="library", detail=detail, note=note), cfg)
 
 
-def first_answer(providers: Sequence[Provider], task: Task, cfg: Config) -> Prior:
-    """The prior of the first provider that has one; its note tells who had none, and why. Raises NoPrior with all
-    reasons when nobody has one."""
-    reasons: list[str] = []
-    for provider in providers:
-        try:
-            prior = provider.answer(task, cfg)
-        except NoPrior as reason:
-            reasons.append(str(reason))
-            continue
-        if not reasons:
-            return prior
-        note = " ".join([*reasons, prior.provenance.note])
-        return msgspec.structs.replace(prior, provenance=msgspec.structs.replace(prior.provenance, note=note))
-    raise NoPrior(" ".join(reasons) or "No provider of priors is configured.")
+def question_of(task: Task, cfg: Config, prompts: str) -> str:
+    """Content address of what is asked of whom: environment, task, vocabulary, provider, model, prompt version."""
+    asked = (task.environment, task.task, task.regions, cfg.provider, cfg.model, prompts)
+    return hashlib.blake2b(msgspec.msgpack.encode(asked), digest_size=16).hexdigest()
+
+
+def noted(prior: Prior, remark: str) -> Prior:
+    """The prior with a remark before its provenance's note."""
+    made = prior.provenance
+    note = "; ".join(filter(None, (remark, made.note)))
+    return msgspec.structs.replace(prior, provenance=msgspec.structs.replace(made, note=note))
 
 
 def task_regions(task: TaskEntry, environment: Environment) -> list[Chosen]:
@@ -191,7 +251,7 @@ def _existence(chosen: Sequence[Chosen], uniform: float) -> list[float]:
 def _region(one: Chosen, existence: float, named: bool, cfg: Config) -> RegionPrior:
     """`named`: the given name describes the region itself, as in a fixed vocabulary; the abstract names of tasks
     ("service zone") say nothing about appearance."""
-    phrases = _phrases_of(one.name, cfg) if named or not one.members else []
+    phrases = phrases_of(one.name, cfg) if named or not one.members else []
     if not one.members:
         return RegionPrior(
             name=one.name, phrases=phrases, existence=existence, query_radius_m=cfg.query_radius_m or 0.75
@@ -200,7 +260,6 @@ def _region(one: Chosen, existence: float, named: bool, cfg: Config) -> RegionPr
     phrases += _member_phrases(one.members, weights, cfg)
     mean, std = _mixture([(e.inclination_deg, e.inclination_std_deg) for e in one.members], weights)
     radius = _mean([member.query_radius_m for member in one.members], weights)
-    parents = {member.parent for member in one.members}
     return RegionPrior(
         name=one.name,
         phrases=list(dict.fromkeys(phrases)),
@@ -208,8 +267,17 @@ def _region(one: Chosen, existence: float, named: bool, cfg: Config) -> RegionPr
         inclination_mean_rad=math.radians(mean),
         inclination_std_rad=math.radians(std),
         query_radius_m=cfg.query_radius_m or radius,
-        parent=one.members[0].parent if len(parents) == 1 else "",
+        parent=_common_parent(one.members, weights),
     )
+
+
+def _common_parent(members: Sequence[RegionEntry], weights: Sequence[float]) -> str:
+    """The zone that holds more than half of the members by their share, if there is one."""
+    held: dict[str, float] = {}
+    for member, weight in zip(members, weights, strict=True):
+        held[member.parent] = held.get(member.parent, 0.0) + weight
+    best = max(held, key=lambda zone: held[zone])
+    return best if held[best] > sum(weights) / 2 else ""
 
 
 def _member_phrases(members: Sequence[RegionEntry], weights: Sequence[float], cfg: Config) -> list[str]:
@@ -217,7 +285,7 @@ def _member_phrases(members: Sequence[RegionEntry], weights: Sequence[float], cf
     embeddings, where each member should count by its share."""
     found: list[str] = []
     for member, weight in zip(members, weights, strict=True):
-        phrases = [*_phrases_of(member.name, cfg), *member.phrases]
+        phrases = [*phrases_of(member.name, cfg), *member.phrases]
         found += phrases[: max(1, round(len(phrases) * weight / max(weights)))]
     return found
 
@@ -233,7 +301,8 @@ def _mean(values: Sequence[float], weights: Sequence[float]) -> float:
     return sum(value * weight for value, weight in zip(values, weights, strict=True)) / sum(weights)
 
 
-def _phrases_of(name: str, cfg: Config) -> list[str]:
+def phrases_of(name: str, cfg: Config) -> list[str]:
+    """The phrases that a name itself makes."""
     return [template.format(with_article(name)) for template in cfg.templates]
 
 
@@ -247,7 +316,7 @@ def _object_names(chosen: Sequence[Chosen], extra: dict[str, dict[str, float]]) 
 
 def _object_phrases(name: str, chosen: Sequence[Chosen], cfg: Config) -> list[str]:
     further = [phrase for one in chosen if one.environment for phrase in one.environment.objects.get(name, [])]
-    return list(dict.fromkeys([*_phrases_of(name, cfg), *further]))
+    return list(dict.fromkeys([*phrases_of(name, cfg), *further]))
 
 
 def _containment(

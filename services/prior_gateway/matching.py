@@ -98,6 +98,22 @@ def choose_regions(
     return [chosen.get(name) or _shared(name, environment, environments, taken) for name in names]
 
 
+def same_region(one: str, other: str, environments: Sequence[Environment]) -> bool:
+    """Whether two names mean one region: alike but for words such as "room", or synonyms of one entry of the first
+    environment that knows both."""
+    if _bare(words(one)) == _bare(words(other)):
+        return True
+    for environment in environments:
+        owners = [{entry.name for entry in environment.regions if _named(name, entry)} for name in (one, other)]
+        if all(owners):
+            return bool(owners[0] & owners[1])
+    return False
+
+
+def _named(name: str, entry: RegionEntry) -> bool:
+    return any(_bare(words(name)) == _bare(words(known)) for known in (entry.name, *entry.synonyms))
+
+
 def _shared(
     name: str, environment: Environment | None, environments: Sequence[Environment], taken: dict[str, str]
 ) -> Chosen:

@@ -10,7 +10,7 @@ import os
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
@@ -27,7 +27,7 @@ from services.runtime.bus import Answer, Bus, Request, Sample, pack_header
 from services.runtime.flow import Progress
 from services.runtime.inbox import Inbox
 from services.runtime.jobs import CREDITS, Ended, JobPool
-from services.runtime.service import Ask, Identity, Service
+from services.runtime.service import Ask, Errand, Identity, Service
 
 log = logging.getLogger(__name__)
 
@@ -86,6 +86,9 @@ class Host:
         self._sequences: dict[str, int] = {}
         self._order = 0
         self._asks: dict[tuple[str, bytes], Ask] = {}
+        self._errands: dict[Errand, Callable[[Any], Awaitable[Message]]] = {}
+        self._running: set[asyncio.Task] = set()
+        self._fault: asyncio.Future = self._loop.create_future()  # of an errand that raised
         self._pools: dict[Topic, JobPool] = {}
         self._slots = threading.Semaphore(CREDITS)
         self._progress = Progress()
@@ -96,6 +99,7 @@ class Host:
     async def run(self) -> None:
         """Build the state, join the bus, and work until stopped."""
         self._state = await self._on_thread(self.service.init, self.cfg, self.identity)
+        self._errands = {errand: errand.open(self.cfg, self.identity) for errand in self.service.errands}
         await self._on_thread(self._join)
         tasks = [asyncio.create_task(self._work())]
         if self.service.tick_s is not None:
@@ -104,16 +108,17 @@ class Host:
             tasks.append(asyncio.create_task(self._drive()))
         stop = asyncio.create_task(self.stopping.wait())
         try:
-            pending = {*tasks, stop}
+            pending = {*tasks, self._fault, stop}
             while not stop.done():
                 done, pending = await asyncio.wait(pending, return_when=asyncio.FIRST_COMPLETED)
                 for task in done:
                     task.result()
             await self._on_thread(self._journal, "STOP")  # only of an orderly end
         finally:
-            for task in (*tasks, stop):
+            under_way = (*tasks, *self._running, self._fault, stop)
+            for task in under_way:
                 task.cancel()
-            await asyncio.gather(*tasks, stop, return_exceptions=True)
+            await asyncio.gather(*under_way, return_exceptions=True)
             await self._leave()
 
     def stop(self) -> None:
@@ -333,7 +338,7 @@ class Host:
         self._put(JOURNAL, entry)
 
     def _ask(self, ask: Ask) -> None:
-        if ask.query not in self.service.asks:
+        if ask.query not in (*self.service.asks, *self.service.errands):
             raise UndeclaredError(f"{self.service.name} asked {ask.query.name}, which it does not declare")
         name = (ask.query.name, encode(ask.request))
         if name not in self._asks:
@@ -341,6 +346,10 @@ class Host:
             self._call(ask)
 
     def _call(self, ask: Ask) -> None:
+        if isinstance(ask.query, Errand):
+            self._loop.call_soon_threadsafe(self._run_errand, ask)
+            return
+
         def answered(answer: Answer) -> None:
             if answer.payload is not None:
                 self.inbox.put(Reply(ask, answer.payload))
@@ -349,6 +358,20 @@ class Host:
                 self._loop.call_soon_threadsafe(self._loop.call_later, ASK_RETRY_S, self._call_again, ask)
 
         self.bus.call(ask.query.key_of(ask.request), encode(ask.request), ASK_TIMEOUT_S, answered)
+
+    def _run_errand(self, ask: Ask) -> None:
+        async def work() -> None:
+            reply = await self._errands[ask.query](ask.request)  # type: ignore[index]
+            self.inbox.put(Reply(ask, encode(reply)))
+
+        task = self._loop.create_task(work())
+        self._running.add(task)
+        task.add_done_callback(self._errand_ended)
+
+    def _errand_ended(self, task: asyncio.Task) -> None:
+        self._running.discard(task)
+        if not task.cancelled() and (error := task.exception()) is not None and not self._fault.done():
+            self._fault.set_exception(error)
 
     def _call_again(self, ask: Ask) -> None:
         if not self.stopping.is_set():

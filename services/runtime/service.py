@@ -24,10 +24,25 @@ class Identity:
 
 
 @dataclass(frozen=True)
-class Ask:
-    """An output of a step: a question. The reply is an input of a later step; the host retries until then."""
+class Errand:
+    """Slow or outside work of a service, such as a call over the network, which must hold up neither its steps nor its
+    answers. `open(cfg, identity)`, called once when the service starts and never in a replay, gives the coroutine
+    function that does it: request in, reply out; it must not raise for what may happen in ordinary life.
+    """
 
-    query: Query
+    name: str
+    request: type[Message]
+    reply: type[Message]
+    open: Callable[[Any, Identity], Callable[[Any], Awaitable[Message]]]
+    key: str = ""  # no key: nobody else can ask
+
+
+@dataclass(frozen=True)
+class Ask:
+    """An output of a step: a question to the bus, or an errand. The reply is an input of a later step; the host repeats
+    a question until then."""
+
+    query: Query | Errand
     request: Message
 
 
@@ -40,7 +55,7 @@ class Service:
     """One service: what it reads, writes and answers, and the functions that do it.
 
     `step(state, message, cfg)` takes one input and yields outputs; it may change `state` and does nothing else.
-    Inputs are messages of `reads`, of `job`, replies to its questions, and `Tick` every `tick_s` seconds.
+    Inputs are messages of `reads`, of `job`, replies to its questions and errands, and `Tick` every `tick_s` seconds.
     `answers` maps a query to `f(state, request, cfg) -> reply`, which must not change the state.
     `drive`, for sources only, is a coroutine that feeds inputs from outside (see `services.runtime.host.Port`).
     """
@@ -55,6 +70,7 @@ class Service:
     writes: tuple[Topic, ...] = ()
     answers: Mapping[Query, Callable[[Any, Any, Any], Message]] = field(default_factory=dict)
     asks: tuple[Query, ...] = ()
+    errands: tuple[Errand, ...] = ()
     job: Topic | None = None  # the pool this service works for
     job_group: Callable[[Any], str] = lambda cfg: ""  # workers of one group do the same work
     prepare: Callable[[Any, list[Message], Any], None] | None = None  # told of jobs that wait; must not block
