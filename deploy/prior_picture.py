@@ -127,10 +127,10 @@ class Png:
 
     def _slanted(self, at: tuple[int, int], text: str, scale: float, size: tuple[int, int], color: Color) -> None:
         side = size[0] + size[1] + 8
-        patch = np.full((2 * side, 2 * side, 3), 255, np.uint8)
-        cv2.putText(patch, text, (side, side), cv2.FONT_HERSHEY_SIMPLEX, scale, color[::-1], 2, cv2.LINE_AA)
+        upright = np.full((2 * side, 2 * side, 3), 255, np.uint8)
+        cv2.putText(upright, text, (side, side), cv2.FONT_HERSHEY_SIMPLEX, scale, color[::-1], 2, cv2.LINE_AA)
         patch = cv2.warpAffine(
-            patch, cv2.getRotationMatrix2D((side, side), 60, 1), patch.shape[1::-1], borderValue=(255, 255, 255)
+            upright, cv2.getRotationMatrix2D((side, side), 60, 1), upright.shape[1::-1], borderValue=(255, 255, 255)
         )
         top, left = max(at[1] - side, 0), max(at[0] - side, 0)
         part = self._image[top : at[1] + side, left : at[0] + side]
@@ -147,7 +147,7 @@ def _twice(point: Point) -> tuple[int, int]:
 
 def draw(prior: Prior, path: Path) -> None:
     """Write the picture; the suffix says which kind. Raises ValueError for another than .svg and .png."""
-    kinds = {".svg": Svg, ".png": Png}
+    kinds: dict[str, type[Svg] | type[Png]] = {".svg": Svg, ".png": Png}
     if path.suffix not in kinds:
         raise ValueError(f"a picture is a .svg or a .png, not {path.suffix or 'a file without suffix'}")
     columns = discriminative(prior, MOST_OBJECTS)

@@ -277,11 +277,12 @@ def differences(before: Prior, after: Prior, least: float) -> list[str]:
         lines += [f"- {kind} {name}" for name in names if name not in others]
         lines += [f"+ {kind} {name}" for name in others if name not in names]
     found = []
-    for title, old_rows, new_rows in (
+    matrices: tuple[tuple[str, Rows, Rows], ...] = (
         ("P(r)", _existence(before), _existence(after)),
-        ("P(o | r)", *map(_held, (before, after))),
-        ("P(ri - rj)", *map(_touching, (before, after))),
-    ):
+        ("P(o | r)", _held(before), _held(after)),
+        ("P(ri - rj)", _touching(before), _touching(after)),
+    )
+    for title, old_rows, new_rows in matrices:
         for row in old_rows.keys() & new_rows.keys():
             for column in old_rows[row].keys() & new_rows[row].keys():
                 was, now = old_rows[row][column], new_rows[row][column]

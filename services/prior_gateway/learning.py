@@ -127,12 +127,20 @@ def disagreements(prior: Prior, seen: Totals, most: int) -> list[Disagreement]:
     names, things = [region.name for region in prior.regions], [item.name for item in prior.objects]
     upper = np.triu(seen.pairs, 1)  # a pair is one entry
     found = [
-        _disagreement("containment", (names[i], things[j]), prior.containment[i, j], seen.holding[i, j], trials)
+        _disagreement(
+            "containment",
+            (names[i], things[j]),
+            float(prior.containment[i, j]),
+            float(seen.holding[i, j]),
+            float(trials),
+        )
         for (i, j), trials in np.ndenumerate(seen.instances)
         if trials > 0
     ]
     found += [
-        _disagreement("adjacency", (names[i], names[j]), prior.adjacency[i, j], seen.touching[i, j], trials)
+        _disagreement(
+            "adjacency", (names[i], names[j]), float(prior.adjacency[i, j]), float(seen.touching[i, j]), float(trials)
+        )
         for (i, j), trials in np.ndenumerate(upper)
         if trials > 0
     ]
@@ -141,9 +149,9 @@ def disagreements(prior: Prior, seen: Totals, most: int) -> list[Disagreement]:
 
 
 def _disagreement(matrix: str, entry: tuple[str, str], expected: float, hits: float, trials: float) -> Disagreement:
-    p, observed = float(expected), float(hits / trials)
-    surprise = (observed - p) ** 2 / (p * (1 - p) / trials + 1e-4)
-    return Disagreement(matrix, *entry, p, observed, float(trials), float(surprise))
+    observed = hits / trials
+    surprise = (observed - expected) ** 2 / (expected * (1 - expected) / trials + 1e-4)
+    return Disagreement(matrix, *entry, expected, observed, trials, surprise)
 
 
 def told(entries: Iterable[Disagreement]) -> tuple[str, dict[str, dict[str, dict[str, tuple[float, float]]]]]:
