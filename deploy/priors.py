@@ -168,7 +168,8 @@ def verdict(prior: Prior, cfg: Config, library: Library) -> str:
     if not prior.provenance.signature and prior.provenance.source == "library" and not prior.provenance.parent_digest:
         task = Task(robot="", stamp_ns=0, environment=prior.environment, task=prior.task, regions=prior.vocabulary)
         try:
-            same = library.answer(task, cfg).digest() == prior.digest()
+            said = library.answer(task, cfg)
+            same = msgspec.structs.replace(said, provenance=prior.provenance).digest() == prior.digest()
         except NoPrior:
             same = False
         return LIBRARY_SIGN if same else "not signed, and not what this version's library says"

@@ -95,7 +95,7 @@ class Trouble(threading.Thread):
         """Random bytes and cut-off messages on every key, with and without a sender's header."""
         cut = [sample.payload[: len(sample.payload) // 2] for sample in messages.values()]
         for topic in TOPICS:
-            key = topic.key.format(robot="robot1", digest="0" * 32)
+            key = topic.key.format(robot="robot1", digest="0" * 32, question="0" * 32)
             for payload in (*GARBAGE, *cut):
                 for header in (b"", b"\xff" * 3, b"\x00" * 40):
                     if topic.delivery != "job":

@@ -76,7 +76,7 @@ def resolve(config_type: type[C], section: str, layers: Mapping[str, Mapping[str
     for name, value in values.items():
         if name not in fields:
             raise ConfigError(f"{section} has no setting {name!r}; it has: {', '.join(sorted(fields))}")
-        if isinstance(value, str) and value[:1] in "[{":
+        if isinstance(value, str) and value.startswith(("[", "{")):
             try:
                 values[name] = msgspec.json.decode(value)
             except msgspec.DecodeError as error:
