@@ -28,6 +28,9 @@ from schemas.topics import (
     JOURNAL,
     KEYFRAME,
     POSE_UPDATE,
+    PRIOR_CLAIM,
+    PRIOR_EVIDENCE,
+    PRIOR_REVISION,
     PYRAMID,
     REGION_DELTA,
     TOPICS,
@@ -38,6 +41,8 @@ from services.runtime.record import LogWriter, read_log, summary
 from services.runtime.zenoh_bus import ZenohBus
 
 FRAMES = 26
+# Recorded, but sent only when there is something to correct, missing, to agree on with other gateways or to learn.
+WHEN_NEEDED = (POSE_UPDATE, BACKFILL, PRIOR_CLAIM, PRIOR_EVIDENCE, PRIOR_REVISION)
 GARBAGE = (b"", b"\x00", b"\xff" * 64, os.urandom(512))
 
 
@@ -290,7 +295,7 @@ def test_explain_from_the_log_adds_up(disturbed, capsys):
 def test_the_log_holds_everything_recorded(disturbed):
     counts = summary(disturbed[1] / "log.mcap")
     for topic in TOPICS:
-        if topic not in (POSE_UPDATE, BACKFILL):  # which are sent only when there is something to correct or missing
+        if topic not in WHEN_NEEDED:
             assert (counts.get(topic.name, 0) > 0) == topic.recorded, topic.name
     services = {
         decode(JOURNAL.type, logged.payload).service for logged in read_log(disturbed[1] / "log.mcap", [JOURNAL])
