@@ -14,6 +14,7 @@ from typing import Literal
 from schemas.codec import Message
 from schemas.features import Backfill, Pyramid, TextEmbeddings, TextRequest
 from schemas.frames import ArchiveReply, ArchiveRequest, CameraState, IngestState, Keyframe, PoseUpdate
+from schemas.objects import Detections
 from schemas.places import MapRequest, PlaceDelta, SnapshotRequest, VoxelMap
 from schemas.priors import (
     Prior,
@@ -79,6 +80,7 @@ INGEST_STATE = Topic("INGEST_STATE", IngestState, f"{ROOT}/{{robot}}/ingest", "l
 PLACE_DELTA = Topic("PLACE_DELTA", PlaceDelta, f"{ROOT}/{{robot}}/places", "every", 2, recorded=True, cache=256)
 ENCODE = Topic("ENCODE", Keyframe, f"{ROOT}/jobs/encode", "job", 2, recorded=False)
 PYRAMID = Topic("PYRAMID", Pyramid, f"{ROOT}/{{robot}}/pyramid", "every", 2, recorded=True, cache=256)
+DETECTIONS = Topic("DETECTIONS", Detections, f"{ROOT}/{{robot}}/detections", "every", 2, recorded=True, cache=256)
 BACKFILL = Topic("BACKFILL", Backfill, f"{ROOT}/{{robot}}/backfill", "every", 0.01, recorded=True, cache=4)
 TASK = Topic("TASK", Task, f"{ROOT}/{{robot}}/task", "every", 0.01, recorded=True, cache=4)
 PRIOR = Topic("PRIOR", Prior, f"{ROOT}/fleet/prior/{{digest}}", "every", 0.01, recorded=True, cache=4)
@@ -103,6 +105,7 @@ TOPICS = (
     PLACE_DELTA,
     ENCODE,
     PYRAMID,
+    DETECTIONS,
     BACKFILL,
     TASK,
     PRIOR,

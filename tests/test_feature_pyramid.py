@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from schemas.codec import decode, encode
 from schemas.features import Pyramid, TextEmbeddings, TextRequest
 from schemas.frames import Intrinsics, Keyframe
-from schemas.topics import ENCODE, PYRAMID, TEXT
+from schemas.topics import DETECTIONS, ENCODE, PYRAMID, TEXT
 from services.feature_pyramid import core, service
 from services.feature_pyramid.core import Config
 from services.feature_pyramid.encoders import EncoderUnavailable, Options, load_encoder
@@ -53,8 +53,10 @@ def checkered(height=480, width=640):
 
 
 def only(outputs):
-    ((topic, message),) = outputs
-    assert topic is PYRAMID
+    """The pyramid of a keyframe, which its detections follow."""
+    (topic, message), (other, detections) = outputs
+    assert topic is PYRAMID and other is DETECTIONS
+    assert (detections.frame_id, detections.space) == (message.frame_id, message.space)
     return message
 
 
@@ -346,7 +348,7 @@ def _frames_seeing(folder, label):
 def test_declaration():
     declared = service.SERVICE
     assert declared.name == "feature_pyramid" and declared.scope == "fleet"
-    assert declared.job is ENCODE and declared.writes == (PYRAMID,) and not declared.reads
+    assert declared.job is ENCODE and declared.writes == (PYRAMID, DETECTIONS) and not declared.reads
     assert declared.key_fields(CFG) == {"space": SPACE} and declared.job_group(CFG) == SPACE
     assert TEXT.key_of(TextRequest(space=SPACE, concepts=[])) == f"psg/encoder/{SPACE}/text"
 

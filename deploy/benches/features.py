@@ -91,6 +91,7 @@ def pool(workers: int, settings: list[str]) -> Iterator[Pool]:
     endpoint = free_endpoint("tcp/127.0.0.1:0")
     stop_router = open_router(endpoint)
     with tempfile.TemporaryDirectory() as folder:
+        settings = ["feature_pyramid.detector=none", *settings]  # crops of pyramids are what is counted
         supervisor = Supervisor(endpoint, "bench", Path(folder), settings)
         running = Pool(supervisor, ZenohBus(endpoint))
         try:

@@ -20,7 +20,7 @@ from schemas.codec import Message, decode, encode
 from schemas.features import Pyramid, TextEmbeddings, TextRequest
 from schemas.frames import Keyframe
 from schemas.places import MapRequest, PlaceDelta, SnapshotRequest, VoxelMap
-from schemas.topics import KEYFRAME, PLACE_SNAPSHOT, TEXT, VOXEL_MAP
+from schemas.topics import KEYFRAME, PLACE_SNAPSHOT, PYRAMID, TEXT, VOXEL_MAP
 from services.ingest.sources import Source, open_source
 from services.registry import BY_NAME
 from services.runtime.config import resolve
@@ -138,7 +138,10 @@ class Perceiver:
         worker, step = self._worker(cfg), BY_NAME["feature_pyramid"].step
         frames = self._keyframes(source, "features")
         return [
-            encode(output[1]) for frame in frames for output in step(worker, frame, cfg) if isinstance(output, tuple)
+            encode(output[1])
+            for frame in frames
+            for output in step(worker, frame, cfg)
+            if isinstance(output, tuple) and output[0] is PYRAMID
         ]
 
     def _keyframes(self, source: Source, what: str) -> Iterator[Keyframe]:

@@ -5,6 +5,7 @@ import numpy as np
 
 from schemas.frames import Intrinsics
 from services.feature_pyramid.medians import patch_medians
+from services.feature_pyramid.segments import SegmentsConfig
 
 
 class Config(msgspec.Struct, frozen=True, kw_only=True):
@@ -22,6 +23,11 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
     surface_cell_px: int = 8  # cell size of the coarse depth surface
     batch_size: int = 0  # crops per forward pass, of one or several keyframes; 0 = what suits encoder and device
     threads: int = 0  # of the neural network library; 0 = its own choice (OMP_NUM_THREADS)
+    detector: str = "segments"  # of objects; or none, grounding_dino:MODEL, owlv2:MODEL (a folder or a published name)
+    detector_prompts: tuple[str, ...] = ()  # names of the objects that grounding_dino and owlv2 are to find
+    detector_threshold: float = 0.3  # least score of what those find; the networks' authors advise 0.2 to 0.35
+    object_point_m: float = 0.05  # side of the cubes of which a detection keeps one point each
+    segments: SegmentsConfig = SegmentsConfig()  # of the detector segments; its grid is every detector's
 
     def __post_init__(self) -> None:
         if self.smallest_crop_px < 1 or self.layers < 1 or self.surface_cell_px < 1:
@@ -30,6 +36,8 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
             raise ValueError("overlap must be in [0, 1)")
         if self.min_area_m2 < 0.0 or self.threads < 0 or self.batch_size < 0:
             raise ValueError("min_area_m2, threads and batch_size must not be negative")
+        if self.object_point_m <= 0.0:
+            raise ValueError("object_point_m must be positive")
 
 
 class Crops(msgspec.Struct, frozen=True, eq=False):

@@ -1,4 +1,4 @@
-"""A worker of the encoding pool: keyframes in, feature pyramids out; answers text queries of its embedding space."""
+"""A worker of the encoding pool: keyframes in, feature pyramids and detected objects out; answers text queries."""
 
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -11,8 +11,10 @@ import numpy as np
 from schemas.codec import Message
 from schemas.features import Pyramid, TextEmbeddings, TextRequest
 from schemas.frames import Keyframe
-from schemas.topics import ENCODE, PYRAMID, TEXT
+from schemas.objects import Detections
+from schemas.topics import DETECTIONS, ENCODE, PYRAMID, TEXT
 from services.feature_pyramid.core import Config, Selection, coarse_surface, select_crops
+from services.feature_pyramid.detect import Detector, Found, lift, load_detector, object_crops
 from services.feature_pyramid.encoders import Encoder, Options, load_encoder, space_of
 from services.runtime.service import Identity, Output, Service
 
@@ -21,7 +23,9 @@ class View(NamedTuple):
     """A keyframe, read: what is left to do is the encoder's."""
 
     selection: Selection
-    crops: list[np.ndarray]  # RGB, uint8 (side, side, 3)
+    found: list[Found]  # objects
+    points_camera_m: list[np.ndarray]  # of each object, (point, 3)
+    crops: list[np.ndarray]  # RGB, uint8 (side, side, 3): those selected, then one of each object
     surface_m: np.ndarray
     broken: bool
 
@@ -32,6 +36,7 @@ class Worker:
 
     instance: str
     encoder: Encoder
+    detector: Detector
     broken: int = 0
     reader: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(1, thread_name_prefix="reader"))
     views: dict[tuple[str, int], Future[View]] = field(default_factory=dict)  # by robot and frame
@@ -43,39 +48,45 @@ class BrokenImage(ValueError):
 
 
 def init(cfg: Config, identity: Identity) -> Worker:
-    """Load the encoder of the configured space. Raises EncoderUnavailable."""
+    """Load the encoder of the configured space and the detector. Raises EncoderUnavailable."""
     options = Options(cfg.threads, cfg.batch_size, cfg.runtime, cfg.device)
-    return Worker(identity.instance, load_encoder(cfg.space, options))
+    return Worker(identity.instance, load_encoder(cfg.space, options), load_detector(cfg))
 
 
 def prepare(state: Worker, messages: list[Message], cfg: Config) -> None:
     """Read the keyframes that wait, on a thread of their own, while the encoder is at work on others."""
     for frame in messages:
         if isinstance(frame, Keyframe) and _key(frame) not in state.views:
-            state.views[_key(frame)] = state.reader.submit(view, frame, cfg)
+            state.views[_key(frame)] = state.reader.submit(view, frame, state.detector, cfg)
 
 
 def step(state: Worker, message: Message, cfg: Config) -> Iterator[Output]:
-    """One pyramid per keyframe, empty when no crop survives or an image is broken: the job is done either way."""
+    """A pyramid and detections per keyframe, empty when nothing is found or an image is broken: the job is done."""
     if not isinstance(message, Keyframe):
         return
     key = _key(message)
     waiting = state.views.pop(key, None)
-    seen = waiting.result() if waiting is not None else view(message, cfg)
+    seen = waiting.result() if waiting is not None else view(message, state.detector, cfg)
     state.broken += seen.broken
     embeddings = state.encoded.pop(key) if key in state.encoded else encode(state, seen)
-    yield PYRAMID, pyramid(state, message, seen, embeddings)
+    split = len(seen.selection.crops)
+    yield PYRAMID, pyramid(state, message, seen, embeddings[:split])
+    yield DETECTIONS, detections(state, message, seen, embeddings[split:])
 
 
-def view(frame: Keyframe, cfg: Config) -> View:
-    """Decode a keyframe and select its crops by depth; without crops when its images are broken."""
+def view(frame: Keyframe, detector: Detector, cfg: Config) -> View:
+    """Decode a keyframe, select its crops by depth, and detect; neither crops nor objects when an image is broken."""
     try:
         color, depth_m, broken = read_color(frame), read_depth(frame), False
     except BrokenImage:
         color, depth_m = blank(frame)
         broken = True
-    selection = select_crops(depth_m, frame.intrinsics, cfg)
-    return View(selection, selection.crops.cut(color), coarse_surface(depth_m, cfg.surface_cell_px), broken)
+    camera = frame.intrinsics
+    selection = select_crops(depth_m, camera, cfg)
+    found = [] if broken else detector.detect(color, depth_m, camera, frame.world_from_camera)
+    found, points_camera_m = lift(found, depth_m, camera, cfg)
+    crops = selection.crops.cut(color) + object_crops(found, camera.width_px, camera.height_px).cut(color)
+    return View(selection, found, points_camera_m, crops, coarse_surface(depth_m, cfg.surface_cell_px), broken)
 
 
 def encode(state: Worker, seen: View) -> np.ndarray:
@@ -114,6 +125,27 @@ def pyramid(state: Worker, frame: Keyframe, seen: View, embeddings: np.ndarray) 
         embeddings=embeddings.astype(np.float16),
         surface_m=seen.surface_m,
         crops_total=seen.selection.candidates,
+    )
+
+
+def detections(state: Worker, frame: Keyframe, seen: View, embeddings: np.ndarray) -> Detections:
+    """What association over time needs of a keyframe; also without objects, for a look that finds nothing counts."""
+    return Detections(
+        robot=frame.robot,
+        frame_id=frame.frame_id,
+        stamp_ns=frame.stamp_ns,
+        space=state.encoder.space,
+        detector=state.detector.name,
+        prompted=state.detector.prompted,
+        worker=state.instance,
+        intrinsics=frame.intrinsics,
+        world_from_camera=frame.world_from_camera.copy(),
+        boxes_px=np.array([one.box_px for one in seen.found], np.float32).reshape(-1, 4),
+        scores=np.array([one.score for one in seen.found], np.float32),
+        embeddings=embeddings.astype(np.float16),
+        point_counts=np.array([len(points_m) for points_m in seen.points_camera_m], np.int32),
+        points_camera_m=np.concatenate([np.zeros((0, 3)), *seen.points_camera_m]).astype(np.float16),
+        surface_m=seen.surface_m.astype(np.float16),
     )
 
 
@@ -160,12 +192,12 @@ def _decode(data: bytes, mode: int, frame: Keyframe) -> np.ndarray:
 
 SERVICE = Service(
     name="feature_pyramid",
-    purpose="Encodes keyframes as feature pyramids and text as concept descriptors",
+    purpose="Encodes keyframes as feature pyramids, detects objects in them, and encodes text as concept descriptors",
     scope="fleet",
     config=Config,
     init=init,
     step=step,
-    writes=(PYRAMID,),
+    writes=(PYRAMID, DETECTIONS),
     answers={TEXT: answer_text},
     job=ENCODE,
     job_group=lambda cfg: space_of(cfg.space),
