@@ -1,6 +1,6 @@
 """The only list of services."""
 
-from schemas.topics import POSE_UPDATE, PRIOR_EVIDENCE, PRIOR_REVISION, TASK, Topic
+from schemas.topics import POSE_UPDATE, PRIOR_REVISION, TASK, Topic
 from services.feature_pyramid.service import SERVICE as FEATURE_PYRAMID
 from services.ingest.service import SERVICE as INGEST
 from services.place_graph.service import SERVICE as PLACE_GRAPH
@@ -12,6 +12,6 @@ from services.segmenter.service import SERVICE as SEGMENTER
 SERVICES: tuple[Service, ...] = (INGEST, PLACE_GRAPH, FEATURE_PYRAMID, PRIOR_GATEWAY, SEGMENTER, SCENE_STORE)
 
 # Topics that people and their programs write or read, through the command line.
-OPERATOR_WRITES: tuple[Topic, ...] = (TASK, POSE_UPDATE, PRIOR_EVIDENCE, PRIOR_REVISION)
+OPERATOR_WRITES: tuple[Topic, ...] = (TASK, POSE_UPDATE, PRIOR_REVISION)
 
 BY_NAME: dict[str, Service] = {service.name: service for service in SERVICES}

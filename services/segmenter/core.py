@@ -10,14 +10,14 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 
-from schemas.codec import Message, copied
+from schemas.codec import Message, copied, encode
 from schemas.features import Pyramid, TextEmbeddings, TextRequest
 from schemas.frames import PoseUpdate
 from schemas.places import PlaceDelta, SnapshotRequest
-from schemas.priors import Prior, PriorList, PriorRequest, Task, TaskInForce, TaskRequest
+from schemas.priors import Prior, PriorEvidence, PriorList, PriorRequest, Task, TaskInForce, TaskRequest
 from schemas.regions import RegionDelta
 from schemas.status import Tick
-from services.segmenter import descriptors, geometry, spaces
+from services.segmenter import descriptors, geometry, observed, spaces
 from services.segmenter.experts.context import ObjectView
 from services.segmenter.graph import apply
 from services.segmenter.inference import (
@@ -64,6 +64,8 @@ def update(state: State, message: Message, cfg: Config) -> Iterator[Message]:
     yield from _requests(state, cfg)
     if switched or (state.dirty and isinstance(message, Pyramid | Tick)):
         yield from _segment(state, switched, isinstance(message, Tick), cfg)
+    if isinstance(message, Tick):
+        yield from _observed(state, cfg)
 
 
 def follow_places(state: State, delta: PlaceDelta, cfg: Config) -> None:
@@ -244,6 +246,18 @@ def _segment(state: State, switched: bool, idle: bool, cfg: Config) -> Iterator[
     state.dirty = state.solver.pending > 0 or state.compared > 0
     if delta is not None:
         yield delta
+
+
+def _observed(state: State, cfg: Config) -> Iterator[PriorEvidence]:
+    """From time to time, what the map shows of its prior; only what has settled, and only when it is news."""
+    state.evidence_waits += 1
+    if state.dirty or not cfg.evidence_ticks or state.evidence_waits < cfg.evidence_ticks:
+        return
+    state.evidence_waits = 0
+    seen = observed.evidence(state, cfg)
+    if seen is not None and (state.observed is None or encode(seen) != encode(state.observed)):
+        state.observed = seen
+        yield seen
 
 
 def _requests(state: State, cfg: Config) -> Iterator[Message]:

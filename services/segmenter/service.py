@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from schemas.codec import Message
 from schemas.features import Backfill, TextRequest
 from schemas.places import SnapshotRequest
-from schemas.priors import PriorRequest, TaskRequest
+from schemas.priors import PriorEvidence, PriorRequest, TaskRequest
 from schemas.regions import PosteriorReply, PosteriorRequest, RegionDelta
 from schemas.topics import (
     BACKFILL,
@@ -14,6 +14,7 @@ from schemas.topics import (
     POSE_UPDATE,
     POSTERIOR,
     PRIOR,
+    PRIOR_EVIDENCE,
     PRIORS,
     PYRAMID,
     REGION_DELTA,
@@ -32,7 +33,7 @@ QUESTIONS = {
     PriorRequest: PRIORS,
     TaskRequest: TASK_IN_FORCE,
 }
-PUBLISHED = {RegionDelta: REGION_DELTA, Backfill: BACKFILL}
+PUBLISHED = {RegionDelta: REGION_DELTA, Backfill: BACKFILL, PriorEvidence: PRIOR_EVIDENCE}
 
 
 def init(cfg: Config, identity: Identity) -> State:
@@ -65,7 +66,7 @@ SERVICE = Service(
     init=init,
     step=step,
     reads=(PLACE_DELTA, PYRAMID, POSE_UPDATE, TASK, PRIOR),
-    writes=(REGION_DELTA, BACKFILL),
+    writes=(REGION_DELTA, BACKFILL, PRIOR_EVIDENCE),
     asks=(PLACE_SNAPSHOT, TEXT, PRIORS, TASK_IN_FORCE),
     answers={REGION_SNAPSHOT: answer_snapshot, POSTERIOR: answer_posterior},
     tick_s=0.5,

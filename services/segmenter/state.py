@@ -7,7 +7,7 @@ import numpy as np
 
 from schemas.features import TextEmbeddings, TextRequest
 from schemas.places import PlaceDelta
-from schemas.priors import Prior, Task
+from schemas.priors import Prior, PriorEvidence, Task
 from schemas.regions import Region
 from services.deltas import Follower
 from services.segmenter import descriptors, publication
@@ -51,6 +51,8 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
     door_clearance_m: float = 0.7  # a way between regions with at most this clearance is a door
     posterior_change: float = 0.01  # smaller changes of a belief are not sent
     footprint_cell_m: float = 0.1  # grid of the regions' areas
+    evidence_ticks: int = 40  # ticks between two reports of what the map shows of its prior; 0 = none
+    evidence_places: int = 5  # a region of fewer places is not counted there: most are mistakes
     prior_wait_ticks: int = 4  # ticks to wait for a task's prior before asking for it
     remembered_priors: int = 4  # priors kept that no task has asked for yet
 
@@ -116,6 +118,8 @@ class State:
     asked_prior: bool = False
     asked_task: bool = False
     waited_ticks: int = 0
+    evidence_waits: int = 0  # ticks since the last report of what the map shows of its prior
+    observed: PriorEvidence | None = None  # that report
     ignored_pyramids: int = 0  # repeated, or not of this space
 
 

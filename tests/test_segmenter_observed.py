@@ -1,0 +1,66 @@
+"""What a map tells the prior gateway about its prior: counted in a world of three rooms in a row."""
+
+import numpy as np
+from segmenter_world import ROBOT, place_delta, place_grid, prior, task, text, walk
+
+from schemas.codec import decode, encode
+from schemas.priors import PriorEvidence
+from schemas.status import Tick
+from schemas.topics import PRIOR_EVIDENCE, TEXT
+from services.prior_gateway import learning
+from services.runtime.service import Ask, Identity
+from services.segmenter.service import SERVICE
+from services.segmenter.state import Config
+
+ROOMS = ["kitchen", "hall", "bedroom"]
+TICK = Tick(stamp_ns=10**18)
+
+
+def told(cfg: Config, ticks: int, names=ROOMS) -> list[PriorEvidence]:
+    """Everything told about the prior by the given tick."""
+    positions, edges = place_grid(3)
+    state, found = SERVICE.init(cfg, Identity(ROBOT, "i", 1)), []
+    queue = [place_delta(positions, edges), task(), prior(names), *walk(3), *[TICK] * ticks]
+    while queue:
+        for output in list(SERVICE.step(state, queue.pop(0), cfg)):
+            if isinstance(output, Ask) and output.query is TEXT:
+                queue.insert(0, text(np.eye(3)[: len(output.request.concepts)]))
+            elif not isinstance(output, Ask) and output[0] is PRIOR_EVIDENCE:
+                found.append(decode(PriorEvidence, encode(output[1])))  # with the checks of the wire
+    return found
+
+
+def test_rooms_in_a_row_are_counted_once_and_only_neighbours_touch():
+    [seen] = told(Config(evidence_ticks=4), 20)  # nothing new after the first time
+    assert (seen.robot, seen.environment, seen.task, seen.prior_digest) == (
+        ROBOT,
+        "home",
+        "tidy up",
+        prior(ROOMS).digest(),
+    )
+    assert seen.regions == ROOMS
+    assert seen.instances.tolist() == [1, 1, 1]
+    np.testing.assert_array_equal(seen.pairs, 1 - np.eye(3))
+    np.testing.assert_array_equal(seen.touching, [[0, 1, 0], [1, 0, 1], [0, 1, 0]])
+    np.testing.assert_allclose(seen.places.sum(), 50, atol=0.1)  # 48 on the grid, two in doorways
+    assert seen.objects == []
+
+
+def test_regions_of_few_places_do_not_count():
+    [seen] = told(Config(evidence_ticks=1, evidence_places=17), 20)[-1:]  # a room has 16, two of them a doorway more
+    assert seen.instances.sum() < 3
+    assert told(Config(evidence_ticks=1, evidence_places=51), 20) == []
+
+
+def test_it_can_be_switched_off():
+    assert told(Config(evidence_ticks=0), 20) == []
+
+
+def test_the_gateway_learns_from_it():
+    [seen] = told(Config(evidence_ticks=4), 20)
+    before = prior(ROOMS)
+    after = learning.revised(before, learning.totals(before, [seen]), 4.0, before.provenance)
+    expected = (4 * 0.3 + np.array([[0, 1, 0], [1, 0, 1], [0, 1, 0]])) / 5  # P = (strength P + k) / (strength + n)
+    off = ~np.eye(3, dtype=bool)
+    np.testing.assert_allclose(after.adjacency[off], expected[off], rtol=1e-6)
+    np.testing.assert_array_equal(after.containment, before.containment)
