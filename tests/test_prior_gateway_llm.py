@@ -14,7 +14,7 @@ from deploy.priors import read
 URL = os.environ.get("PSG_TEST_LLM_URL", "")
 START_S, MAKE_S = 120, 1500
 # A small model with one thread: small calls, no thinking aloud, numbers from a list (its server enforces no bounds).
-SMALL = '{"samples": 1, "reason": false, "regions_per_call": 1, "repairs": 4, "max_tokens": 700, "steps": 11}'
+SMALL = '{"samples": 4, "reason": false, "regions_per_call": 1, "repairs": 1, "max_tokens": 700, "steps": 11}'
 
 pytestmark = [pytest.mark.skipif(not URL, reason="no PSG_TEST_LLM_URL: see `make test-llm`"), pytest.mark.timeout(3600)]
 
@@ -38,7 +38,14 @@ def test_a_small_model_makes_a_whole_prior(tmp_path):
         *("--timeout", str(MAKE_S), "--out", str(tmp_path / "prior.json")),
     ]
     settings = (
-        *("provider=openai", f"endpoint={URL}", "model=small", "structured=json_object", f"synthesis={SMALL}"),
+        *(
+            "provider=openai",
+            f"endpoint={URL}",
+            "model=small",
+            "temperature=0.8",
+            "structured=json_object",
+            f"synthesis={SMALL}",
+        ),
         *(f"archive={tmp_path / 'kept'}", 'calls={"timeout_s": 600, "deadline_s": 1200}'),
     )
     for setting in settings:

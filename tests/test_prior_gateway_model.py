@@ -133,7 +133,7 @@ def put(*path, value=None, drop=False):
 
 FAULTS = {
     "a name twice": (is_regions, put("regions", 1, "name", value="Hall"), "'hall' is named more than once"),
-    "no name": (is_regions, put("regions", 1, "name", value=" ?"), "has no name"),
+    "no name": (is_regions, put("regions", 1, "name", value=" ?"), "neither letter nor digit"),
     "an endless name": (is_regions, put("regions", 1, "name", value="x" * 99), "too long"),
     "too few": (is_regions, put("regions", value=[]), "between 3 and 12"),
     "shares as fractions": (
@@ -141,7 +141,7 @@ FAULTS = {
         lambda a: [at.update(share=0.25) for at in a["regions"]] and None,
         "percentages and sum to 100",
     ),
-    "no phrase": (is_description, put("hall", "phrases", value=["", "x"]), "phrase is empty"),
+    "no phrase": (is_description, put("hall", "phrases", value=["", " "]), "there is no phrase"),
     "an endless phrase": (is_description, put("hall", "phrases", value=["x" * 999]), "longer than"),
     "a vertical spread": (is_description, put("hall", "inclination_spread_deg", value=0), "its spread above 0"),
     "scale in metres": (is_description, put("hall", "scale_cm", value=0.75), "no sensible distance"),

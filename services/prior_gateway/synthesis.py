@@ -7,7 +7,7 @@ whoever drives it owns network, retries and time. Every answer is checked; a fau
 
 import json
 import math
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Iterable, Sequence
 from dataclasses import dataclass, field
 from string import Template
 from typing import Any, TypeVar
@@ -260,8 +260,8 @@ def describe(talk: Talk, batch: list[str]) -> Dialogue[dict[str, Described]]:
         if faults := _faults_of_keys("region", found, batch):
             return {}, faults
         for entry in found.values():
-            entry.phrases = list(dict.fromkeys(" ".join(phrase.split()) for phrase in entry.phrases))
-            entry.objects = list(dict.fromkeys(" ".join(name.split()).casefold() for name in entry.objects))
+            entry.phrases = _tidy(entry.phrases)
+            entry.objects = _tidy(name.casefold() for name in entry.objects)
         return found, [fault for name, entry in found.items() for fault in _faults_of_description(name, entry)]
 
     return (yield from talk.ask("describe", _object(dict.fromkeys(batch, form)), read, batch=", ".join(batch)))
@@ -410,7 +410,11 @@ def _faults_of_keys(kind: str, found: dict[str, Any], wanted: list[str], where: 
 
 
 def _faults_of_names(kind: str, names: Sequence[str]) -> list[str]:
-    faults = [f"a {kind} has no name" for name in names if not any(c.isalnum() for c in name)]
+    faults = [
+        f"a name of the kind {kind} has neither letter nor digit"
+        for name in names
+        if not any(c.isalnum() for c in name)
+    ]
     return faults + [f"the name {name[:LONGEST_NAME]!r}... is too long" for name in names if len(name) > LONGEST_NAME]
 
 
@@ -424,10 +428,15 @@ def _faults_of_places(found: dict[str, Placed]) -> list[str]:
     return faults + _faults_of_names("zone", [at.parent for at in found.values() if at.parent])
 
 
+def _tidy(texts: Iterable[str]) -> list[str]:
+    """Each text once, with single spaces; one without letter or digit says nothing and is left out."""
+    return [text for text in dict.fromkeys(" ".join(text.split()) for text in texts) if any(c.isalnum() for c in text)]
+
+
 def _faults_of_description(name: str, entry: Described) -> list[str]:
     faults = _faults_of_names("object", entry.objects)
-    if not entry.phrases or not all(map(str.strip, entry.phrases)):
-        faults.append(f"{name!r}: a phrase is empty, or there is none")
+    if not entry.phrases:
+        faults.append(f"{name!r}: there is no phrase")
     if not 1 <= len(entry.objects) <= MOST_LISTED or len(entry.phrases) > MOST_LISTED:
         faults.append(f"{name!r}: give 1 to {MOST_LISTED} objects and as many phrases at most")
     faults += [
