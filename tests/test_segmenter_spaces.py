@@ -7,7 +7,7 @@ from segmenter_world import SPACE, place_delta, prior, task, text, walk
 from test_segmenter_core import ROOMS, TICK, Run, finished, world
 
 from schemas.codec import decode, encode
-from schemas.topics import BACKFILL, TEXT
+from schemas.topics import BACKFILL, REGION_DELTA, TEXT
 from services.runtime.service import Ask
 from services.segmenter.service import SERVICE
 from services.segmenter.spaces import SpacesConfig
@@ -42,7 +42,7 @@ class TwoSpaces(Run):
                         self.feed(self.text(output.request))
                 elif not isinstance(output, Ask) and output[0] is BACKFILL:
                     self.wishes.append(output[1])
-                elif not isinstance(output, Ask):
+                elif not isinstance(output, Ask) and output[0] is REGION_DELTA:
                     self.deltas.append(output[1])
                     self.reader.apply(output[1])
         return self
