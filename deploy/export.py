@@ -10,6 +10,7 @@
     zones         [{label, regions [id]}]         layer above: adjacent regions whose labels share a parent in the prior
     places        [{id, position_m [x, y, z], radius_m, region, label, posterior {label: p}, unknown, predicted,
                     frontier {direction [x, y, z], area_m2}, ellipse {half_axes_m, angle_rad}, hull_m [[x, y]]}]
+    objects       [{id, label, probability, known, position_m, min_m, max_m, frames, place}]   place = the nearest
     edges         [{a, b, clearance_m}]           between places
     trajectory_m  [[x, y, z]]                     camera centres in order of time
 
@@ -27,13 +28,14 @@ import spark_dsg
 from deploy.evaluation.metrics import GroundTruth
 from deploy.map_image import draw_map, label_colors
 from deploy.place_image import draw_places
+from schemas.objects import SceneObject
 from schemas.places import VoxelMap
 from schemas.regions import Region
 from schemas.scene import Scene
 
 NO_REGION = -1
 DECIMALS = 4  # a tenth of a millimetre, a hundredth of a percent
-PLACE, PLACE_2D, ROOM, BUILDING = "p", "P", "R", "B"  # node prefixes of Spark-DSG
+OBJECT, PLACE, PLACE_2D, ROOM, BUILDING = "O", "p", "P", "R", "B"  # node prefixes of Spark-DSG
 
 
 def scene_json(scene: Scene) -> dict[str, Any]:
@@ -76,12 +78,36 @@ def scene_json(scene: Scene) -> dict[str, Any]:
             | _ground_json(surfaces.get(place_id))
             for row, place_id in enumerate(scene.place_ids.tolist())
         ],
+        "objects": [_object_json(item, place) for item, place in _placed(scene)],
         "edges": [
             {"a": a, "b": b, "clearance_m": _short(clearance_m)}
             for (a, b), clearance_m in zip(scene.edges.tolist(), scene.clearances_m, strict=True)
         ],
         "trajectory_m": _short(scene.trajectory),
     }
+
+
+def _object_json(item: SceneObject, place: int | None) -> dict[str, Any]:
+    return {
+        "id": item.id,
+        "label": item.label or None,
+        "probability": _short(item.probability),
+        "known": _short(item.known),
+        "position_m": _short(item.position_m),
+        "min_m": _short(item.min_m),
+        "max_m": _short(item.max_m),
+        "frames": item.frames,
+        "place": place,
+    }
+
+
+def _placed(scene: Scene) -> list[tuple[SceneObject, int | None]]:
+    """Each object with the id of its nearest place."""
+    placed: list[tuple[SceneObject, int | None]] = []
+    for item in scene.objects:
+        distances_m = np.linalg.norm(scene.positions_m - np.array(item.position_m, np.float32), axis=1)
+        placed.append((item, int(scene.place_ids[distances_m.argmin()]) if len(distances_m) else None))
+    return placed
 
 
 def zones(scene: Scene) -> list[tuple[str, list[int]]]:
@@ -147,7 +173,7 @@ def save_json(scene: Scene, path: str | Path) -> None:
 
 
 def spark_dsg_graph(scene: Scene) -> spark_dsg.DynamicSceneGraph:
-    """The scene in Spark-DSG's layers: places, rooms above them, one building above the rooms.
+    """The scene in Spark-DSG's layers: objects, places above them, rooms, one building above the rooms.
 
     A place keeps its radius as `distance`, a room the mean posterior of its places as `semantic_class_probabilities`;
     what Spark-DSG has no field for stands in the nodes' and the graph's metadata. Edges between places weigh their
@@ -168,6 +194,10 @@ def spark_dsg_graph(scene: Scene) -> spark_dsg.DynamicSceneGraph:
         weight = spark_dsg.EdgeAttributes()
         weight.weighted, weight.weight = True, clearance_m
         graph.insert_edge(_symbol(prefix, a), _symbol(prefix, b), weight)
+    for item, place in _placed(scene):
+        _add(graph, spark_dsg.DsgLayers.OBJECTS, OBJECT, item.id, _object_node(scene, item))
+        if place is not None:
+            graph.insert_edge(_symbol(prefix, place), _symbol(OBJECT, item.id), enforce_single_parent=True)
     members = _members(scene)
     for region in scene.regions:
         rows = members[region.id]
@@ -251,6 +281,18 @@ def _describe_place(
     node.name = str(_symbol(prefix, int(scene.place_ids[row])))
     node.metadata.set({"label": label, "unknown": float(scene.unknown[row])})
     _label_node(node, label, scene, colors)
+
+
+def _object_node(scene: Scene, item: SceneObject) -> spark_dsg.ObjectNodeAttributes:
+    node = spark_dsg.ObjectNodeAttributes()
+    node.position = np.array(item.position_m)
+    node.last_update_time_ns = scene.stamp_ns
+    node.name = item.label
+    low_m, high_m = np.array(item.min_m), np.array(item.max_m)
+    node.bounding_box = spark_dsg.BoundingBox(high_m - low_m, (high_m + low_m) / 2)
+    node.registered = True
+    node.metadata.set({"probability": item.probability, "known": item.known, "frames": item.frames})
+    return node
 
 
 def _room_node(

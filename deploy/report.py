@@ -53,9 +53,11 @@ def write(result: Result, out: Path, truth: dict[str, Any] | None, console: Cons
     scene = result.scene
     console.print(region_table(scene))
     labelled = int((scene.place_regions >= 0).sum())
+    named = sum(bool(item.label) for item in scene.objects)
     console.print(
         f"{len(scene.place_ids)} places ({labelled} labelled), {len(scene.edges)} edges, "
-        f"{len(scene.regions)} regions; {result.counts.encoded_summary()}; "
+        f"{len(scene.regions)} regions, {len(scene.objects)} objects ({named} named); "
+        f"{result.counts.encoded_summary()}; "
         f"{result.counts.crops} of {result.counts.crops_total} crops encoded"
     )
     if truth is not None:

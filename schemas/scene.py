@@ -6,6 +6,7 @@ import msgspec
 import numpy as np
 
 from schemas.codec import Message, Shape
+from schemas.objects import SceneObject
 from schemas.regions import Region
 
 _NO_IDS = msgspec.field(default_factory=lambda: np.zeros(0, np.int64))
@@ -54,6 +55,7 @@ class Scene(Message, frozen=True, kw_only=True):
     clearances_m: Annotated[np.ndarray, Shape("float32", "edge")]
     trajectory: Annotated[np.ndarray, Shape("float32", "frame", 3)]  # camera centres of the keyframes, world
     predicted_ids: Annotated[np.ndarray, Shape("int64", "predicted")] = _NO_IDS  # places whose label is a prediction
+    objects: list[SceneObject] = []
     # Frontiers and 2D places, as in PlaceDelta.
     frontier_ids: Annotated[np.ndarray, Shape("int64", "frontier")] = _NO_IDS
     frontier_directions: Annotated[np.ndarray, Shape("float32", "frontier", 3)] = _NO_POINTS

@@ -14,7 +14,7 @@ from typing import Literal
 from schemas.codec import Message
 from schemas.features import Backfill, Pyramid, TextEmbeddings, TextRequest
 from schemas.frames import ArchiveReply, ArchiveRequest, CameraState, IngestState, Keyframe, PoseUpdate
-from schemas.objects import Detections
+from schemas.objects import Detections, ObjectDelta
 from schemas.places import MapRequest, PlaceDelta, SnapshotRequest, VoxelMap
 from schemas.priors import (
     Prior,
@@ -94,6 +94,7 @@ PRIOR_REVISION = Topic(
     "PRIOR_REVISION", PriorRevision, f"{ROOT}/fleet/prior_revision", "every", 0.001, recorded=True, cache=1
 )
 REGION_DELTA = Topic("REGION_DELTA", RegionDelta, f"{ROOT}/{{robot}}/regions", "every", 2, recorded=True, cache=256)
+OBJECT_DELTA = Topic("OBJECT_DELTA", ObjectDelta, f"{ROOT}/{{robot}}/objects", "every", 1, recorded=True, cache=256)
 SCENE_REVISION = Topic("SCENE_REVISION", SceneRevision, f"{ROOT}/{{robot}}/scene", "latest", 4, recorded=False)
 JOURNAL = Topic("JOURNAL", Consumed, f"{ROOT}/{{robot}}/journal", "every", 20, recorded=True, cache=1024)
 
@@ -113,6 +114,7 @@ TOPICS = (
     PRIOR_EVIDENCE,
     PRIOR_REVISION,
     REGION_DELTA,
+    OBJECT_DELTA,
     SCENE_REVISION,
     JOURNAL,
 )
@@ -121,13 +123,25 @@ ARCHIVE = Query("ARCHIVE", ArchiveRequest, ArchiveReply, f"{ROOT}/{{robot}}/ask/
 PLACE_SNAPSHOT = Query("PLACE_SNAPSHOT", SnapshotRequest, PlaceDelta, f"{ROOT}/{{robot}}/ask/places")
 VOXEL_MAP = Query("VOXEL_MAP", MapRequest, VoxelMap, f"{ROOT}/{{robot}}/ask/voxels")
 REGION_SNAPSHOT = Query("REGION_SNAPSHOT", SnapshotRequest, RegionDelta, f"{ROOT}/{{robot}}/ask/regions")
+OBJECT_SNAPSHOT = Query("OBJECT_SNAPSHOT", SnapshotRequest, ObjectDelta, f"{ROOT}/{{robot}}/ask/objects")
 POSTERIOR = Query("POSTERIOR", PosteriorRequest, PosteriorReply, f"{ROOT}/{{robot}}/ask/posterior")
 TASK_IN_FORCE = Query("TASK_IN_FORCE", TaskRequest, TaskInForce, f"{ROOT}/{{robot}}/ask/task")
 SCENE = Query("SCENE", SceneRequest, Scene, f"{ROOT}/{{robot}}/ask/scene")
 TEXT = Query("TEXT", TextRequest, TextEmbeddings, f"{ROOT}/encoder/{{space}}/text")
 PRIORS = Query("PRIORS", PriorRequest, PriorList, f"{ROOT}/fleet/ask/prior")
 
-QUERIES = (ARCHIVE, PLACE_SNAPSHOT, VOXEL_MAP, REGION_SNAPSHOT, POSTERIOR, TASK_IN_FORCE, SCENE, TEXT, PRIORS)
+QUERIES = (
+    ARCHIVE,
+    PLACE_SNAPSHOT,
+    VOXEL_MAP,
+    REGION_SNAPSHOT,
+    OBJECT_SNAPSHOT,
+    POSTERIOR,
+    TASK_IN_FORCE,
+    SCENE,
+    TEXT,
+    PRIORS,
+)
 
 STATUS = Query("STATUS", StatusRequest, ServiceStatus, f"{ROOT}/status")
 

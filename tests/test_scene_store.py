@@ -446,6 +446,7 @@ def test_a_file_of_the_former_layout_is_upgraded(tmp_path):
         sql.execute("ALTER TABLE regions DROP COLUMN message")
         sql.execute("ALTER TABLE beliefs DROP COLUMN predicted")
         sql.execute("DROP TABLE place_details")
+        sql.execute("DROP TABLE objects")
         sql.execute("PRAGMA user_version = 1")
     again = Store(path)
     assert encode(again.scene()) == encode(before)

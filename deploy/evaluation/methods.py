@@ -18,6 +18,7 @@ from deploy.evaluation.metrics import GroundTruth
 from deploy.evaluation.perception import ROBOT, EvaluationError, Perception
 from schemas.codec import Message
 from schemas.features import Pyramid, TextEmbeddings, TextRequest
+from schemas.objects import ObjectDelta
 from schemas.places import PlaceDelta
 from schemas.priors import Prior, Task
 from schemas.regions import RegionDelta
@@ -104,8 +105,11 @@ class Segmenter:
                 store.note_cameras(self._graph, message)
             for output in list(BY_NAME["segmenter"].step(self.state, message, self.config)):
                 if not isinstance(output, Ask):
-                    assert isinstance(output[1], RegionDelta)
-                    store.apply_regions(self._graph, output[1])
+                    if isinstance(output[1], ObjectDelta):
+                        store.apply_objects(self._graph, output[1])
+                    else:
+                        assert isinstance(output[1], RegionDelta)
+                        store.apply_regions(self._graph, output[1])
                 elif isinstance(output.request, TextRequest):
                     waiting.insert(0, self.text(output.request.concepts))
         return store.scene(self._graph)

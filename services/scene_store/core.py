@@ -1,6 +1,6 @@
 """The stored scene graph of each robot: deltas in, one consistent scene out (pure).
 
-Two writers are mirrored independently, the place graph and the regions; they meet only in `scene`. So a belief about a
+Three streams are mirrored independently, places, regions and objects; they meet only in `scene`. So a belief about a
 place that has not arrived yet is kept, and is listed as soon as the place exists.
 """
 
@@ -10,6 +10,7 @@ from typing import Literal, NamedTuple
 import msgspec
 import numpy as np
 
+from schemas.objects import ObjectDelta, SceneObject
 from schemas.places import PlaceDelta
 from schemas.priors import Task
 from schemas.regions import Region, RegionDelta
@@ -86,10 +87,12 @@ class Graph:
     sightings: dict[int, Sighting] = field(default_factory=dict)  # by frame id
     regions: dict[int, Region] = field(default_factory=dict)
     beliefs: dict[int, Belief] = field(default_factory=dict)  # by place id
+    objects: dict[int, SceneObject] = field(default_factory=dict)
     alignment: Alignment = field(default_factory=Alignment)
     task: Task | None = None
     place_cursor: Cursor = field(default_factory=Cursor)
     region_cursor: Cursor = field(default_factory=Cursor)
+    object_cursor: Cursor = field(default_factory=Cursor)
     revision: int = -1
 
 
@@ -105,6 +108,7 @@ class Changes:
     edges: set[Edge] = field(default_factory=set)
     regions: set[int] = field(default_factory=set)
     beliefs: set[int] = field(default_factory=set)
+    objects: set[int] = field(default_factory=set)
 
 
 def apply_places(graph: Graph, delta: PlaceDelta) -> Changes:
@@ -184,6 +188,22 @@ def apply_regions(graph: Graph, delta: RegionDelta) -> Changes:
     return changes
 
 
+def apply_objects(graph: Graph, delta: ObjectDelta) -> Changes:
+    """Apply one object delta, in the order its schema states. A snapshot or a new writer replaces all objects."""
+    changes = Changes(replaced=delta.snapshot or delta.epoch != graph.object_cursor.epoch)
+    if changes.replaced:
+        graph.objects.clear()
+    for gone in [*delta.removed_ids.tolist(), *delta.merged_ids[:, 0].tolist()]:
+        graph.objects.pop(gone, None)
+        changes.objects.add(gone)
+    for entry in delta.objects:
+        graph.objects[entry.id] = entry
+        changes.objects.add(entry.id)
+    graph.object_cursor = Cursor(delta.epoch, delta.revision, delta.stamp_ns)
+    graph.revision += 1
+    return changes
+
+
 def note_cameras(graph: Graph, delta: PlaceDelta) -> dict[int, Sighting]:
     """Camera centres of a delta that are news, by frame id; call it for every delta, whatever its revision.
 
@@ -227,7 +247,7 @@ def scene(graph: Graph) -> Scene:
     source = aligned if graph.region_cursor.epoch >= 0 or graph.task is None else graph.task
     return Scene(
         robot=graph.robot,
-        stamp_ns=max(graph.place_cursor.stamp_ns, graph.region_cursor.stamp_ns),
+        stamp_ns=stamp_ns(graph),
         environment=source.environment,
         task=source.task,
         prior_digest=aligned.prior_digest,
@@ -247,6 +267,7 @@ def scene(graph: Graph) -> Scene:
         predicted_ids=np.array(
             [place for place, belief in zip(ids, beliefs, strict=True) if belief.predicted], np.int64
         ),
+        objects=[graph.objects[number] for number in sorted(graph.objects)],
         **_details(graph),
     )
 
@@ -266,13 +287,18 @@ def _details(graph: Graph) -> dict[str, np.ndarray]:
     }
 
 
+def stamp_ns(graph: Graph) -> int:
+    """When the newest delta was made."""
+    return max(cursor.stamp_ns for cursor in (graph.place_cursor, graph.region_cursor, graph.object_cursor))
+
+
 def revision_of(graph: Graph, store_epoch: int) -> SceneRevision:
     """What the store announces after a delta."""
     return SceneRevision(
         robot=graph.robot,
         epoch=store_epoch,
         revision=graph.revision,
-        stamp_ns=max(graph.place_cursor.stamp_ns, graph.region_cursor.stamp_ns),
+        stamp_ns=stamp_ns(graph),
         places=len(graph.places),
         edges=len(graph.edges),
         regions=len(graph.regions),

@@ -14,13 +14,14 @@ import msgspec
 import numpy as np
 
 from schemas.codec import encode
+from schemas.objects import SceneObject
 from schemas.priors import Prior, Task
 from schemas.regions import Region
 from services.runtime.service import ServiceError
 from services.scene_store import core
 
 APPLICATION_ID = 0x70736753  # "psgS", in the header of the file
-LAYOUT_VERSION = 3
+LAYOUT_VERSION = 4
 
 LAYOUT = """
 CREATE TABLE robots (id INTEGER PRIMARY KEY, name TEXT NOT NULL UNIQUE);
@@ -54,6 +55,10 @@ CREATE TABLE beliefs (
     robot INTEGER NOT NULL REFERENCES robots, place INTEGER NOT NULL,
     region INTEGER NOT NULL, posterior BLOB NOT NULL, unknown REAL NOT NULL, predicted INTEGER NOT NULL DEFAULT 0,
     PRIMARY KEY (robot, place)) WITHOUT ROWID;
+CREATE TABLE objects (
+    robot INTEGER NOT NULL REFERENCES robots, id INTEGER NOT NULL, label TEXT NOT NULL,
+    x_m REAL NOT NULL, y_m REAL NOT NULL, z_m REAL NOT NULL, message BLOB NOT NULL,
+    PRIMARY KEY (robot, id)) WITHOUT ROWID;
 CREATE TABLE tasks (
     robot INTEGER NOT NULL REFERENCES robots, stamp_ns INTEGER NOT NULL,
     environment TEXT NOT NULL, task TEXT NOT NULL, regions TEXT NOT NULL,
@@ -73,6 +78,11 @@ UPGRADES = {  # statements that bring a file of the version before to this one
     3: """CREATE TABLE place_details (
     robot INTEGER NOT NULL REFERENCES robots, place INTEGER NOT NULL, kind TEXT NOT NULL, numbers BLOB NOT NULL,
     PRIMARY KEY (robot, place, kind)) WITHOUT ROWID;
+""",
+    4: """CREATE TABLE objects (
+    robot INTEGER NOT NULL REFERENCES robots, id INTEGER NOT NULL, label TEXT NOT NULL,
+    x_m REAL NOT NULL, y_m REAL NOT NULL, z_m REAL NOT NULL, message BLOB NOT NULL,
+    PRIMARY KEY (robot, id)) WITHOUT ROWID;
 """,
 }
 
@@ -158,6 +168,8 @@ class Database:
         ):
             graph.sightings[frame] = core.Sighting(epoch, revision, tuple(xyz))
         self._load_regions(graph, robot)
+        for number, message in self._select("id, message FROM objects", robot):
+            graph.objects[number] = msgspec.msgpack.decode(message, type=SceneObject)
         for *fields, regions in self._select("stamp_ns, environment, task, regions FROM tasks", robot, "stamp_ns"):
             stamp_ns, environment, task = fields
             core.set_task(
@@ -264,6 +276,16 @@ class Database:
                 ((robot, p, b.region, b.posterior.astype("<f2").tobytes(), b.unknown, b.predicted) for p, b in beliefs),
             )
             self._put_cursor(robot, "region", graph.region_cursor, graph)
+
+    def put_objects(self, graph: core.Graph, changes: core.Changes) -> None:
+        """Make one applied object delta durable."""
+        with self._transaction(graph.robot) as robot:
+            if changes.replaced:
+                self._sql.execute("DELETE FROM objects WHERE robot = ?", (robot,))
+            self._delete("objects", "id", robot, sorted(changes.objects - graph.objects.keys()))
+            kept = (graph.objects[number] for number in sorted(changes.objects & graph.objects.keys()))
+            self._put("objects", ((robot, o.id, o.label, *o.position_m, msgspec.msgpack.encode(o)) for o in kept))
+            self._put_cursor(robot, "object", graph.object_cursor, graph)
 
     def put_cameras(self, robot: str, cameras: dict[int, core.Sighting]) -> None:
         """Keep camera centres of a delta that itself is not applied."""

@@ -6,12 +6,15 @@ from dataclasses import dataclass
 import msgspec
 
 from schemas.codec import Message
+from schemas.objects import ObjectDelta
 from schemas.places import PlaceDelta, SnapshotRequest
 from schemas.priors import Prior, Task, TaskInForce, TaskRequest
 from schemas.regions import RegionDelta
 from schemas.scene import Scene, SceneRequest
 from schemas.status import Tick
 from schemas.topics import (
+    OBJECT_DELTA,
+    OBJECT_SNAPSHOT,
     PLACE_DELTA,
     PLACE_SNAPSHOT,
     PRIOR,
@@ -32,11 +35,12 @@ CHECKPOINT_S = 1.0  # the write-ahead log is folded into the file between deltas
 
 @dataclass
 class Robot:
-    """One robot's graph and where its two writers stand."""
+    """One robot's graph and where its writers stand."""
 
     graph: core.Graph
     places: Follower[PlaceDelta]
     regions: Follower[RegionDelta]
+    objects: Follower[ObjectDelta]
 
 
 @dataclass
@@ -64,6 +68,8 @@ def step(state: State, message: Message, cfg: core.Config) -> Iterator[Output]:
             yield from _take_places(state, message)
         case RegionDelta():
             yield from _take_regions(state, message)
+        case ObjectDelta():
+            yield from _take_objects(state, message)
         case Task():
             if core.set_task(_known(state, message.robot).graph, message):
                 state.database.put_task(message)
@@ -79,6 +85,7 @@ def _resume(state: State) -> Iterator[Output]:
         request = SnapshotRequest(robot=state.resumed.pop(0))
         yield Ask(PLACE_SNAPSHOT, request)
         yield Ask(REGION_SNAPSHOT, request)
+        yield Ask(OBJECT_SNAPSHOT, request)
 
 
 def _take_places(state: State, delta: PlaceDelta) -> Iterator[Output]:
@@ -105,6 +112,16 @@ def _take_regions(state: State, delta: RegionDelta) -> Iterator[Output]:
         yield Ask(REGION_SNAPSHOT, SnapshotRequest(robot=delta.robot))
 
 
+def _take_objects(state: State, delta: ObjectDelta) -> Iterator[Output]:
+    robot = _known(state, delta.robot)
+    for due in robot.objects.take(delta):
+        changes = core.apply_objects(robot.graph, due)
+        state.database.put_objects(robot.graph, changes)
+        yield SCENE_REVISION, core.revision_of(robot.graph, state.epoch)
+    if robot.objects.needs_snapshot:
+        yield Ask(OBJECT_SNAPSHOT, SnapshotRequest(robot=delta.robot))
+
+
 def _known(state: State, robot: str) -> Robot:
     if robot not in state.robots:
         state.robots[robot] = _robot(core.Graph(robot))
@@ -112,8 +129,10 @@ def _known(state: State, robot: str) -> Robot:
 
 
 def _robot(graph: core.Graph) -> Robot:
-    places, regions = graph.place_cursor, graph.region_cursor
-    return Robot(graph, Follower(places.epoch, places.revision), Follower(regions.epoch, regions.revision))
+    places, regions, objects = (
+        (cursor.epoch, cursor.revision) for cursor in (graph.place_cursor, graph.region_cursor, graph.object_cursor)
+    )
+    return Robot(graph, Follower(*places), Follower(*regions), Follower(*objects))
 
 
 def answer_scene(state: State, request: SceneRequest, cfg: core.Config) -> Scene:
@@ -140,10 +159,10 @@ SERVICE = Service(
     config=core.Config,
     init=init,
     step=step,
-    reads=(PLACE_DELTA, REGION_DELTA, TASK, PRIOR),
+    reads=(PLACE_DELTA, REGION_DELTA, OBJECT_DELTA, TASK, PRIOR),
     writes=(SCENE_REVISION,),
     answers={SCENE: answer_scene, TASK_IN_FORCE: answer_task},
-    asks=(PLACE_SNAPSHOT, REGION_SNAPSHOT),
+    asks=(PLACE_SNAPSHOT, REGION_SNAPSHOT, OBJECT_SNAPSHOT),
     tick_s=CHECKPOINT_S,
     close=close,
     replay_config=lambda cfg: msgspec.structs.replace(cfg, path=":memory:"),

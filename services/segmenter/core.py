@@ -1,7 +1,7 @@
 """Segmentation: places in, regions out (paper, Global Inference via Graph Cuts; pure).
 
 One input at a time: `update` takes a message, changes the state and yields what is to be sent: the delta of regions and
-beliefs, and requests for what is missing (a place snapshot, text embeddings, a prior).
+beliefs, that of objects, and requests for what is missing (a place snapshot, text embeddings, a prior).
 """
 
 from collections.abc import Iterator
@@ -13,11 +13,12 @@ import numpy as np
 from schemas.codec import Message, copied, encode
 from schemas.features import Pyramid, TextEmbeddings, TextRequest
 from schemas.frames import PoseUpdate
+from schemas.objects import Detections, ObjectDelta
 from schemas.places import PlaceDelta, SnapshotRequest
 from schemas.priors import Prior, PriorEvidence, PriorList, PriorRequest, Task, TaskInForce, TaskRequest
 from schemas.regions import RegionDelta
 from schemas.status import Tick
-from services.segmenter import descriptors, geometry, observed, spaces
+from services.segmenter import descriptors, geometry, naming, objects, observed, spaces
 from services.segmenter.experts.context import ObjectView
 from services.segmenter.graph import apply
 from services.segmenter.inference import (
@@ -26,6 +27,7 @@ from services.segmenter.inference import (
     edge_weights,
     evaluate_experts,
     partition,
+    see_objects,
     settle,
     with_neighbours,
 )
@@ -34,12 +36,14 @@ from services.segmenter.state import Alignment, Config, State
 
 
 def update(state: State, message: Message, cfg: Config) -> Iterator[Message]:
-    """Take one input. Yields RegionDelta when something changed, and requests for what is missing."""
+    """Take one input. Yields RegionDelta or ObjectDelta when something changed, and requests for what is missing."""
     match message:
         case PlaceDelta():
             follow_places(state, message, cfg)
         case Pyramid():
             observe(state, message, cfg)
+        case Detections():
+            detect(state, message, cfg)
         case PoseUpdate():
             correct_poses(state, message, cfg)
         case Task():
@@ -62,6 +66,8 @@ def update(state: State, message: Message, cfg: Config) -> Iterator[Message]:
             yield from follow_spaces(state, cfg)
     switched = align(state, cfg)
     yield from _requests(state, cfg)
+    if switched or isinstance(message, Tick):
+        yield from follow_objects(state, cfg)
     if switched or (state.dirty and isinstance(message, Pyramid | Tick)):
         yield from _segment(state, switched, isinstance(message, Tick), cfg)
     if isinstance(message, Tick):
@@ -114,6 +120,42 @@ def observe(state: State, pyramid: Pyramid, cfg: Config) -> None:
     state.dirty = True
 
 
+def detect(state: State, detections: Detections, cfg: Config) -> None:
+    """Associate one frame's detections; those of a space that is not in force wait for it, if it may take over."""
+    if detections.space != state.spaces.force and not cfg.spaces.follow:
+        return
+    if detections.frame_id in state.poses:
+        pose = state.poses[detections.frame_id]
+        detections = msgspec.structs.replace(detections, world_from_camera=pose)
+    if objects.observe(state.tracks, detections, cfg.tracking):
+        state.stamp_ns = max(state.stamp_ns, detections.stamp_ns)
+
+
+def follow_objects(state: State, cfg: Config) -> Iterator[ObjectDelta]:
+    """Tell what became of the objects, and let the experts see it. Names wait for the text of the prior's objects."""
+    tracks, alignment = state.tracks, state.alignment
+    if tracks.moved or tracks.space != state.spaces.force:
+        objects.renew(tracks, state.spaces.force, cfg.tracking)
+    prior = None if alignment is None else alignment.prior
+    text = None if prior is None else state.texts.get(_concept_key(state.spaces.force, object_concepts(prior)))
+    if not tracks.changed or (text is None and prior is not None and prior.objects and tracks.items):
+        return
+    now = naming.named(tracks, prior, text, cfg.tracking)
+    digest = "" if alignment is None else alignment.digest
+    ledger = state.object_ledger
+    delta = ledger.tell(state.robot, state.epoch, state.stamp_ns, now=now, merged=tracks.merged, digest=digest)
+    tracks.merged, tracks.changed = [], False
+    if delta is not None:
+        if alignment is not None:
+            see_objects(state, ledger.view(), cfg)
+        yield delta
+
+
+def object_concepts(prior: Prior) -> list[list[str]]:
+    """The phrases that describe each of the prior's objects."""
+    return [list(item.phrases) for item in prior.objects]
+
+
 def correct_poses(state: State, poses: PoseUpdate, cfg: Config) -> None:
     """Re-anchor frames, and integrate afresh the places that they saw from the old pose or see from the new one.
 
@@ -126,6 +168,7 @@ def correct_poses(state: State, poses: PoseUpdate, cfg: Config) -> None:
     for frame_id, world_from_camera in zip(poses.frame_ids.tolist(), poses.world_from_camera, strict=True):
         state.poses[frame_id] = world_from_camera.copy()
         spaces.move(state.spaces, frame_id, world_from_camera)
+        objects.move(state.tracks, frame_id, world_from_camera)
         for frame in state.archive.move(frame_id, world_from_camera) or ():
             affected[descriptors.visible(frame, state.graph.positions_m, cfg.kernel)] = True
     if affected.any():
@@ -182,7 +225,7 @@ def take_text(state: State, text: TextEmbeddings, cfg: Config) -> None:
     asked = state.asked_text.pop(text.space, None)
     if asked is not None and len(text.embeddings) == len(asked.concepts):
         state.texts[_concept_key(text.space, asked.concepts)] = copied(text)
-        while len(state.texts) > cfg.remembered_priors:
+        while len(state.texts) > 2 * cfg.remembered_priors:  # regions and objects of each
             del state.texts[next(iter(state.texts))]
 
 
@@ -215,6 +258,7 @@ def align(state: State, cfg: Config) -> bool:
     state.bias, state.compared = np.zeros(len(prior.regions)), len(state.graph.ids)
     if len(prior.objects) != state.objects.concepts.shape[1] or former is not None:
         state.objects = ObjectView()  # its columns are the former prior's objects
+    state.tracks.changed = True
     return True
 
 
@@ -276,6 +320,10 @@ def _requests(state: State, cfg: Config) -> Iterator[Message]:
             yield PriorRequest(environment=task.environment, task=task.task, regions=task.regions)
         return
     if state.alignment is not None and state.alignment.digest == wanted[0]:
+        concepts = object_concepts(state.alignment.prior)
+        missing = _concept_key(state.spaces.force, concepts) not in state.texts
+        if concepts and state.tracks.items and missing:
+            yield from _text_request(state, state.spaces.force, concepts)
         return
     concepts = region_concepts(wanted[1], cfg.object_phrases)
     yield from _text_request(state, state.spaces.force, concepts)

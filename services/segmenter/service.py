@@ -1,14 +1,18 @@
-"""Reads places, pyramids, corrected poses, tasks and priors; writes regions and beliefs."""
+"""Reads places, pyramids, detections, corrected poses, tasks and priors; writes regions, beliefs and objects."""
 
 from collections.abc import Iterator
 
 from schemas.codec import Message
 from schemas.features import Backfill, TextRequest
+from schemas.objects import ObjectDelta
 from schemas.places import SnapshotRequest
 from schemas.priors import PriorEvidence, PriorRequest, TaskRequest
 from schemas.regions import PosteriorReply, PosteriorRequest, RegionDelta
 from schemas.topics import (
     BACKFILL,
+    DETECTIONS,
+    OBJECT_DELTA,
+    OBJECT_SNAPSHOT,
     PLACE_DELTA,
     PLACE_SNAPSHOT,
     POSE_UPDATE,
@@ -33,7 +37,12 @@ QUESTIONS = {
     PriorRequest: PRIORS,
     TaskRequest: TASK_IN_FORCE,
 }
-PUBLISHED = {RegionDelta: REGION_DELTA, Backfill: BACKFILL, PriorEvidence: PRIOR_EVIDENCE}
+PUBLISHED = {
+    RegionDelta: REGION_DELTA,
+    ObjectDelta: OBJECT_DELTA,
+    Backfill: BACKFILL,
+    PriorEvidence: PRIOR_EVIDENCE,
+}
 
 
 def init(cfg: Config, identity: Identity) -> State:
@@ -53,6 +62,11 @@ def answer_snapshot(state: State, request: SnapshotRequest, cfg: Config) -> Regi
     return report.snapshot(state)
 
 
+def answer_objects(state: State, request: SnapshotRequest, cfg: Config) -> ObjectDelta:
+    """All objects published so far."""
+    return state.object_ledger.snapshot(state.robot, state.epoch)
+
+
 def answer_posterior(state: State, request: PosteriorRequest, cfg: Config) -> PosteriorReply:
     """Why a place carries its label."""
     return report.explain(state, request, cfg)
@@ -65,9 +79,9 @@ SERVICE = Service(
     config=Config,
     init=init,
     step=step,
-    reads=(PLACE_DELTA, PYRAMID, POSE_UPDATE, TASK, PRIOR),
-    writes=(REGION_DELTA, BACKFILL, PRIOR_EVIDENCE),
+    reads=(PLACE_DELTA, PYRAMID, DETECTIONS, POSE_UPDATE, TASK, PRIOR),
+    writes=(REGION_DELTA, OBJECT_DELTA, BACKFILL, PRIOR_EVIDENCE),
     asks=(PLACE_SNAPSHOT, TEXT, PRIORS, TASK_IN_FORCE),
-    answers={REGION_SNAPSHOT: answer_snapshot, POSTERIOR: answer_posterior},
+    answers={REGION_SNAPSHOT: answer_snapshot, OBJECT_SNAPSHOT: answer_objects, POSTERIOR: answer_posterior},
     tick_s=0.5,
 )

@@ -10,7 +10,7 @@ from schemas.places import PlaceDelta
 from schemas.priors import Prior, PriorEvidence, Task
 from schemas.regions import Region
 from services.deltas import Follower
-from services.segmenter import descriptors, publication
+from services.segmenter import descriptors, naming, objects, publication
 from services.segmenter.balance import BalanceConfig
 from services.segmenter.experts import REGISTRY
 from services.segmenter.experts.context import ObjectSettings, ObjectView
@@ -34,6 +34,7 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
     )
     geometry: GeometryConfig = msgspec.field(default_factory=GeometryConfig)
     objects: ObjectSettings = msgspec.field(default_factory=ObjectSettings)
+    tracking: objects.TrackingConfig = msgspec.field(default_factory=objects.TrackingConfig)
     beta: float = 2.0  # weight of the pairwise term (paper)
     edge_decay_m: float = 2.0  # w_dist = exp(-length / edge_decay_m)
     edge_sum: float = 3.0  # sum of w_dist at a place, whatever the graph's density and scale; 0 = w_dist as it is
@@ -100,6 +101,8 @@ class State:
     pose_revisions: dict[int, int] = field(default_factory=dict)  # of the newest correction by the epoch of its writer
     places: Places = field(default_factory=Places.none)
     objects: ObjectView = field(default_factory=ObjectView)
+    tracks: objects.Tracks = field(default_factory=objects.Tracks)
+    object_ledger: naming.ObjectLedger = field(default_factory=naming.ObjectLedger)
     task: Task | None = None
     priors: dict[str, Prior] = field(default_factory=dict)  # by digest, latest arrival last
     texts: dict[tuple[str, ...], TextEmbeddings] = field(default_factory=dict)  # by space and concepts
@@ -131,4 +134,5 @@ def empty(cfg: Config, robot: str, epoch: int) -> State:
         query_radius_m=cfg.default_query_radius_m,
         spaces=Spaces(cfg.space),
         solver=Solver(cfg.solver),
+        tracks=objects.Tracks(cfg.space),
     )

@@ -16,12 +16,19 @@ class ObjectView:
     ids: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))  # (object,) that last
     positions_m: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))  # (object, 3) world
     concepts: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))  # (object, concept) P(c | o), rows sum to 1
+    weights: np.ndarray | None = None  # (object,) of its word, in [0, 1]; None = 1 each
+
+    @property
+    def words(self) -> np.ndarray:
+        """Weight (object,) of each object's word."""
+        return np.ones(len(self.ids)) if self.weights is None else self.weights
 
     def changed_m(self, before: "ObjectView") -> np.ndarray:
         """Where objects (n, 3) are new, gone or different against `before`; of moved ones both positions."""
         _, here, there = np.intersect1d(self.ids, before.ids, assume_unique=True, return_indices=True)
         same_columns = self.concepts.shape[1] == before.concepts.shape[1]
         same = (self.positions_m[here] == before.positions_m[there]).all(axis=1) & same_columns
+        same &= self.words[here] == before.words[there]
         if same_columns:
             same &= (self.concepts[here] == before.concepts[there]).all(axis=1)
         kept, was = np.zeros(len(self.ids), dtype=bool), np.zeros(len(before.ids), dtype=bool)

@@ -11,7 +11,8 @@ def objects(context: Context) -> tuple[np.ndarray, np.ndarray]:
     """Proximity-discounted max-pool of P(r | o) over the objects within reach (paper, The Object Expert).
 
     Confidence is the pooled mass. Each object's P(r | o) sums to one, so one object gives its proximity weight; several
-    that speak for different regions can add up to more, while a confidence ends at 1: the mass is cut there.
+    that speak for different regions can add up to more, while a confidence ends at 1: the mass is cut there. An object
+    of which it is unsure whether it is any of the prior's weighs less.
     """
     settings, view = context.object_settings, context.objects
     count, labels = len(context.frames), len(context.prior.regions)
@@ -19,7 +20,7 @@ def objects(context: Context) -> tuple[np.ndarray, np.ndarray]:
     pooled = np.zeros((count, labels))
     if len(places):
         evidence = (view.concepts @ region_of_concept(context.prior))[found]
-        evidence *= np.exp(-distances_m / settings.decay_m)[:, None]
+        evidence *= (np.exp(-distances_m / settings.decay_m) * view.words[found])[:, None]
         anchored, first = np.unique(places, return_index=True)
         pooled[anchored] = np.maximum.reduceat(evidence, first, axis=0)
     mass = pooled.sum(axis=1)

@@ -1,0 +1,155 @@
+"""What the objects of the map are, in the prior's terms, and what followers have been told of them (pure)."""
+
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from schemas.features import TextEmbeddings
+from schemas.objects import ObjectDelta, SceneObject
+from schemas.priors import Prior
+from services.segmenter.experts.context import ObjectView, standardised
+from services.segmenter.objects import Track, TrackingConfig, Tracks, descriptor
+
+VISIBLE_CHANGE = 0.02  # smaller changes of a probability are not sent
+
+
+class Named(NamedTuple):
+    """One object as told, its belief over the prior's objects, and the weight of its word."""
+
+    entry: SceneObject
+    concepts: np.ndarray  # (concept,) sums to 1
+    weight: float
+
+
+@dataclass
+class ObjectLedger:
+    """What followers know."""
+
+    told: dict[int, Named] = field(default_factory=dict)
+    digest: str = ""
+    revision: int = -1
+    stamp_ns: int = 0
+
+    def view(self) -> ObjectView:
+        """The objects that carry a label, for the experts."""
+        named = [item for item in self.told.values() if item.entry.label]
+        return ObjectView(
+            ids=np.array([item.entry.id for item in named], np.int64),
+            positions_m=np.array([item.entry.position_m for item in named]).reshape(-1, 3),
+            concepts=np.array([item.concepts for item in named]).reshape(len(named), -1),
+            weights=np.array([item.weight for item in named]),
+        )
+
+    def snapshot(self, robot: str, epoch: int) -> ObjectDelta:
+        """Everything told so far; before the first delta, the empty state that it follows on."""
+        return self._delta(robot, epoch, [item.entry for _, item in sorted(self.told.items())], snapshot=True)
+
+    def tell(
+        self,
+        robot: str,
+        epoch: int,
+        stamp_ns: int,
+        *,
+        now: dict[int, Named],
+        merged: list[tuple[int, int]],
+        digest: str,
+    ) -> ObjectDelta | None:
+        """The delta from what is known to what is so; None when nothing changed visibly."""
+        known = self.told if digest == self.digest else {}
+        upserts = [item for number, item in now.items() if number not in known or _differs(item, known[number])]
+        heirs = dict(merged)
+        joined = []
+        for gone in sorted(self.told.keys() & heirs.keys() - now.keys()):
+            into = heirs[gone]
+            while into not in now and into in heirs:
+                into = heirs[into]
+            joined += [(gone, into)] if into in now else []
+        removed = sorted(self.told.keys() - now.keys() - {gone for gone, _ in joined})
+        if not (upserts or joined or removed):
+            return None
+        self.told = {number: known.get(number, item) for number, item in now.items()}
+        self.told |= {item.entry.id: item for item in upserts}
+        self.digest, self.revision, self.stamp_ns = digest, self.revision + 1, stamp_ns
+        return self._delta(robot, epoch, [item.entry for item in upserts], removed, joined)
+
+    def _delta(
+        self,
+        robot: str,
+        epoch: int,
+        entries: list[SceneObject],
+        removed: list[int] | None = None,
+        joined: list[tuple[int, int]] | None = None,
+        *,
+        snapshot: bool = False,
+    ) -> ObjectDelta:
+        return ObjectDelta(
+            robot=robot,
+            epoch=epoch,
+            revision=self.revision,
+            stamp_ns=self.stamp_ns,
+            prior_digest=self.digest,
+            snapshot=snapshot,
+            objects=entries,
+            removed_ids=np.array(removed or [], np.int64),
+            merged_ids=np.array(joined or [], np.int64).reshape(-1, 2),
+        )
+
+
+def named(tracks: Tracks, prior: Prior | None, text: TextEmbeddings | None, cfg: TrackingConfig) -> dict[int, Named]:
+    """Every object that was seen often enough; without a prior and its text, none has a label."""
+    items = [track for track in tracks.items.values() if track.frames >= cfg.min_frames]
+    if not items:
+        return {}
+    if prior is None or text is None:
+        return {track.id: Named(_entry(track, "", 0.0, 0.0, cfg), np.zeros(0), 0.0) for track in items}
+    found = np.array([descriptor(track.embeddings) for track in items])
+    concepts, known = beliefs(found, np.array([track.prompted for track in items]), text)
+    result = {}
+    for track, row, sure in zip(items, concepts, known.tolist(), strict=True):
+        best = int(row.argmax())
+        label = prior.objects[best].name if sure >= cfg.known_least else ""
+        weight = sure * (1.0 if track.prompted else cfg.unprompted_weight)
+        result[track.id] = Named(_entry(track, label, float(row[best]), sure, cfg), row, weight)
+    return result
+
+
+def beliefs(found: np.ndarray, prompted: np.ndarray, text: TextEmbeddings) -> tuple[np.ndarray, np.ndarray]:
+    """P(c | o) (object, concept), rows sum to 1, and the probability (object,) that it is any of the concepts.
+
+    A softmax of the standardised similarities with the space's null class beside them, as the visual expert's. An
+    object of a prompted detector is one of the concepts by construction: it has no null class.
+    """
+    scores = text.temperature * standardised(found, text)
+    shift = scores.max(axis=1, keepdims=True)
+    odds = np.exp(scores - shift)
+    total = odds.sum(axis=1)
+    null = np.where(prompted, 0.0, np.exp(np.minimum(text.temperature * text.null_score - shift[:, 0], 700.0)))
+    return odds / total[:, None], total / (total + null)
+
+
+def _entry(track: Track, label: str, probability: float, known: float, cfg: TrackingConfig) -> SceneObject:
+    low_m, high_m = np.round(track.box_m(cfg.cell_m), 3)
+    return SceneObject(
+        id=track.id,
+        label=label,
+        probability=round(probability, 3),
+        known=round(known, 3),
+        position_m=tuple(np.round((low_m + high_m) / 2, 3).tolist()),
+        min_m=tuple(low_m.tolist()),
+        max_m=tuple(high_m.tolist()),
+        frames=track.frames,
+    )
+
+
+def _differs(now: Named, before: Named) -> bool:
+    """Whether somebody who looks would see it; a number of frames counts when it has doubled."""
+    one, other = now.entry, before.entry
+    return (
+        (one.label, one.min_m, one.max_m) != (other.label, other.min_m, other.max_m)
+        or abs(one.probability - other.probability) > VISIBLE_CHANGE
+        or abs(one.known - other.known) > VISIBLE_CHANGE
+        or one.frames >= 2 * other.frames
+        or one.frames < other.frames
+        or len(now.concepts) != len(before.concepts)
+    )

@@ -1,0 +1,273 @@
+"""Objects of the map: detections associated over time (paper, eq. temporal_fusion_objects; pure).
+
+A detection's points, moved into the world, fill cells of a grid. It belongs to the object whose cells it shares, the
+descriptor deciding between several; objects that come to share most of their cells become one, the older stays. An
+object seen once, and not again although several later frames looked at it, was none.
+
+Detections stay in an archive, without their images: a corrected pose, or another embedding space, associates them
+afresh. An object then keeps the id under which most of its detections were known.
+"""
+
+from dataclasses import dataclass, field
+
+import msgspec
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from schemas.codec import copied
+from schemas.objects import Detections
+from services.geometry import inverse, transform
+from services.segmenter import descriptors
+
+AXIS_BITS = 21  # of a cell's number for each axis: 200 km of 0.1 m cells
+_STEPS = np.stack(np.meshgrid(*[(-1, 0, 1)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+AROUND = (_STEPS[:, 0] << 2 * AXIS_BITS) + (_STEPS[:, 1] << AXIS_BITS) + _STEPS[:, 2]  # a cell and its 26 neighbours
+
+
+class TrackingConfig(msgspec.Struct, frozen=True, kw_only=True):
+    """How detections become objects, and how loudly these speak; the paper leaves these values open."""
+
+    cell_m: float = 0.15  # grid of an object's surface; surfaces one cell apart count as the same
+    match_overlap: float = 0.5  # of a detection and an object: least share of one in the other
+    match_part: float = 0.1  # and least share the other way round: a cup on a table is not the table
+    descriptor_weight: float = 0.5  # of the cosine similarity against the overlap, between several candidates
+    merge_overlap: float = 0.6  # mean of both shares from which two objects are one
+    min_frames: int = 2  # keyframes that must have detected an object
+    patience_frames: int = 5  # later frames that look at it in vain, after which one seen in fewer is dropped
+    max_depth_m: float = 6.0  # frames farther away do not count as looking
+    observations: int = 32  # embeddings kept per object, the newest
+    archive_frames: int = 2000  # frames whose detections are kept, over all spaces, the newest
+    known_least: float = 0.5  # probability of being any of the prior's objects from which one carries a label
+    unprompted_weight: float = 0.0  # of objects of a detector that does not know the prior, in the object expert
+
+    def __post_init__(self) -> None:
+        if not (self.cell_m > 0 and self.min_frames >= 1 and self.observations >= 1 and self.archive_frames >= 1):
+            raise ValueError("cell_m, min_frames, observations and archive_frames must be positive")
+        if not (0 < self.match_overlap <= 1 and 0 <= self.match_part <= 1 and 0 < self.merge_overlap <= 1):
+            raise ValueError("match_overlap, match_part and merge_overlap are shares")
+        if not (0 <= self.known_least <= 1 and 0 <= self.unprompted_weight <= 1):
+            raise ValueError("known_least and unprompted_weight lie in [0, 1]")
+
+
+@dataclass
+class Track:
+    """One object."""
+
+    id: int
+    cells: np.ndarray  # (cell,) int64, sorted
+    hits: np.ndarray  # (cell,) detections that touched it
+    embeddings: list[np.ndarray]  # (dim,) float16 each, the newest last
+    sources: set[tuple[str, int, int]]  # detector, frame id and number of each detection
+    prompted: bool  # whether a detector that was asked for the prior's objects found it
+    missed: int = 0  # frames that looked at it in vain
+
+    @property
+    def frames(self) -> int:
+        """Keyframes in which it was detected."""
+        return len({frame for _, frame, _ in self.sources})
+
+    def box_m(self, cell_m: float) -> np.ndarray:
+        """Corners (2, 3) of the box around its cells; those touched once are left out of one seen three times."""
+        solid = self.cells[self.hits > 1] if self.frames > 2 and (self.hits > 1).any() else self.cells
+        numbers = unpacked(solid)
+        return np.stack((numbers.min(axis=0), numbers.max(axis=0) + 1)) * cell_m
+
+
+@dataclass
+class Tracks:
+    """All objects, and the detections they were made from."""
+
+    space: str = ""  # of the detections that the objects are made from
+    items: dict[int, Track] = field(default_factory=dict)  # by id
+    archive: dict[tuple[str, str, int], Detections] = field(default_factory=dict)  # by space, detector and frame id
+    next_id: int = 0
+    merged: list[tuple[int, int]] = field(default_factory=list)  # (gone, into) since they were last told
+    moved: bool = False  # a pose in the archive was corrected since the last association
+    changed: bool = False  # since they were last told
+
+
+def observe(tracks: Tracks, detections: Detections, cfg: TrackingConfig) -> bool:
+    """Keep one frame's detections, and associate them if they are of the space in force; False for a repeat."""
+    key = (detections.space, detections.detector, detections.frame_id)
+    if key in tracks.archive:
+        return False
+    tracks.archive[key] = kept = copied(detections)
+    if len(tracks.archive) > cfg.archive_frames:
+        del tracks.archive[next(iter(tracks.archive))]
+    if detections.space == tracks.space and not tracks.moved:
+        associate(tracks, kept, cfg)
+    return True
+
+
+def move(tracks: Tracks, frame_id: int, world_from_camera: np.ndarray) -> None:
+    """Give a frame its corrected pose; `renew` then associates afresh."""
+    for key, kept in tracks.archive.items():
+        if key[2] == frame_id:
+            tracks.archive[key] = msgspec.structs.replace(kept, world_from_camera=world_from_camera.copy())
+            tracks.moved = True
+
+
+def renew(tracks: Tracks, space: str, cfg: TrackingConfig) -> None:
+    """Associate all stored detections of a space afresh; ids last by the detections that objects share."""
+    fresh = Tracks(space=space)
+    for (kept_space, _, _), detections in tracks.archive.items():
+        if kept_space == space:
+            associate(fresh, detections, cfg)
+    heirs = _heirs(list(tracks.items.values()), list(fresh.items.values()))
+    items = {}
+    for track in fresh.items.values():
+        former = [old for old, heir in heirs.items() if heir == track.id]
+        best = max(former, key=lambda old: (len(tracks.items[old].sources & track.sources), -old), default=None)
+        number = tracks.next_id if best is None else best
+        tracks.next_id += best is None
+        tracks.merged += [(old, number) for old in former if old != best]
+        track.id = number
+        items[number] = track
+    tracks.space, tracks.items, tracks.moved, tracks.changed = space, dict(sorted(items.items())), False, True
+
+
+def _heirs(before: list[Track], after: list[Track]) -> dict[int, int]:
+    """The new object that holds most of each former one's detections, by id."""
+    holder = {source: track.id for track in after for source in track.sources}
+    heirs = {}
+    for track in before:
+        held = [holder[source] for source in track.sources if source in holder]
+        if held:
+            heirs[track.id] = max(sorted(set(held)), key=held.count)
+    return heirs
+
+
+def associate(tracks: Tracks, detections: Detections, cfg: TrackingConfig) -> None:
+    """One frame's detections join objects or begin new ones; then merge, and drop what nobody saw again."""
+    seen = _clouds(detections, cfg.cell_m)
+    joined = _matches(tracks, detections, seen, cfg)
+    touched = []
+    for index, cells in enumerate(seen):
+        source = {(detections.detector, detections.frame_id, index)}
+        news = Track(-1, cells, np.ones_like(cells), [detections.embeddings[index]], source, detections.prompted)
+        track = tracks.items.get(joined.get(index, -1))
+        if track is None:
+            news.id, track = tracks.next_id, news
+            tracks.items[news.id], tracks.next_id = news, tracks.next_id + 1
+        else:
+            _extend(track, news, cfg)
+        touched.append(track.id)
+    _merge(tracks, touched, cfg)
+    _forget(tracks, detections, set(touched), cfg)
+    tracks.changed = True
+
+
+def _clouds(detections: Detections, cell_m: float) -> list[np.ndarray]:
+    """The cells (cell,) that each detection's points fill in the world."""
+    points_m = transform(detections.world_from_camera, detections.points_camera_m.astype(np.float64))
+    clouds = np.split(packed(np.floor(points_m / cell_m).astype(np.int64)), np.cumsum(detections.point_counts)[:-1])
+    return [np.unique(cells) for cells in clouds[: len(detections.point_counts)]]
+
+
+def _matches(tracks: Tracks, detections: Detections, seen: list[np.ndarray], cfg: TrackingConfig) -> dict[int, int]:
+    """Object id by detection: at most one each, the sum of overlap and similarity as large as possible."""
+    items = list(tracks.items.values())
+    scores = np.zeros((len(seen), len(items)))
+    for column, track in enumerate(items):
+        for row, cells in enumerate(seen):
+            if not _close(cells, track.cells):
+                continue
+            shares = shared(cells, track.cells), shared(track.cells, cells)
+            if max(shares) >= cfg.match_overlap and min(shares) >= cfg.match_part:
+                cosine = float(descriptor(track.embeddings) @ detections.embeddings[row].astype(np.float64))
+                scores[row, column] = max(shares) + cfg.descriptor_weight * (1 + cosine) + 1e-9
+    rows, columns = linear_sum_assignment(-scores)
+    pairs = zip(rows.tolist(), columns.tolist(), strict=True)
+    return {row: items[column].id for row, column in pairs if scores[row, column] > 0}
+
+
+def _merge(tracks: Tracks, touched: list[int], cfg: TrackingConfig) -> None:
+    """Objects that have come to share most of their cells with one that grew become one; the older id stays."""
+    waiting = list(dict.fromkeys(touched))
+    while waiting:
+        track = tracks.items.get(waiting.pop())
+        if track is None:
+            continue
+        for other in list(tracks.items.values()):
+            if other.id == track.id or not _close(track.cells, other.cells):
+                continue
+            if shared(track.cells, other.cells) + shared(other.cells, track.cells) >= 2 * cfg.merge_overlap:
+                into, gone = (track, other) if track.id < other.id else (other, track)
+                _extend(into, gone, cfg)
+                del tracks.items[gone.id]
+                tracks.merged.append((gone.id, into.id))
+                waiting.append(into.id)
+                break
+
+
+def _forget(tracks: Tracks, detections: Detections, touched: set[int], cfg: TrackingConfig) -> None:
+    """Count frames that look at a barely seen object in vain; enough of them, and it is dropped."""
+    doubtful = [t for t in tracks.items.values() if t.frames < cfg.min_frames and t.id not in touched]
+    if not doubtful:
+        return
+    centres_m = np.array([track.box_m(cfg.cell_m).mean(axis=0) for track in doubtful])
+    none = np.zeros(0, np.float32)
+    view = descriptors.Frame(
+        inverse(detections.world_from_camera),
+        detections.intrinsics,
+        centers_px=none.reshape(0, 2),
+        sigmas_px=none,
+        layer_starts=np.zeros(0, np.int64),
+        embeddings=none.reshape(0, 0),
+        surface_m=descriptors.fill_holes(detections.surface_m),
+    )
+    looks = descriptors.visible(view, centres_m, descriptors.KernelConfig(max_depth_m=cfg.max_depth_m))
+    for row in looks.tolist():
+        doubtful[row].missed += 1
+        if doubtful[row].missed >= cfg.patience_frames:
+            del tracks.items[doubtful[row].id]
+
+
+def _extend(track: Track, more: Track, cfg: TrackingConfig) -> None:
+    """`track` holds what `more` holds, too."""
+    every, where = np.unique(np.concatenate((track.cells, more.cells)), return_inverse=True)
+    counts = np.bincount(where, np.concatenate((track.hits, more.hits)), minlength=len(every))
+    track.cells, track.hits = every, counts.astype(np.int64)
+    track.embeddings = [*track.embeddings, *more.embeddings][-cfg.observations :]
+    track.sources |= more.sources
+    track.prompted |= more.prompted
+
+
+def descriptor(embeddings: list[np.ndarray]) -> np.ndarray:
+    """Unit descriptor (dim,) of unit observations: their mean, weighted by centrality (eq. temporal_fusion_objects).
+
+    The weight of an observation is its mean cosine similarity to the others, at least 0; where all are 0, or there is
+    one only, they count alike.
+    """
+    stack = np.array(embeddings, dtype=np.float64)
+    weights = np.ones(len(stack))
+    if len(stack) > 1:
+        centrality = (stack @ stack.sum(axis=0) - (stack * stack).sum(axis=1)) / (len(stack) - 1)
+        weights = np.maximum(centrality, 0.0) if (centrality > 0).any() else weights
+    mean = weights @ stack
+    return mean / max(float(np.linalg.norm(mean)), 1e-12)
+
+
+def shared(cells: np.ndarray, others: np.ndarray) -> float:
+    """Share of the cells that are at most one cell from one of the others (both sorted)."""
+    near = (cells[:, None] + AROUND).ravel()
+    at = np.minimum(np.searchsorted(others, near), len(others) - 1)
+    return float((others[at] == near).reshape(len(cells), -1).any(axis=1).mean())
+
+
+def _close(cells: np.ndarray, others: np.ndarray) -> bool:
+    """Whether the first axes, by which cells are sorted, overlap."""
+    step = 2 << 2 * AXIS_BITS
+    return bool(cells[0] <= others[-1] + step and others[0] <= cells[-1] + step)
+
+
+def packed(numbers: np.ndarray) -> np.ndarray:
+    """Cell numbers (n, 3) as one integer each (n,), so that a step along an axis is a constant sum."""
+    x, y, z = (numbers + (1 << AXIS_BITS - 1)).T
+    return (x << 2 * AXIS_BITS) + (y << AXIS_BITS) + z
+
+
+def unpacked(cells: np.ndarray) -> np.ndarray:
+    """Inverse of `packed`."""
+    mask = (1 << AXIS_BITS) - 1
+    return np.stack((cells >> 2 * AXIS_BITS, cells >> AXIS_BITS & mask, cells & mask), 1) - (1 << AXIS_BITS - 1)

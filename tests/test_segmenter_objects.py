@@ -1,0 +1,274 @@
+"""Objects: synthetic boxes seen from a walk become objects with lasting ids; names, deltas, pose corrections."""
+
+import msgspec
+import numpy as np
+import pytest
+from segmenter_world import CAMERA, DIM, ROBOT, SPACE, look, place_delta, place_grid, prior, task, text
+
+from schemas.codec import decode, encode
+from schemas.features import TextRequest
+from schemas.frames import PoseUpdate
+from schemas.objects import Detections, ObjectDelta
+from schemas.places import SnapshotRequest
+from schemas.status import Tick
+from schemas.topics import OBJECT_SNAPSHOT
+from services.geometry import inverse, transform
+from services.runtime.service import Ask, Identity
+from services.segmenter import naming, objects
+from services.segmenter.experts.context import ObjectView
+from services.segmenter.service import SERVICE
+from services.segmenter.state import Config
+
+CFG = objects.TrackingConfig()
+EYE = np.eye(DIM)
+BED = (np.array((2.0, 1.0, 0.0)), np.array((3.2, 2.6, 0.6)), 1)  # low and high corner, axis of its embedding
+OVEN = (np.array((2.0, -2.0, 0.0)), np.array((2.6, -1.4, 0.9)), 0)
+TICK = Tick(stamp_ns=10**18)
+
+
+def faces(low, high, step=0.05):
+    """Points on the surface of a box."""
+    grids = [np.arange(a, b + 1e-9, step) for a, b in zip(low, high, strict=True)]
+    points = np.stack(np.meshgrid(*grids, indexing="ij"), axis=-1).reshape(-1, 3)
+    return points[(np.isclose(points, low) | np.isclose(points, high)).any(axis=1)]
+
+
+def side(box, eye, step=0.05):
+    """The faces of a box that an eye sees."""
+    low, high, _ = box
+    points = faces(low, high, step)
+    shown = [(np.isclose(points[:, a], low[a]) & (eye[a] < low[a])) for a in range(3)]
+    shown += [(np.isclose(points[:, a], high[a]) & (eye[a] > high[a])) for a in range(3)]
+    return points[np.any(shown, axis=0)]
+
+
+def sight(frame_id, pose, boxes, *, said=None, surface_m=9.0, **changes):
+    """Detections of some boxes from a pose; `said` is the pose that the message claims."""
+    clouds = [transform(inverse(pose), side(box, pose[:3, 3])) for box in boxes]
+    rng = np.random.default_rng(frame_id)
+    vectors = np.array([EYE[box[2]] for box in boxes]).reshape(-1, DIM) + 0.05 * rng.standard_normal((len(boxes), DIM))
+    fields = {
+        "robot": ROBOT,
+        "frame_id": frame_id,
+        "stamp_ns": frame_id,
+        "space": SPACE,
+        "detector": "segments",
+        "prompted": False,
+        "worker": "w",
+        "intrinsics": CAMERA,
+        "world_from_camera": pose if said is None else said,
+        "boxes_px": np.zeros((len(boxes), 4), np.float32),
+        "scores": np.ones(len(boxes), np.float32),
+        "embeddings": (vectors / np.linalg.norm(vectors, axis=1, keepdims=True)).astype(np.float16),
+        "point_counts": np.array([len(cloud) for cloud in clouds], np.int32),
+        "points_camera_m": np.concatenate([np.zeros((0, 3)), *clouds]).astype(np.float16),
+        "surface_m": np.full((12, 16), surface_m, np.float16),
+    }
+    message = Detections(**(fields | changes))
+    return decode(Detections, encode(message))
+
+
+def walk(count=8):
+    """Poses around the boxes, looking at the middle between them."""
+    angles = np.linspace(-0.6, 0.6, count)
+    return [look(2.5 - 4 * np.cos(a), 0.0 - 4 * np.sin(a), a) for a in angles]
+
+
+def seen(frames, cfg=CFG):
+    tracks = objects.Tracks(SPACE)
+    for frame in frames:
+        assert objects.observe(tracks, frame, cfg)
+    return tracks
+
+
+def test_boxes_seen_from_a_walk_become_one_object_each_with_their_size():
+    tracks = seen([sight(i, pose, [BED, OVEN] if i % 2 else [OVEN, BED]) for i, pose in enumerate(walk())])
+    assert len(tracks.items) == 2
+    for track in tracks.items.values():
+        vector = objects.descriptor(track.embeddings)
+        low, high, axis = BED if vector[1] > vector[0] else OVEN
+        assert vector[axis] > 0.97 and track.frames == 8
+        found = track.box_m(CFG.cell_m)
+        assert np.abs(found[0, :2] - low[:2]).max() < 0.5 and np.abs(found[1, 2] - high[2]) <= CFG.cell_m + 0.01
+        assert (np.abs(found.mean(axis=0) - (low + high) / 2) < 0.4).all()
+
+
+def test_a_repeated_frame_changes_nothing():
+    frame = sight(0, walk()[0], [BED])
+    tracks = seen([frame])
+    assert not objects.observe(tracks, frame, CFG)
+    assert [track.frames for track in tracks.items.values()] == [1]
+
+
+def test_halves_become_one_object_when_a_view_joins_them_and_the_older_id_stays():
+    pose = look(-1.0, 1.8, 0.0)
+    middle = (BED[0][1] + BED[1][1]) / 2
+    left = (BED[0], np.array((BED[1][0], middle - 0.3, BED[1][2])), 1)
+    right = (np.array((BED[0][0], middle + 0.3, BED[0][2])), BED[1], 1)
+    frames = [sight(0, pose, [left, right]), sight(1, pose, [left, right])]
+    tracks = seen(frames)
+    assert sorted(tracks.items) == [0, 1]
+    for number in range(2, 5):
+        objects.observe(tracks, sight(number, pose, [BED]), CFG)
+    for number in range(5, 7):
+        objects.observe(tracks, sight(number, pose, [BED]), CFG)
+    assert len(tracks.items) <= 2 and 0 in tracks.items
+    assert all(gone > into for gone, into in tracks.merged)
+
+
+def test_two_objects_with_the_same_cells_merge_into_the_older():
+    tracks = seen([sight(0, walk()[3], [BED]), sight(1, walk()[3], [OVEN])])
+    younger, older = tracks.items[1], tracks.items[0]
+    younger.cells, younger.hits = older.cells.copy(), older.hits.copy()
+    objects.observe(tracks, sight(2, walk()[3], [BED]), CFG)
+    assert list(tracks.items) == [0] and tracks.merged == [(1, 0)]
+    assert tracks.items[0].frames == 3
+
+
+@pytest.mark.parametrize(("surface_m", "left"), [(9.0, 0), (1.0, 1)], ids=["looked at", "hidden"])
+def test_what_later_frames_look_at_in_vain_was_no_object(surface_m, left):
+    pose = look(-1.0, 1.8, 0.0)
+    tracks = seen([sight(0, pose, [BED])])
+    for number in range(1, CFG.patience_frames + 1):
+        assert len(tracks.items) == 1
+        objects.observe(tracks, sight(number, pose, [], surface_m=surface_m), CFG)
+    assert len(tracks.items) == left
+
+
+def test_centrality_by_hand():
+    """Two alike at cosine 1 and an outlier at cosine 0: weights 1/2, 1/2, 0, so the outlier leaves no trace."""
+    one, other = EYE[0], EYE[1]
+    assert np.allclose(objects.descriptor([one, one, other]), one)
+    assert np.allclose(objects.descriptor([one, other]), (one + other) / np.sqrt(2))  # none is central: alike
+    assert np.allclose(objects.descriptor([other]), other)
+
+
+def test_centrality_against_a_literal_loop():
+    rng = np.random.default_rng(3)
+    rows = rng.standard_normal((9, 16)) + 0.5
+    rows /= np.linalg.norm(rows, axis=1, keepdims=True)
+    total = np.zeros(16)
+    for k, row in enumerate(rows):
+        cosines = [float(row @ rows[j]) for j in range(len(rows)) if j != k]
+        total += max(sum(cosines) / len(cosines), 0.0) * row
+    assert np.abs(objects.descriptor(list(rows)) - total / np.linalg.norm(total)).max() < 1e-12
+
+
+def test_packed_cells_come_back_and_neighbours_are_near():
+    rng = np.random.default_rng(0)
+    numbers = rng.integers(-500, 500, (200, 3))
+    assert (objects.unpacked(objects.packed(numbers)) == numbers).all()
+    cells = np.sort(objects.packed(np.array([(0, 0, 0), (5, 5, 5)])))
+    assert objects.shared(cells, np.sort(objects.packed(np.array([(1, -1, 1)])))) == 0.5
+    assert objects.shared(cells, np.sort(objects.packed(np.array([(2, 0, 0)])))) == 0.0
+
+
+def test_a_pose_correction_moves_the_object_and_keeps_its_id():
+    off = np.eye(4)
+    off[:3, 3] = (0.0, 3.0, 0.0)
+    poses = walk()
+    truth = seen([sight(i, pose, [BED, OVEN]) for i, pose in enumerate(poses)])
+    tracks = seen([sight(i, pose, [BED, OVEN], said=off @ pose) for i, pose in enumerate(poses)])
+    tracks.next_id = 50
+    wrong = {number: track.box_m(CFG.cell_m) for number, track in tracks.items.items()}
+    for index, pose in enumerate(poses):
+        objects.move(tracks, index, pose)
+    objects.renew(tracks, SPACE, CFG)
+    assert tracks.items.keys() == wrong.keys() and tracks.next_id == 50
+    for number, track in tracks.items.items():
+        assert (track.box_m(CFG.cell_m) == truth.items[number].box_m(CFG.cell_m)).all()
+        assert wrong[number][0, 1] - track.box_m(CFG.cell_m)[0, 1] == pytest.approx(3.0, abs=0.2)
+
+
+def test_beliefs_by_hand():
+    """Standardised similarities 1 and -1 at temperature 2 beside a null at 0: e^2, e^-2 and 1."""
+    found = np.zeros((2, DIM))
+    found[:, :2] = (0.55, 0.05)  # with mean 0.3 and spread 0.25
+    answer = text(np.eye(2))
+    rows, known = naming.beliefs(found, np.array([False, True]), answer)
+    odds = np.exp([2.0, -2.0])
+    assert np.allclose(rows, odds / odds.sum(), atol=1e-6)
+    assert known == pytest.approx([odds.sum() / (odds.sum() + 1), 1.0], abs=1e-6)
+
+
+class Run:
+    """One segmenter; text requests are answered with the basis vectors of regions, or of the oven and the bed."""
+
+    def __init__(self, cfg=None):
+        self.cfg = cfg or Config()
+        self.state = SERVICE.init(self.cfg, Identity(ROBOT, "i", 1))
+        self.deltas, self.objects = [], {}
+
+    def feed(self, *messages):
+        for message in messages:
+            for output in list(SERVICE.step(self.state, message, self.cfg)):
+                if isinstance(output, Ask) and isinstance(output.request, TextRequest):
+                    self.feed(text(EYE[: len(output.request.concepts)], space=output.request.space))
+                elif not isinstance(output, Ask) and isinstance(output[1], ObjectDelta):
+                    self.take(decode(ObjectDelta, encode(output[1])))
+        return self
+
+    def take(self, delta):
+        assert delta.revision == len(self.deltas)
+        self.deltas.append(delta)
+        for number in [*delta.removed_ids.tolist(), *delta.merged_ids[:, 0].tolist()]:
+            del self.objects[number]
+        for entry in delta.objects:
+            self.objects[entry.id] = entry
+
+
+def started(**kwargs):
+    positions, edges = place_grid(1)
+    frames = [sight(i, pose, [BED, OVEN], **kwargs) for i, pose in enumerate(walk())]
+    return Run().feed(place_delta(positions, edges), *frames, TICK)
+
+
+def test_objects_are_told_once_and_named_when_a_prior_comes():
+    run = started()
+    assert [item.label for item in run.objects.values()] == ["", ""] and run.deltas[0].prior_digest == ""
+    run.feed(TICK, TICK)
+    assert len(run.deltas) == 1
+    run.feed(task(), prior(["kitchen", "bedroom"]), TICK, TICK)
+    assert sorted(item.label for item in run.objects.values()) == ["bed", "oven"] and len(run.deltas) == 2
+    assert run.deltas[1].prior_digest == run.state.alignment.digest
+    snapshot = SERVICE.answers[OBJECT_SNAPSHOT](run.state, SnapshotRequest(robot=ROBOT), run.cfg)
+    assert snapshot.snapshot and snapshot.revision == 1
+    assert {item.id: item for item in snapshot.objects} == run.objects
+
+
+@pytest.mark.parametrize("prompted", [False, True])
+def test_only_objects_of_a_detector_that_knows_the_prior_have_a_word(prompted):
+    run = started(prompted=prompted).feed(task(), prior(["kitchen", "bedroom"]), TICK)
+    view = run.state.objects
+    assert isinstance(view, ObjectView) and len(view.ids) == 2
+    assert np.allclose(view.concepts.sum(axis=1), 1.0)
+    assert view.words.tolist() == ([1.0, 1.0] if prompted else [0.0, 0.0])
+
+
+def test_a_pose_update_moves_what_was_told():
+    run = started()
+    before = dict(run.objects)
+    shift = np.eye(4)
+    shift[:3, 3] = (0.0, 6.0, 0.0)
+    poses = np.array([shift @ pose for pose in walk()])
+    update = PoseUpdate(
+        robot=ROBOT, epoch=1, revision=0, stamp_ns=9, frame_ids=np.arange(len(poses)), world_from_camera=poses
+    )
+    run.feed(update, TICK)
+    assert run.objects.keys() == before.keys()
+    for number, item in run.objects.items():
+        assert np.subtract(item.position_m, before[number].position_m) == pytest.approx((0, 6, 0), abs=0.2)
+
+
+def test_detections_of_another_space_wait_until_it_is_in_force():
+    run = started()
+    there = dict(run.objects)
+    run.feed(*[sight(i, pose, [OVEN], space="other/space") for i, pose in enumerate(walk())], TICK)
+    assert run.objects == there
+    objects.renew(run.state.tracks, "other/space", run.cfg.tracking)
+    assert [track.frames for track in run.state.tracks.items.values()] == [8]
+
+
+def test_settings_out_of_range_are_refused():
+    with pytest.raises(ValueError, match="shares"):
+        msgspec.convert({"match_overlap": 2.0}, objects.TrackingConfig)
