@@ -18,7 +18,7 @@ from schemas.priors import ObjectPrior, Prior, Provenance, RegionPrior, Task, Ta
 from schemas.regions import Region, RegionDelta, Transition
 from schemas.scene import SceneRequest
 from schemas.status import Tick
-from schemas.topics import PLACE_SNAPSHOT, REGION_SNAPSHOT, SCENE, SCENE_REVISION
+from schemas.topics import OBJECT_SNAPSHOT, PLACE_SNAPSHOT, REGION_SNAPSHOT, SCENE, SCENE_REVISION
 from services.runtime.service import Ask, Identity
 from services.scene_store import core, service
 from services.scene_store.database import APPLICATION_ID, Database, StoreError
@@ -234,7 +234,7 @@ def test_missed_deltas_are_made_up_by_snapshots(tmp_path):
     whole.feed(*deltas[:100])
     store.feed(*deltas[:30])
     store = store.reopened()
-    assert asked(store.feed(Tick(stamp_ns=1))) == [PLACE_SNAPSHOT, REGION_SNAPSHOT]
+    assert asked(store.feed(Tick(stamp_ns=1))) == [PLACE_SNAPSHOT, REGION_SNAPSHOT, OBJECT_SNAPSHOT]
     assert asked(store.feed(Tick(stamp_ns=2))) == []
     outputs = store.feed(*deltas[90:100])  # a gap: they wait, and the host is asked again (it knows the question)
     assert set(asked(outputs)) == {PLACE_SNAPSHOT, REGION_SNAPSHOT} and not revisions(outputs)
@@ -256,7 +256,7 @@ def test_a_quiet_writer_is_caught_up_after_a_restart(tmp_path):
     store.feed(*deltas[:40])
     store = store.reopened()
     outputs = store.feed(*snapshots_of(whole, 59, 59))
-    assert asked(outputs) == [PLACE_SNAPSHOT, REGION_SNAPSHOT]
+    assert asked(outputs) == [PLACE_SNAPSHOT, REGION_SNAPSHOT, OBJECT_SNAPSHOT]
     assert encode(store.scene()) == encode(whole.scene())
 
 
@@ -363,7 +363,7 @@ def test_tasks_priors_and_robots(tmp_path):
     assert in_force == {ROBOT: tasks[1], "nobody": None}
     rows = sqlite3.connect(store.cfg.path).execute("SELECT digest, message FROM priors").fetchall()
     assert [(digest, decode(Prior, blob)) for digest, blob in rows] == [(prior.digest(), prior)]
-    assert asked(store.feed(Tick(stamp_ns=1))) == [PLACE_SNAPSHOT, REGION_SNAPSHOT] * 2
+    assert asked(store.feed(Tick(stamp_ns=1))) == [PLACE_SNAPSHOT, REGION_SNAPSHOT, OBJECT_SNAPSHOT] * 2
 
 
 def test_history_lists_what_each_delta_left(tmp_path):

@@ -10,13 +10,14 @@ from schemas.places import PlaceDelta
 from schemas.priors import Prior, PriorEvidence, Task
 from schemas.regions import Region
 from services.deltas import Follower
-from services.segmenter import descriptors, naming, objects, publication
+from services.segmenter import descriptors, naming, publication
 from services.segmenter.balance import BalanceConfig
 from services.segmenter.experts import REGISTRY
 from services.segmenter.experts.context import ObjectSettings, ObjectView
 from services.segmenter.geometry import GeometryConfig
 from services.segmenter.graph import PlaceGraph
 from services.segmenter.incremental import Settings, Solver
+from services.segmenter.objects import TrackingConfig, Tracks
 from services.segmenter.places import Places
 from services.segmenter.sharing import SharingConfig
 from services.segmenter.spaces import Spaces, SpacesConfig
@@ -34,7 +35,7 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
     )
     geometry: GeometryConfig = msgspec.field(default_factory=GeometryConfig)
     objects: ObjectSettings = msgspec.field(default_factory=ObjectSettings)
-    tracking: objects.TrackingConfig = msgspec.field(default_factory=objects.TrackingConfig)
+    tracking: TrackingConfig = msgspec.field(default_factory=TrackingConfig)
     beta: float = 2.0  # weight of the pairwise term (paper)
     edge_decay_m: float = 2.0  # w_dist = exp(-length / edge_decay_m)
     edge_sum: float = 3.0  # sum of w_dist at a place, whatever the graph's density and scale; 0 = w_dist as it is
@@ -101,7 +102,7 @@ class State:
     pose_revisions: dict[int, int] = field(default_factory=dict)  # of the newest correction by the epoch of its writer
     places: Places = field(default_factory=Places.none)
     objects: ObjectView = field(default_factory=ObjectView)
-    tracks: objects.Tracks = field(default_factory=objects.Tracks)
+    tracks: Tracks = field(default_factory=Tracks)
     object_ledger: naming.ObjectLedger = field(default_factory=naming.ObjectLedger)
     task: Task | None = None
     priors: dict[str, Prior] = field(default_factory=dict)  # by digest, latest arrival last
@@ -134,5 +135,5 @@ def empty(cfg: Config, robot: str, epoch: int) -> State:
         query_radius_m=cfg.default_query_radius_m,
         spaces=Spaces(cfg.space),
         solver=Solver(cfg.solver),
-        tracks=objects.Tracks(cfg.space),
+        tracks=Tracks(cfg.space),
     )
