@@ -32,8 +32,8 @@ class ObjectLedger:
     stamp_ns: int = 0
 
     def view(self) -> ObjectView:
-        """The objects that carry a label, for the experts."""
-        named = [item for item in self.told.values() if item.entry.label]
+        """The objects that carry a label or have a say, for regions and experts."""
+        named = [item for item in self.told.values() if item.entry.label or item.weight > 0]
         return ObjectView(
             ids=np.array([item.entry.id for item in named], np.int64),
             positions_m=np.array([item.entry.position_m for item in named]).reshape(-1, 3),
@@ -108,7 +108,7 @@ def named(tracks: Tracks, prior: Prior | None, text: TextEmbeddings | None, cfg:
     result = {}
     for track, row, sure in zip(items, concepts, known.tolist(), strict=True):
         best = int(row.argmax())
-        label = prior.objects[best].name if sure >= cfg.known_least else ""
+        label = prior.objects[best].name if sure * row[best] >= cfg.label_least else ""
         weight = sure * (1.0 if track.prompted else cfg.unprompted_weight)
         result[track.id] = Named(_entry(track, label, float(row[best]), sure, cfg), row, weight)
     return result

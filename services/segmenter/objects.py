@@ -37,7 +37,9 @@ class TrackingConfig(msgspec.Struct, frozen=True, kw_only=True):
     max_depth_m: float = 6.0  # frames farther away do not count as looking
     observations: int = 32  # embeddings kept per object, the newest
     archive_frames: int = 2000  # frames whose detections are kept, over all spaces, the newest
-    known_least: float = 0.5  # probability of being any of the prior's objects from which one carries a label
+    label_least: float = (
+        0.5  # probability of being one of the prior's objects from which on an object carries its label
+    )
     unprompted_weight: float = 0.0  # of objects of a detector that does not know the prior, in the object expert
 
     def __post_init__(self) -> None:
@@ -45,8 +47,8 @@ class TrackingConfig(msgspec.Struct, frozen=True, kw_only=True):
             raise ValueError("cell_m, min_frames, observations and archive_frames must be positive")
         if not (0 < self.match_overlap <= 1 and 0 <= self.match_part <= 1 and 0 < self.merge_overlap <= 1):
             raise ValueError("match_overlap, match_part and merge_overlap are shares")
-        if not (0 <= self.known_least <= 1 and 0 <= self.unprompted_weight <= 1):
-            raise ValueError("known_least and unprompted_weight lie in [0, 1]")
+        if not (0 <= self.label_least <= 1 and 0 <= self.unprompted_weight <= 1):
+            raise ValueError("label_least and unprompted_weight lie in [0, 1]")
 
 
 @dataclass
