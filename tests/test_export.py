@@ -14,6 +14,7 @@ from deploy.evaluation.metrics import GroundTruth
 from deploy.export import map_png, places_png, save_json, save_spark_dsg, scene_json, spark_dsg_graph, zones
 from deploy.map_image import FREE, PALETTE, UNLABELLED, WALL, label_colors
 from deploy.place_image import OPENING
+from schemas.objects import SceneObject
 from schemas.places import VoxelMap
 from schemas.regions import Region
 from schemas.scene import Scene
@@ -179,6 +180,26 @@ def test_openings_are_exported_as_frontiers():
 
 
 GROUND = ("surface_ids", "ellipses", "hull_counts", "hulls_m")
+
+
+def test_objects_hang_below_their_nearest_place(tmp_path):
+    fields = {"label": "bed", "probability": 0.6, "known": 0.9, "frames": 3}
+    low_m, high_m = (0.5, 0.0, 0.0), (1.5, 1.0, 0.5)
+    scene = flat()
+    nearest = int(np.linalg.norm(scene.positions_m - (1.0, 0.5, 0.25), axis=1).argmin())
+    item = SceneObject(id=4, position_m=(1.0, 0.5, 0.25), min_m=low_m, max_m=high_m, **fields)
+    scene = changed(scene, objects=[item])
+    (told,) = scene_json(scene)["objects"]
+    assert told == {**fields, "id": 4, "position_m": [1.0, 0.5, 0.25], "min_m": [*low_m], "max_m": [*high_m]} | {
+        "place": int(scene.place_ids[nearest])
+    }
+    save_spark_dsg(scene, tmp_path / "dsg.json")
+    graph = spark_dsg.DynamicSceneGraph.load(str(tmp_path / "dsg.json"))
+    found = node(graph, "O", 4)
+    assert found.attributes.name == "bed"
+    np.testing.assert_allclose(found.attributes.bounding_box.dimensions, [1.0, 1.0, 0.5])
+    np.testing.assert_allclose(found.attributes.bounding_box.world_P_center, [1.0, 0.5, 0.25])
+    assert found.get_parent() == spark_dsg.NodeSymbol("p", int(scene.place_ids[nearest])).value
 
 
 def test_places_on_the_ground_are_exported_with_hull_and_ellipse(tmp_path):

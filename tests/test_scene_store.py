@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from schemas.codec import decode, encode
+from schemas.objects import ObjectDelta, SceneObject
 from schemas.places import PlaceDelta
 from schemas.priors import ObjectPrior, Prior, Provenance, RegionPrior, Task, TaskRequest
 from schemas.regions import Region, RegionDelta, Transition
@@ -410,6 +411,26 @@ def test_everything_a_region_tells_survives_a_restart(tmp_path):
     for scene in (store.scene(), store.reopened().scene()):
         assert scene.regions == [region]
         assert scene.predicted_ids.tolist() == [2]
+
+
+def test_objects_change_merge_go_and_survive_a_restart(tmp_path):
+    def item(number, label="bed", x_m=1.0):
+        corner = (x_m - 0.5, 0.0, 0.0), (x_m + 0.5, 1.0, 0.5)
+        fields = {"label": label, "probability": 0.6, "known": 0.9, "position_m": (x_m, 0.5, 0.25), "frames": 3}
+        return SceneObject(id=number, min_m=corner[0], max_m=corner[1], **fields)
+
+    def delta(revision, items, removed=(), merged=(), epoch=1, **fields):
+        arrays = {"removed_ids": np.array(removed, np.int64), "merged_ids": np.array(merged, np.int64).reshape(-1, 2)}
+        head = {"robot": ROBOT, "epoch": epoch, "revision": revision, "stamp_ns": revision, "prior_digest": "d"}
+        return ObjectDelta(objects=items, **head, **arrays, **fields)
+
+    store = Store(tmp_path / "scene.sqlite")
+    store.feed(delta(0, [item(0), item(1), item(2)]), delta(1, [item(2, "sofa")], removed=[0], merged=[(1, 2)]))
+    assert store.scene().objects == [item(2, "sofa")]
+    store = store.reopened()
+    assert store.scene().objects == [item(2, "sofa")]
+    store.feed(delta(5, [item(7), item(2, "sofa", 2.0)], snapshot=True))
+    assert store.reopened().scene().objects == [item(2, "sofa", 2.0), item(7)]
 
 
 def test_openings_and_ground_are_kept_until_they_close_or_their_place_goes(tmp_path):

@@ -103,17 +103,14 @@ def test_a_repeated_frame_changes_nothing():
 def test_halves_become_one_object_when_a_view_joins_them_and_the_older_id_stays():
     pose = look(-1.0, 1.8, 0.0)
     middle = (BED[0][1] + BED[1][1]) / 2
-    left = (BED[0], np.array((BED[1][0], middle - 0.3, BED[1][2])), 1)
-    right = (np.array((BED[0][0], middle + 0.3, BED[0][2])), BED[1], 1)
+    left = (BED[0], np.array((BED[1][0], middle - 0.1, BED[1][2])), 1)
+    right = (np.array((BED[0][0], middle + 0.1, BED[0][2])), BED[1], 1)
     frames = [sight(0, pose, [left, right]), sight(1, pose, [left, right])]
     tracks = seen(frames)
     assert sorted(tracks.items) == [0, 1]
-    for number in range(2, 5):
-        objects.observe(tracks, sight(number, pose, [BED]), CFG)
-    for number in range(5, 7):
-        objects.observe(tracks, sight(number, pose, [BED]), CFG)
-    assert len(tracks.items) <= 2 and 0 in tracks.items
-    assert all(gone > into for gone, into in tracks.merged)
+    objects.observe(tracks, sight(2, pose, [BED]), CFG)
+    assert sorted(tracks.items) == [0]
+    assert tracks.merged == [(1, 0)]
 
 
 def test_two_objects_with_the_same_cells_merge_into_the_older():
@@ -243,6 +240,16 @@ def test_only_objects_of_a_detector_that_knows_the_prior_have_a_word(prompted):
     assert isinstance(view, ObjectView) and len(view.ids) == 2
     assert np.allclose(view.concepts.sum(axis=1), 1.0)
     assert view.words.tolist() == ([1.0, 1.0] if prompted else [0.0, 0.0])
+
+
+def test_where_nothing_is_likely_enough_no_object_has_a_label_and_nothing_a_word():
+    cfg = Config(tracking=objects.TrackingConfig(label_least=1.0))
+    positions, edges = place_grid(1)
+    frames = [sight(i, pose, [BED, OVEN]) for i, pose in enumerate(walk())]
+    run = Run(cfg).feed(place_delta(positions, edges), *frames, TICK, task(), prior(["kitchen", "bedroom"]), TICK, TICK)
+    assert [item.label for item in run.objects.values()] == ["", ""]
+    assert all(item.probability > 0.5 and 0 < item.known < 1 for item in run.objects.values())
+    assert len(run.state.objects.ids) == 0
 
 
 def test_a_pose_update_moves_what_was_told():

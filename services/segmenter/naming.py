@@ -34,10 +34,12 @@ class ObjectLedger:
     def view(self) -> ObjectView:
         """The objects that carry a label or have a say, for regions and experts."""
         named = [item for item in self.told.values() if item.entry.label or item.weight > 0]
+        if not named:
+            return ObjectView()
         return ObjectView(
             ids=np.array([item.entry.id for item in named], np.int64),
-            positions_m=np.array([item.entry.position_m for item in named]).reshape(-1, 3),
-            concepts=np.array([item.concepts for item in named]).reshape(len(named), -1),
+            positions_m=np.array([item.entry.position_m for item in named]),
+            concepts=np.array([item.concepts for item in named]),
             weights=np.array([item.weight for item in named]),
         )
 
