@@ -25,7 +25,7 @@ from services.runtime.service import Identity
 DATA = Path(__file__).parents[2] / "shared" / "data"
 CAMERA = Intrinsics(640, 480, 500.0, 400.0, 320.0, 240.0)
 SPACE = "conse/efficientnet-lite0/minilm-l6-v2"  # the fastest
-CFG = Config(space=SPACE, threads=1)
+CFG = Config(space=SPACE, threads=1, smallest_crop_px=224)
 
 
 @pytest.fixture(scope="session")
@@ -77,9 +77,15 @@ def test_states_worked_by_hand():
 def test_sides_grow_linearly_up_to_the_shorter_side():
     assert core.layer_sides(360, Config(smallest_crop_px=224, layers=3)) == [224, 292, 360]
     assert core.layer_sides(1080, Config(smallest_crop_px=224, layers=5)) == [224, 438, 652, 866, 1080]
-    assert core.layer_sides(480, Config(layers=1)) == [224]
+    assert core.layer_sides(480, Config(smallest_crop_px=224, layers=1)) == [224]
     assert core.layer_sides(100, Config(layers=3)) == [100]  # an image smaller than the smallest crop
     assert core.layer_sides(224, Config(layers=3)) == [224]
+
+
+def test_the_smallest_crop_suits_the_encoder_unless_it_is_set():
+    assert core.layer_sides(480, Config(layers=1)) == [448]
+    assert core.layer_sides(480, Config(layers=1, space="open_clip/ViT-H-14/laion2b_s32b_b79k")) == [224]
+    assert core.layer_sides(480, Config(layers=1, smallest_crop_px=112)) == [112]
 
 
 @settings(max_examples=60, deadline=None)
@@ -126,7 +132,7 @@ def test_depth_is_the_median_of_what_was_measured():
     depth_m[:, :200] = 9.0  # crop 0 holds 200 columns at 9 m, 20 at 2 m and 4 without measurement
     depth_m[:, 200:220] = 2.0
     depth_m[100, 640 - 224] = 30.0  # the only measurement of the crops at the right border
-    selection = core.select_crops(depth_m, CAMERA, Config(layers=1, min_area_m2=0.0))
+    selection = core.select_crops(depth_m, CAMERA, Config(smallest_crop_px=224, layers=1, min_area_m2=0.0))
     by_corner = {
         (left, top): depth
         for left, top, depth in zip(

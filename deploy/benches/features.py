@@ -91,7 +91,8 @@ def pool(workers: int, settings: list[str]) -> Iterator[Pool]:
     endpoint = free_endpoint("tcp/127.0.0.1:0")
     stop_router = open_router(endpoint)
     with tempfile.TemporaryDirectory() as folder:
-        settings = ["feature_pyramid.detector=none", *settings]  # crops of pyramids are what is counted
+        published = f"feature_pyramid.smallest_crop_px={core.PUBLISHED_CROP_PX}"
+        settings = ["feature_pyramid.detector=none", published, *settings]  # crops of pyramids are what is counted
         supervisor = Supervisor(endpoint, "bench", Path(folder), settings)
         running = Pool(supervisor, ZenohBus(endpoint))
         try:
@@ -114,8 +115,9 @@ def numbered(keyframes: list[Keyframe]) -> Iterator[Keyframe]:
 def sample_crops(keyframes: list[Keyframe], count: int, side_px: int) -> np.ndarray:
     """Crops as the network sees them: uint8 (count, side, side, 3)."""
     crops: list[np.ndarray] = []
+    cfg = core.Config(smallest_crop_px=core.PUBLISHED_CROP_PX)
     for frame in keyframes:
-        selection = core.select_crops(read_depth(frame), frame.intrinsics, core.Config())
+        selection = core.select_crops(read_depth(frame), frame.intrinsics, cfg)
         crops += [resized(crop, side_px) for crop in selection.crops.cut(read_color(frame))]
         if len(crops) >= count:
             break

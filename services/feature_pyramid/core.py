@@ -7,6 +7,9 @@ from schemas.frames import Intrinsics
 from services.feature_pyramid.medians import patch_medians
 from services.feature_pyramid.segments import SegmentsConfig
 
+PUBLISHED_CROP_PX = 224  # the paper's, for CLIP
+SCENE_CROP_PX = 448  # for conse: its network classifies pictures of whole scenes; chosen on split dev
+
 
 class Config(msgspec.Struct, frozen=True, kw_only=True):
     """Settings of the feature pyramid; one embedding space per worker."""
@@ -16,7 +19,7 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
     )
     runtime: str = "onnx"  # or torch: what runs the networks of conse
     device: str = "auto"  # cpu, cuda, or auto: cuda where there is one
-    smallest_crop_px: int = 224  # side of layer 0; smaller images use their shorter side
+    smallest_crop_px: int = 0  # side of layer 0; smaller images use their shorter side; 0 = what suits the encoder
     layers: int = 3  # sides grow linearly from the smallest crop to the shorter side of the image
     overlap: float = 0.5  # least share of a crop's side that its neighbour covers too
     min_area_m2: float = 2.25  # A_min: crops that see less physical area are not encoded
@@ -30,8 +33,8 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
     segments: SegmentsConfig = SegmentsConfig()  # of the detector segments; its grid is every detector's
 
     def __post_init__(self) -> None:
-        if self.smallest_crop_px < 1 or self.layers < 1 or self.surface_cell_px < 1:
-            raise ValueError("smallest_crop_px, layers and surface_cell_px must be at least 1")
+        if self.smallest_crop_px < 0 or self.layers < 1 or self.surface_cell_px < 1:
+            raise ValueError("layers and surface_cell_px must be at least 1, and smallest_crop_px not negative")
         if not 0.0 <= self.overlap < 1.0:
             raise ValueError("overlap must be in [0, 1)")
         if self.min_area_m2 < 0.0 or self.threads < 0 or self.batch_size < 0:
@@ -107,11 +110,16 @@ def pyramid_crops(width_px: int, height_px: int, cfg: Config) -> Crops:
 
 def layer_sides(shorter_px: int, cfg: Config) -> list[int]:
     """Side of the crops of each layer, growing linearly up to the image's shorter side."""
-    smallest = min(cfg.smallest_crop_px, shorter_px)
+    smallest = min(smallest_crop_px(cfg), shorter_px)
     layers = cfg.layers if smallest < shorter_px else 1
     if layers == 1:
         return [smallest]
     return sorted({round(side) for side in np.linspace(smallest, shorter_px, layers).tolist()})
+
+
+def smallest_crop_px(cfg: Config) -> int:
+    """Side of layer 0 as set, or else what suits the embedding space's family."""
+    return cfg.smallest_crop_px or (SCENE_CROP_PX if cfg.space.startswith("conse/") else PUBLISHED_CROP_PX)
 
 
 def crop_starts(length_px: int, side_px: int, overlap: float) -> list[int]:
