@@ -14,6 +14,7 @@ import zenoh
 from deploy import bench_segmenter
 from deploy.benches import features as bench_features
 from deploy.benches.kernel import kernel
+from deploy.benches.learning import learning_bench
 from deploy.benches.places import place_bench
 from deploy.benches.swap import swap_bench
 from schemas.codec import decode, encode
@@ -174,6 +175,7 @@ BENCHES: dict[str, Callable[[], tuple[dict, dict]]] = {
     "swap": swap_bench,
     "segmenter": bench_segmenter.updates,
     "task": bench_segmenter.switch,
+    "learning": learning_bench,
     "e2e": e2e,
 }
 

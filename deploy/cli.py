@@ -200,7 +200,9 @@ def _add_tools(command: Command) -> None:
     )
 
     bench = command("bench", "measure one part, or all", "prior-sg bench places --json")
-    bench.add_argument("name", help="bus, places, features, kernel, swap, segmenter, task, e2e, all of these, or pool")
+    bench.add_argument(
+        "name", help="bus, places, features, kernel, swap, segmenter, task, learning, e2e, all of these, or pool"
+    )
     bench.add_argument("--seconds", type=float, default=300.0, help="how long pool lasts (default: %(default)s)")
     bench.add_argument("--json", action="store_true", help="print one JSON object per measurement")
 

@@ -9,6 +9,8 @@ from schemas.status import Tick
 from schemas.topics import PRIOR_EVIDENCE, TEXT
 from services.prior_gateway import learning
 from services.runtime.service import Ask, Identity
+from services.segmenter import observed
+from services.segmenter.experts.context import ObjectView
 from services.segmenter.service import SERVICE
 from services.segmenter.state import Config
 
@@ -63,4 +65,45 @@ def test_the_gateway_learns_from_it():
     expected = (4 * 0.3 + np.array([[0, 1, 0], [1, 0, 1], [0, 1, 0]])) / 5  # P = (strength P + k) / (strength + n)
     off = ~np.eye(3, dtype=bool)
     np.testing.assert_allclose(after.adjacency[off], expected[off], rtol=1e-6)
+    np.testing.assert_array_equal(after.containment, before.containment)
+
+
+def test_objects_count_for_the_region_of_their_nearest_place_by_their_best_candidate():
+    positions_m, regions = np.array([[0.0, 0, 0], [1, 0, 0], [10, 0, 0], [20, 0, 0]]), np.array([7, 7, 9, 8])
+    view = ObjectView(
+        ids=np.arange(5),
+        positions_m=np.array([[0.2, 0, 0], [1.3, 0, 0], [9.5, 0, 0], [12.0, 0, 0], [20.0, 0, 0]]),
+        concepts=np.array([[0.9, 0.1], [0.4, 0.6], [0.2, 0.8], [1.0, 0.0], [1.0, 0.0]]),
+        weights=np.array([1.0, 1.0, 0.5, 1.0, 1.0]),
+    )
+    held = observed._held(view, positions_m, regions, np.array([7, 9]))  # 8 is too small, the object at 12 too far
+    np.testing.assert_allclose(held, [[0.9, 0.6], [0.1, 0.4]])
+
+
+def seen_with(weight: float) -> PriorEvidence:
+    """The evidence of three labelled rooms with an oven in the kitchen."""
+    positions, edges = place_grid(3)
+    cfg = Config(evidence_ticks=0)
+    state = SERVICE.init(cfg, Identity(ROBOT, "i", 1))
+    queue = [place_delta(positions, edges), task(), prior(ROOMS), *walk(3), TICK]
+    while queue:
+        for output in list(SERVICE.step(state, queue.pop(0), cfg)):
+            if isinstance(output, Ask) and output.query is TEXT:
+                queue.insert(0, text(np.eye(3)[: len(output.request.concepts)]))
+    state.objects = ObjectView(np.array([1]), np.array([[2.0, 2.0, 0.5]]), np.array([[0.9, 0.1]]), np.array([weight]))
+    return decode(PriorEvidence, encode(observed.evidence(state, cfg)))
+
+
+def test_what_a_region_holds_revises_containment():
+    seen, before = seen_with(1.0), prior(ROOMS)
+    assert seen.objects == ["oven", "bed"]
+    np.testing.assert_allclose(seen.holding, [[0.9, 0.1], [0, 0], [0, 0]], rtol=1e-6)
+    after = learning.revised(before, learning.totals(before, [seen]), 4.0, before.provenance)
+    np.testing.assert_allclose(after.containment, (4 * 0.5 + np.array([[0.9, 0.1], [0, 0], [0, 0]])) / 5, rtol=1e-6)
+
+
+def test_objects_without_a_say_are_no_sign_that_one_has_looked():
+    seen, before = seen_with(0.0), prior(ROOMS)
+    assert seen.objects == [] and seen.holding.shape == (3, 0)
+    after = learning.revised(before, learning.totals(before, [seen]), 4.0, before.provenance)
     np.testing.assert_array_equal(after.containment, before.containment)

@@ -142,7 +142,8 @@ def evaluate(scene: Scene, free: VoxelMap, truth: GroundTruth) -> dict[str, floa
     """
     assignment = assign(scene, free, truth)
     overlap = overlap_of(scene, assignment, truth)
-    semantic, geometric = _scores(overlap, overlap.same_label), _scores(overlap, np.ones_like(overlap.same_label))
+    semantic = scores_of(overlap, overlap.same_label)
+    geometric = scores_of(overlap, np.ones_like(overlap.same_label))
     scores = {f"{key}_s": value for key, value in semantic.items()} | {f"{k}_g": v for k, v in geometric.items()}
     scores["miou_s_penalised"], scores["miou_g_penalised"] = scores["penalised_s"], scores["penalised_g"]
     scores["accuracy"] = _ratio((overlap.shared * overlap.same_label).sum(), overlap.true.sum())
@@ -267,7 +268,8 @@ def _near(points: np.ndarray, others: np.ndarray, reach: float) -> float:
     return float((distances <= reach * (1 + 1e-9)).mean())
 
 
-def _scores(overlap: Overlap, counted: np.ndarray) -> dict[str, float]:
+def scores_of(overlap: Overlap, counted: np.ndarray) -> dict[str, float]:
+    """Precision, recall, F1 and mean intersection over union, where only the pairs `counted` may match."""
     shared = overlap.shared * counted
     union = overlap.estimated[:, None] + overlap.true[None, :] - overlap.shared
     precision = _mean((shared / overlap.estimated[:, None]).max(axis=1, initial=0.0))

@@ -19,7 +19,7 @@ from services.prior_gateway.synthesis import LEAST, MOST
 class LearningConfig(msgspec.Struct, frozen=True, kw_only=True):
     """How observations revise priors."""
 
-    strength: float = 4.0  # how many observed regions one statement of the prior is worth; our judgement, not tuned
+    strength: float = 4.0  # observed regions that a statement of the prior is worth; see `prior-sg bench learning`
     automatic: bool = False  # publish a revised prior without being asked; regions change while the robot works
     least_maps: int = 3  # maps that must have been observed before a prior is revised automatically
     least_change: float = 0.2  # and by how much an entry must change

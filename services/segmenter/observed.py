@@ -1,12 +1,17 @@
-"""What a map shows of its prior: how its regions share the places, and which of them touch (beyond the paper; pure).
+"""What a map shows of its prior: how its regions share the places, which of them touch, and what they hold (beyond the
+paper; pure).
 
-Objects are not counted: that a region holds none of a kind says something only where one has looked for that kind.
+Objects count once some object of the map has a say: that a region holds none of a kind says something only where one
+has looked for that kind.
 """
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from schemas.priors import PriorEvidence
+from services.segmenter.experts.context import ObjectView
 from services.segmenter.places import UNLABELLED
+from services.segmenter.regions import OBJECT_REACH_M
 from services.segmenter.state import Config, State
 
 
@@ -24,6 +29,8 @@ def evidence(state: State, cfg: Config) -> PriorEvidence | None:
     instances = np.bincount(labels, minlength=count).astype(np.float32)
     pairs = np.outer(instances, instances)
     np.fill_diagonal(pairs, instances * (instances - 1) / 2)
+    looked = bool((state.objects.words > 0).any())
+    held = _held(state.objects, state.graph.positions_m, places.regions, ids)
     return PriorEvidence(
         robot=state.robot,
         epoch=state.graph_epoch,
@@ -35,7 +42,8 @@ def evidence(state: State, cfg: Config) -> PriorEvidence | None:
         regions=state.alignment.labels,
         places=places.posteriors[rows].sum(axis=0).astype(np.float32),
         instances=instances,
-        holding=np.zeros((count, 0), np.float32),
+        objects=[item.name for item in prior.objects] if looked else [],
+        holding=_by_label(held, labels, count) if looked else np.zeros((count, 0), np.float32),
         pairs=pairs.astype(np.float32),
         touching=_touching(places.regions[state.graph.edges], ids, labels, count),
     )
@@ -49,3 +57,26 @@ def _touching(ends: np.ndarray, ids: np.ndarray, labels: np.ndarray, count: int)
     np.add.at(touching, (one, other), 1)
     np.add.at(touching, (other, one), one != other)
     return touching
+
+
+def _held(view: ObjectView, positions_m: np.ndarray, regions: np.ndarray, ids: np.ndarray) -> np.ndarray:
+    """How surely (region, concept) each of the regions `ids` holds each kind of object: the word of its best candidate.
+
+    An object stands in the region of its nearest place. The best, as in the object expert, because the doubts of many
+    objects about what they are do not add up to one that is there.
+    """
+    held = np.zeros((len(ids), view.concepts.shape[1]))
+    if len(view.ids):
+        distances_m, nearest = cKDTree(positions_m).query(view.positions_m)
+        region = regions[nearest]
+        inside = np.flatnonzero((distances_m <= OBJECT_REACH_M) & np.isin(region, ids))
+        words = view.words[inside, None] * view.concepts[inside]
+        np.maximum.at(held, np.searchsorted(ids, region[inside]), words)
+    return held
+
+
+def _by_label(held: np.ndarray, labels: np.ndarray, count: int) -> np.ndarray:
+    """Sums (label, concept) over the regions of each label."""
+    holding = np.zeros((count, held.shape[1]), np.float32)
+    np.add.at(holding, labels, held)
+    return holding

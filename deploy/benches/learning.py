@@ -1,0 +1,174 @@
+"""`prior-sg bench learning`: does a prior that is wrong about the world come right while robots explore homes?
+
+The prior in hand is the library's. In each world some pairs of regions have exchanged their objects, neighbours and
+frequencies. A robot explores home after home, each labelled by the real segmenter under the prior as revised so far;
+what the segmenter counts revises it. Other homes of the same world, the same for every prior, give F1_S.
+"""
+
+import statistics
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from deploy.benches import homes
+from deploy.benches.homes import ROBOT, WIDTH, Home, Sight
+from deploy.evaluation.metrics import Overlap, scores_of
+from schemas.features import TextRequest
+from schemas.priors import Prior, PriorEvidence, Task
+from schemas.status import Tick
+from services.prior_gateway import core as gateway
+from services.prior_gateway import learning, library
+from services.segmenter import core, inference, observed
+from services.segmenter.regions import components
+from services.segmenter.state import Config, State, empty
+
+REGIONS = [
+    *("kitchen", "dining room", "living room", "bedroom", "bathroom", "hallway"),
+    *("home office", "laundry room", "garage", "balcony", "pantry", "entrance"),
+]
+EXPLORED = (0, 1, 3, 10)
+WORLDS = 8
+EXCHANGED_PAIRS = 3  # half of the regions
+TEST_HOMES = 8  # of each world
+STRENGTHS = (1.0, 16.0)  # beside the default
+TRUTH_HOMES = 3_000  # in which the frequency of touching is counted
+GROSS = 0.3  # entries of containment by which the prior in hand is wrong at least
+SIGHTS = {  # by the suffix of their figures; the main one gives about the F1_S of the sample home
+    "": Sight(lookalike=1.1, detected=0.8, mistaken=0.15),
+    "_dim": Sight(lookalike=1.5, detected=0.8, mistaken=0.15),
+    "_sure_objects": Sight(lookalike=1.1, detected=1.0, mistaken=0.0),
+}
+CFG = Config(evidence_ticks=0)
+
+
+def learning_bench(worlds: int = WORLDS) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Errors of the matrices and F1_S after some homes, means and standard deviations over worlds."""
+    default = learning.LearningConfig().strength
+    found: dict[str, list[float]] = {}
+    for seed in range(worlds):
+        for suffix, sight in SIGHTS.items():
+            world = World(seed, sight)
+            figures = world.run(default) | (world.sweep() if not suffix else {})
+            for name, value in figures.items():
+                found.setdefault(name + suffix, []).append(value)
+    metrics: dict[str, Any] = {name: statistics.mean(values) for name, values in found.items()}
+    metrics |= {f"{name}_sd": statistics.stdev(values) for name, values in found.items()}
+    settings = {"worlds": worlds, "test_homes": TEST_HOMES, "rooms": WIDTH**2, "regions": len(REGIONS)}
+    return metrics, settings | {"exchanged_pairs": EXCHANGED_PAIRS, "strength": default, "others": STRENGTHS}
+
+
+def prior_in_hand() -> Prior:
+    """The library's, for fixed regions."""
+    task = Task(robot=ROBOT, stamp_ns=1, environment="residential home", task="real-estate listing", regions=REGIONS)
+    return library.load().answer(task, gateway.Config())
+
+
+class World:
+    """Homes that differ from the prior in hand."""
+
+    def __init__(self, seed: int, sight: Sight) -> None:
+        self.sight, self.rng = sight, np.random.default_rng(seed)
+        self.prior = prior_in_hand()
+        self.truth = homes.exchanged(self.prior, EXCHANGED_PAIRS, self.rng)
+        sample = homes.layouts(self.truth, TRUTH_HOMES, self.rng)
+        self.adjacency = homes.touching_frequency(sample, len(REGIONS))
+        self.test = [self._home(labels) for labels in homes.layouts(self.truth, TEST_HOMES, self.rng)]
+        self.explored = [self._home(labels) for labels in homes.layouts(self.truth, max(EXPLORED), self.rng)]
+        self.states = [explore(home) for home in self.test]
+
+    def _home(self, labels: np.ndarray) -> Home:
+        return homes.home(labels, self.truth, self.sight, CFG.space, self.rng)
+
+    def run(self, strength: float) -> dict[str, float]:
+        """Figures after each number of homes, and what the true prior would give."""
+        metrics = self.after(strength, EXPLORED)
+        metrics["f1_s_gain"] = metrics[f"f1_s_{max(EXPLORED)}"] - metrics["f1_s_0"]
+        metrics["f1_s_true"] = self.f1(msgspec.structs.replace(self.truth, adjacency=self._statable()))
+        return metrics
+
+    def sweep(self) -> dict[str, float]:
+        """The same for other strengths."""
+        return {
+            f"{name}_strength_{strength:g}": value
+            for strength in STRENGTHS
+            for name, value in self.after(strength, EXPLORED[1:]).items()
+        }
+
+    def after(self, strength: float, explored: tuple[int, ...]) -> dict[str, float]:
+        """Errors and F1_S after so many homes."""
+        priors, metrics = self.learnt(strength), dict[str, float]()
+        for number in explored:
+            figures = self.errors(priors[number]) | {"f1_s": self.f1(priors[number])}
+            metrics |= {f"{name}_{number}": value for name, value in figures.items()}
+        return metrics
+
+    def _statable(self) -> np.ndarray:
+        """The true frequencies as a prior may state them."""
+        known = np.where(np.isfinite(self.adjacency), self.adjacency, self.truth.adjacency)
+        return np.clip(known, learning.LEAST, learning.MOST).astype(np.float32)
+
+    def learnt(self, strength: float) -> list[Prior]:
+        """The prior after 0, 1, 2, ... homes."""
+        priors, seen = [self.prior], list[PriorEvidence]()
+        for home in self.explored:
+            state = explore(home)
+            label(state, home, priors[-1])
+            counted = observed.evidence(state, CFG)
+            seen += [] if counted is None else [counted]
+            totals = learning.totals(self.prior, seen)
+            priors.append(learning.revised(self.prior, totals, strength, self.prior.provenance))
+        return priors
+
+    def errors(self, prior: Prior) -> dict[str, float]:
+        """Mean absolute errors of the entries; of adjacency those between different regions that met."""
+        met = np.isfinite(self.adjacency) & ~np.eye(len(REGIONS), dtype=bool)
+        gross = np.abs(self.prior.containment - self.truth.containment) >= GROSS
+        held = np.abs(prior.containment - self.truth.containment)
+        ours, theirs = ([region.existence for region in one.regions] for one in (prior, self.truth))
+        return {
+            "containment_error": float(held.mean()),
+            "containment_error_gross": float(held[gross].mean()),
+            "adjacency_error": float(np.abs(prior.adjacency - self.adjacency)[met].mean()),
+            "existence_error": float(np.abs(np.subtract(ours, theirs)).mean()),
+        }
+
+    def f1(self, prior: Prior) -> float:
+        """Mean F1_S of the test homes."""
+        scores = []
+        for home, state in zip(self.test, self.states, strict=True):
+            label(state, home, prior)
+            scores.append(f1_s(home.truth, state))
+        return statistics.mean(scores)
+
+
+def explore(home: Home) -> State:
+    """A segmenter that has seen all of a home, before any prior."""
+    state = empty(CFG, ROBOT, 1)
+    for message in (home.places, *home.pyramids):
+        list(core.update(state, message, CFG))
+    return state
+
+
+def label(state: State, home: Home, prior: Prior) -> None:
+    """Put a prior in force and let the segmenter come to rest."""
+    task = Task(robot=ROBOT, stamp_ns=1, environment=prior.environment, task=prior.task, regions=prior.vocabulary)
+    for message in (task, prior):
+        for output in list(core.update(state, message, CFG)):
+            if isinstance(output, TextRequest):
+                list(core.update(state, homes.text(output, prior), CFG))
+    assert state.alignment is not None and state.alignment.digest == prior.digest()
+    inference.see_objects(state, home.objects, CFG)
+    list(core.update(state, Tick(stamp_ns=1), CFG))
+
+
+def f1_s(truth: np.ndarray, state: State) -> float:
+    """F1_S of the regions; every place stands for the same volume. `truth` (place,) labels."""
+    places = state.places
+    true_ids = components(truth, state.graph.edges)
+    _, rows = np.unique(places.regions, return_inverse=True)
+    shared = np.zeros((rows.max() + 1, true_ids.max() + 1), np.int64)
+    np.add.at(shared, (rows, true_ids), 1)
+    same = np.zeros(shared.shape, bool)
+    same[rows, true_ids] = places.labels == truth  # a region has one label, so every place of a pair says the same
+    return scores_of(Overlap(shared, shared.sum(axis=1), shared.sum(axis=0), same), same)["f1"]
