@@ -18,7 +18,7 @@ from deploy.evaluation.metrics import GroundTruth
 from deploy.evaluation.perception import ROBOT, EvaluationError, Perception
 from schemas.codec import Message
 from schemas.features import Pyramid, TextEmbeddings, TextRequest
-from schemas.objects import ObjectDelta
+from schemas.objects import Detections, ObjectDelta
 from schemas.places import PlaceDelta
 from schemas.priors import Prior, Task
 from schemas.regions import RegionDelta
@@ -73,18 +73,19 @@ class Variant:
     config: Config
     prior: Callable[[Case], Prior] = lambda case: case.prior
     pyramids: Callable[[Case], Sequence[Pyramid]] = lambda case: case.perception.pyramids
+    detections: Callable[[Case], Sequence[Detections]] = lambda case: case.perception.detections
     text: Callable[[TextEmbeddings], TextEmbeddings] = lambda text: text
     seen: Callable[[Case, State], None] = lambda case, state: None  # may change what the segmenter has seen
 
     def run(self, case: Case) -> Scene:
-        """Places, then all pyramids, then task and prior: the field is solved once, over everything."""
+        """Places, all pyramids and detections, then task and prior; the field is solved when all that is known."""
         prior, perception = self.prior(case), case.perception
         config = msgspec.structs.replace(self.config, space=perception.space)
         task = Task(robot=ROBOT, stamp_ns=0, environment=prior.environment, task=prior.task, regions=prior.vocabulary)
         segmenter = Segmenter(config, lambda concepts: self.text(perception.text(concepts)))
-        segmenter.read([perception.places, *self.pyramids(case)])
+        segmenter.read([perception.places, *self.pyramids(case), *self.detections(case)])
         self.seen(case, segmenter.state)
-        return segmenter.read([task, prior, Tick(stamp_ns=1)])
+        return segmenter.read([task, prior, Tick(stamp_ns=1), Tick(stamp_ns=2)])
 
 
 class Segmenter:
@@ -104,14 +105,13 @@ class Segmenter:
                 store.apply_places(self._graph, message)
                 store.note_cameras(self._graph, message)
             for output in list(BY_NAME["segmenter"].step(self.state, message, self.config)):
-                if not isinstance(output, Ask):
-                    if isinstance(output[1], ObjectDelta):
-                        store.apply_objects(self._graph, output[1])
-                    else:
-                        assert isinstance(output[1], RegionDelta)
-                        store.apply_regions(self._graph, output[1])
-                elif isinstance(output.request, TextRequest):
-                    waiting.insert(0, self.text(output.request.concepts))
+                if isinstance(output, Ask):
+                    if isinstance(output.request, TextRequest):
+                        waiting.insert(0, self.text(output.request.concepts))
+                elif isinstance(output[1], ObjectDelta):
+                    store.apply_objects(self._graph, output[1])
+                elif isinstance(output[1], RegionDelta):
+                    store.apply_regions(self._graph, output[1])
         return store.scene(self._graph)
 
 
@@ -131,6 +131,7 @@ def ablations(config: Config) -> list[Method]:
         return [oracles.top_layer(pyramid) for pyramid in case.perception.pyramids]
 
     unscaled = msgspec.structs.replace(kernel, gamma=ANY_SCALE)
+    heard = msgspec.structs.replace(config.tracking, unprompted_weight=1.0)
     unhidden = msgspec.structs.replace(kernel, occlusion_tolerance_m=NEVER_M)
     parts = {
         "no sharing": (
@@ -142,6 +143,10 @@ def ablations(config: Config) -> list[Method]:
             "labels that the encoder favours everywhere are not corrected",
         ),
         "no pairwise term": (Variant(msgspec.structs.replace(config, beta=0.0)), "beta = 0"),
+        "all objects speak": (
+            Variant(msgspec.structs.replace(config, tracking=heard)),
+            "also those of a detector that does not know the prior's",
+        ),
         "no scale trust": (Variant(msgspec.structs.replace(config, kernel=unscaled)), "crops of any scale count alike"),
         "no occlusion test": (Variant(msgspec.structs.replace(config, kernel=unhidden)), "hidden places count as seen"),
         "global feature": (
@@ -193,7 +198,11 @@ def oracle(config: Config, name: str) -> Method:
         variant = Variant(config, pyramids=lambda case: _true_pyramids(case, config.object_phrases))
         about = "crops carry the text embedding of the true region that most of their points lie in"
     elif name == "objects":
-        variant = Variant(config, seen=lambda case, state: _see_true_objects(case, state, config))
+        variant = Variant(
+            config,
+            detections=lambda case: () if case.objects else case.perception.detections,
+            seen=lambda case, state: _see_true_objects(case, state, config),
+        )
         about = "the objects are those of the ground truth that the robot has seen; as ours where it names none"
     else:
         variant = Variant(config, seen=lambda case, state: _see_truth(case, state, config.object_phrases))

@@ -1,4 +1,4 @@
-"""What all methods are compared on: the places, the map and the encoded crops of one sequence, made in this process.
+"""What all methods are compared on: the places, the map, the encoded crops and objects of one sequence, made in this process.
 
 Making them takes minutes and judging methods takes seconds, so they are kept on disk, under a digest of what
 determines them: the names, times and sizes of the source's files, the settings, and the code that made them, other than
@@ -19,8 +19,9 @@ from deploy.evaluation.metrics import GroundTruth
 from schemas.codec import Message, decode, encode
 from schemas.features import Pyramid, TextEmbeddings, TextRequest
 from schemas.frames import Keyframe
+from schemas.objects import Detections
 from schemas.places import MapRequest, PlaceDelta, SnapshotRequest, VoxelMap
-from schemas.topics import KEYFRAME, PLACE_SNAPSHOT, PYRAMID, TEXT, VOXEL_MAP
+from schemas.topics import DETECTIONS, KEYFRAME, PLACE_SNAPSHOT, PYRAMID, TEXT, VOXEL_MAP
 from services.ingest.sources import Source, open_source
 from services.registry import BY_NAME
 from services.runtime.config import resolve
@@ -48,6 +49,7 @@ class Perception:
     pyramids: tuple[Pyramid, ...]
     space: str
     text: TextOf  # concept descriptors in that space
+    detections: tuple[Detections, ...] = ()
     seconds: dict[str, float] = field(default_factory=dict)  # what making it took, by part; 0 = was on disk
 
 
@@ -89,25 +91,26 @@ class Perceiver:
         cfg = self._config("feature_pyramid", features)
         seconds: dict[str, float] = {}
         snapshot, voxels = self._kept("places", path, None, lambda: self._places(source), seconds)
-        pyramids = self._kept("features", path, cfg, lambda: self._pyramids(source, cfg), seconds)
+        features_made = self._kept("features", path, cfg, lambda: self._features(source, cfg), seconds)
         return Perception(
             name=sequence_name(path),
             places=decode(PlaceDelta, snapshot),
             voxels=decode(VoxelMap, voxels),
-            pyramids=tuple(decode(Pyramid, pyramid) for pyramid in pyramids),
+            pyramids=tuple(decode(Pyramid, pyramid) for pyramid in features_made[::2]),
             space=cfg.space,
             text=lambda concepts: self._text(concepts, cfg),
+            detections=tuple(decode(Detections, found) for found in features_made[1::2]),
             seconds=seconds,
         )
 
     def _kept(
         self, kind: str, path: Path, features: Any, make: Callable[[], list[bytes]], seconds: dict[str, float]
     ) -> list[bytes]:
-        made_by = {"ingest": (self._config("ingest"), self._code["ingest"])}
+        made_by: dict[str, Any] = {"ingest": (self._config("ingest"), self._code["ingest"])}
         if features is None:
             made_by["place_graph"] = (self._config("place_graph"), self._code["place_graph"])
         else:
-            made_by["feature_pyramid"] = (features, self._code["feature_pyramid"])
+            made_by["feature_pyramid"] = (features, self._code["feature_pyramid"], "pyramids and detections")
         key = {"source": source_digest(path), "made_by": made_by}
         seconds[kind] = 0.0
         content = self.cache.get(f"{sequence_name(path)}-{kind}", key)
@@ -134,15 +137,14 @@ class Perceiver:
         ]
         return [encode(reply) for reply in replies]
 
-    def _pyramids(self, source: Source, cfg: Any) -> list[bytes]:
+    def _features(self, source: Source, cfg: Any) -> list[bytes]:
+        """Pyramid and detections of each keyframe in turn."""
         worker, step = self._worker(cfg), BY_NAME["feature_pyramid"].step
-        frames = self._keyframes(source, "features")
-        return [
-            encode(output[1])
-            for frame in frames
-            for output in step(worker, frame, cfg)
-            if isinstance(output, tuple) and output[0] is PYRAMID
-        ]
+        made: list[bytes] = []
+        for frame in self._keyframes(source, "features"):
+            messages = {output[0].name: output[1] for output in step(worker, frame, cfg) if isinstance(output, tuple)}
+            made += [encode(messages[PYRAMID.name]), encode(messages[DETECTIONS.name])]
+        return made
 
     def _keyframes(self, source: Source, what: str) -> Iterator[Keyframe]:
         """The keyframes that ingest selects, each with a report of how far the source is."""
@@ -166,7 +168,7 @@ class Perceiver:
 
     def _worker(self, cfg: Any) -> Any:
         """The encoder of these settings; weights are loaded when something is not on disk yet."""
-        key = (cfg.space, cfg.threads, cfg.batch_size)
+        key = (cfg.space, cfg.threads, cfg.batch_size, cfg.detector, cfg.detector_prompts)
         if key not in self._workers:
             self.report(f"loading {cfg.space}", 0, 0)
             self._workers[key] = BY_NAME["feature_pyramid"].init(cfg, Identity(ROBOT, "worker", 1))
