@@ -1,4 +1,4 @@
-"""What all methods are compared on: the places, the map, the encoded crops and objects of one sequence, made in this process.
+"""What all methods are compared on: places, map, encoded crops and detections of one sequence, made in this process.
 
 Making them takes minutes and judging methods takes seconds, so they are kept on disk, under a digest of what
 determines them: the names, times and sizes of the source's files, the settings, and the code that made them, other than
