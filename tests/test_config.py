@@ -6,6 +6,16 @@ import pytest
 from services.runtime.config import ConfigError, from_arguments, from_environment, merge, read_file, resolve
 
 
+class Group(msgspec.Struct, frozen=True, kw_only=True):
+    limit: float = 0.5
+    count: int = 3
+
+
+class Grouped(msgspec.Struct, frozen=True, kw_only=True):
+    group: Group = Group()
+    weights: dict[str, float] = msgspec.field(default_factory=dict)
+
+
 class Config(msgspec.Struct, frozen=True, kw_only=True):
     beta: float = 2.0
     names: list[str] = msgspec.field(default_factory=lambda: ["visual"])
@@ -39,6 +49,20 @@ def test_defaults_file_environment_arguments(tmp_path):
 def test_faults(arguments, sentence):
     with pytest.raises(ConfigError, match=sentence):
         resolve(Config, "segmenter", merge(from_arguments(arguments)))
+
+
+def test_fields_inside_a_group_are_named_with_dots(tmp_path):
+    path = tmp_path / "robot.toml"
+    path.write_text("[segmenter.group]\nlimit = 0.1\ncount = 7\n")
+    environment = from_environment({"PSG_SEGMENTER__GROUP__LIMIT": "0.2"})
+    layers = merge(read_file(path), environment)
+    assert resolve(Grouped, "segmenter", layers) == Grouped(group=Group(limit=0.2, count=7))
+    layers = merge(layers, from_arguments(["segmenter.group.count=9", 'segmenter.weights={"a": 1.5}']))
+    assert resolve(Grouped, "segmenter", layers) == Grouped(group=Group(limit=0.2, count=9), weights={"a": 1.5})
+    with pytest.raises(ConfigError, match=r"segmenter\.group has no setting 'most'; it has: count, limit"):
+        resolve(Grouped, "segmenter", from_arguments(["segmenter.group.most=1"]))
+    with pytest.raises(ConfigError, match=r"segmenter has no setting 'weights\.a'"):
+        resolve(Grouped, "segmenter", from_arguments(["segmenter.weights.a=1"]))
 
 
 def test_unreadable_file(tmp_path):

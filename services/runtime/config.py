@@ -66,22 +66,49 @@ def check_sections(layers: Mapping[str, Any], known: Sequence[str]) -> None:
 
 
 def resolve(config_type: type[C], section: str, layers: Mapping[str, Mapping[str, Any]]) -> C:
-    """The config of one service. Text values are read as the field's type; lists as JSON.
+    """The config of one service. Text values are read as the field's type; lists and groups as JSON.
 
-    A config with `PRESETS` has a setting `preset`, which names the defaults that all others change.
+    `tracking.cell_m` (in the environment `TRACKING__CELL_M`) names a field inside a group. A config with `PRESETS` has
+    a setting `preset`, which names the defaults that all others change.
     """
     values = dict(layers.get(section, {}))
     values = getattr(config_type, "PRESETS", {}).get(values.get("preset"), {}) | values
-    fields = {field.name: field for field in msgspec.structs.fields(config_type)}
-    for name, value in values.items():
-        if name not in fields:
-            raise ConfigError(f"{section} has no setting {name!r}; it has: {', '.join(sorted(fields))}")
-        if isinstance(value, str) and value.startswith(("[", "{")):
-            try:
-                values[name] = msgspec.json.decode(value)
-            except msgspec.DecodeError as error:
-                raise ConfigError(f"{section}.{name}: {value!r} is not valid JSON: {error}") from error
+    values = _checked(config_type, section, values)
     try:
         return msgspec.convert(values, config_type, strict=False)
     except (msgspec.ValidationError, ValueError) as error:
         raise ConfigError(f"{section}: {error}") from error
+
+
+def _checked(config_type: type, section: str, values: Mapping[str, Any]) -> dict[str, Any]:
+    """The values by field, groups as mappings, every name known."""
+    fields = {field.name: field.type for field in msgspec.structs.fields(config_type)}
+    inner: dict[str, dict[str, Any]] = {}
+    found: dict[str, Any] = {}
+    for name, value in values.items():
+        field, dot, rest = name.replace("__", ".").partition(".")
+        if field not in fields or (dot and not _is_group(fields[field])):
+            raise ConfigError(f"{section} has no setting {name!r}; it has: {', '.join(sorted(fields))}")
+        if dot:
+            inner.setdefault(field, {})[rest] = value
+        else:
+            found[field] = _decoded(f"{section}.{field}", value)
+    for field, rest_values in inner.items():
+        found[field] = {**found.get(field, {}), **rest_values}
+    for field, value in found.items():
+        if _is_group(fields[field]) and isinstance(value, Mapping):
+            found[field] = _checked(fields[field], f"{section}.{field}", value)
+    return found
+
+
+def _is_group(kind: Any) -> bool:
+    return isinstance(kind, type) and issubclass(kind, msgspec.Struct)
+
+
+def _decoded(name: str, value: Any) -> Any:
+    if not (isinstance(value, str) and value.startswith(("[", "{"))):
+        return value
+    try:
+        return msgspec.json.decode(value)
+    except msgspec.DecodeError as error:
+        raise ConfigError(f"{name}: {value!r} is not valid JSON: {error}") from error
