@@ -11,8 +11,8 @@ from typing import Any
 import msgspec
 import zenoh
 
-from deploy import bench_segmenter
 from deploy.benches import features as bench_features
+from deploy.benches import segmenter
 from deploy.benches.kernel import kernel
 from deploy.benches.learning import learning_bench
 from deploy.benches.places import place_bench
@@ -173,8 +173,8 @@ BENCHES: dict[str, Callable[[], tuple[dict, dict]]] = {
     "features": features,
     "kernel": kernel,
     "swap": swap_bench,
-    "segmenter": bench_segmenter.updates,
-    "task": bench_segmenter.switch,
+    "segmenter": segmenter.updates,
+    "task": segmenter.switch,
     "learning": learning_bench,
     "e2e": e2e,
 }
