@@ -1,4 +1,4 @@
-"""The solver that follows changes, the dual bound and the marginals."""
+"""The solver that follows changes, and the dual bound."""
 
 import itertools
 
@@ -8,9 +8,8 @@ import pytest
 from services.segmenter import swap
 from services.segmenter.adjacency import adjacency
 from services.segmenter.bound import lower_bound
-from services.segmenter.field import Field, conditional_costs, energy
+from services.segmenter.field import Field, energy
 from services.segmenter.incremental import Settings, Solver, changed_rows
-from services.segmenter.marginals import marginals, marginals_near, min_marginals
 from tests.segmenter_fields import all_energies, best_swap, random_field, random_tree
 
 
@@ -232,67 +231,8 @@ def test_the_dual_bound_is_one(seed):
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_on_trees_the_bound_and_the_marginals_are_exact(seed):
+def test_on_trees_the_bound_and_the_labels_are_exact(seed):
     field = random_tree(seed, places=7, labels=3)
-    every, energies = all_energies(field)
+    energies = all_energies(field)[1]
     assert lower_bound(field) == pytest.approx(energies.min(), rel=1e-6)
     assert energy(field, swap.minimise(field, field.unary.argmin(axis=1))) == pytest.approx(energies.min())
-    np.testing.assert_allclose(min_marginals(field, reweighted=False), least_energies(every, energies, 3), atol=1e-4)
-    np.testing.assert_allclose(marginals(field), shares(every, energies, 3), atol=1e-3)
-    flat = marginals(field, temperature=2.0)
-    np.testing.assert_allclose(flat, shares(every, energies / 2.0, 3), atol=1e-3)
-
-
-def least_energies(every, energies, labels):
-    least = [[energies[every[:, p] == label].min() for label in range(labels)] for p in range(every.shape[1])]
-    return np.array(least) - energies.min()
-
-
-def shares(every, energies, labels):
-    weights = np.exp(energies.min() - energies)
-    weights /= weights.sum()
-    return np.array([[weights[every[:, p] == label].sum() for label in range(labels)] for p in range(every.shape[1])])
-
-
-def test_marginals_of_small_fields_with_cycles():
-    """Reweighted sums come close, far closer than costs with the neighbours fixed, which err on the sure side."""
-    errors, fixed_errors, low, high = [], [], [], []
-    for seed in range(40):
-        field = random_field(seed, places=7, labels=3, degree=4)
-        every, energies = all_energies(field)
-        exact, least = shares(every, energies, 3), least_energies(every, energies, 3)
-        fixed = conditional_costs(field, every[energies.argmin()])
-        fixed -= fixed.min(axis=1, keepdims=True)
-        odds = np.exp(-fixed)
-        errors.append(np.abs(marginals(field, passes=30) - exact).mean())
-        fixed_errors.append(np.abs(odds / odds.sum(axis=1, keepdims=True) - exact).mean())
-        low.append((min_marginals(field, passes=200) - least).mean())
-        high.append((fixed - least).min())
-    assert np.mean(errors) < 0.07
-    assert np.mean(errors) < 0.5 * np.mean(fixed_errors)
-    assert np.mean(low) <= 1e-3
-    assert min(high) > -1e-9
-
-
-def test_marginals_of_some_places_given_the_others():
-    field = random_field(4, places=30, labels=3)
-    labels = swap.minimise(field, field.unary.argmin(axis=1))
-    rows = np.array([3])
-    costs = conditional_costs(field, labels)[rows]
-    np.testing.assert_allclose(
-        min_marginals(field, labels=labels, rows=rows), costs - costs.min(axis=1, keepdims=True), atol=1e-4
-    )
-    expected = np.exp(costs.min() - costs)
-    np.testing.assert_allclose(marginals(field, labels=labels, rows=rows), expected / expected.sum(), atol=1e-4)
-    with pytest.raises(ValueError, match="labels"):
-        marginals(field, rows=rows)
-
-
-def test_marginals_near_some_places_are_those_of_the_whole_field():
-    field = random_field(8, places=300, labels=4, degree=3)
-    field = field._replace(weights=0.5 * field.weights)
-    labels = swap.minimise(field, field.unary.argmin(axis=1))
-    centers = np.array([250, 3, 120])
-    near = marginals_near(field, labels, centers, reach=6, passes=40)
-    np.testing.assert_allclose(near, marginals(field, passes=40)[centers], atol=0.03)
-    assert np.abs(near - marginals_near(field, labels, centers, reach=0)).max() > 0.05

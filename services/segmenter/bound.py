@@ -22,8 +22,8 @@ def lower_bound(field: Field, passes: int = 400, close_enough: float = 1e-9) -> 
     take_up(rows, graph, np.ascontiguousarray(field.unary, np.float64), np.zeros(places, np.int64), messages)
     best, before = -np.inf, -np.inf
     for number in range(passes):
-        run_pass(rows, True, graph, messages, True)
-        best = max(best, run_pass(rows, False, graph, messages, True))
+        run_pass(rows, True, graph, messages)
+        best = max(best, run_pass(rows, False, graph, messages))
         if number % 20 == 19:
             if best - before <= close_enough * abs(best):
                 break

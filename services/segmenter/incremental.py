@@ -205,7 +205,7 @@ class Solver:
 def round_trip(rows, labels, graph, unary, pairwise, messages, mark, least_gain):  # noqa: PLR0917, ANN001, ANN201
     """Pass messages there and back over `rows`; fuse the labels of both passes into `labels`."""
     for forward in (True, False):
-        run_pass(rows, forward, graph, messages, True)
+        run_pass(rows, forward, graph, messages)
         fuse(rows, messages.proposed, labels, graph, unary, pairwise, mark, least_gain)
 
 

@@ -72,12 +72,29 @@ def lay_down(rows, messages):  # noqa: ANN001, ANN201
         messages.inside[place] = False
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
-def run_pass(rows, forward, graph, messages, reweighted):  # noqa: ANN001, ANN201
-    """One pass over `rows` (ascending) in order or back; fills in `proposed`, returns the bound (valid passing back).
+@njit(cache=True, nogil=True, fastmath=FAST, inline="always")
+def _tell(told, weight, pairwise, incoming, arc):  # noqa: ANN001, ANN202
+    """The message to `arc`, min_i told[i] + weight V[i, j] less its least value, which is returned."""
+    count, padded = pairwise.shape
+    least = incoming.dtype.type(FAR)
+    for label in range(padded):
+        incoming[arc, label] = FAR
+    for other in range(0, count, UNROLLED):
+        told_0, told_1, told_2, told_3 = told[other], told[other + 1], told[other + 2], told[other + 3]
+        for label in range(padded):
+            low = min(told_0 + weight * pairwise[other, label], told_1 + weight * pairwise[other + 1, label])
+            high = min(told_2 + weight * pairwise[other + 2, label], told_3 + weight * pairwise[other + 3, label])
+            incoming[arc, label] = min(incoming[arc, label], low, high)
+    for label in range(count):
+        least = min(least, incoming[arc, label])
+    for label in range(padded):
+        incoming[arc, label] -= least
+    return least
 
-    Not `reweighted`, it is the plain min-sum algorithm: exact on trees, without a bound.
-    """
+
+@njit(cache=True, nogil=True, fastmath=FAST)
+def run_pass(rows, forward, graph, messages):  # noqa: ANN001, ANN201
+    """One pass over `rows` (ascending) in order or back; fills in `proposed`, returns the bound."""
     starts, neighbours, weights, twins = graph.starts, graph.neighbours, graph.weights, graph.twins
     costs, incoming, pairwise = messages.costs, messages.incoming, messages.pairwise
     inside, proposed = messages.inside, messages.proposed
@@ -113,30 +130,16 @@ def run_pass(rows, forward, graph, messages, reweighted):  # noqa: ANN001, ANN20
             least = min(least, open_[label] + known[label])
         proposed[place] = best
         bound += least
-        share = number(1.0 / max(before, after, 1)) if reweighted else number(1.0)
+        share = number(1.0 / max(before, after, 1))
         for label in range(padded):
             known[label] = share * (open_[label] + known[label] - least)
         for arc in range(starts[place], starts[place + 1]):
             neighbour = neighbours[arc]
             if not inside[neighbour] or (neighbour < place) == forward:
                 continue
-            weight, twin, least = number(weights[arc]), twins[arc], number(FAR)
             for label in range(padded):
                 told[label] = known[label] - incoming[arc, label]
-                incoming[twin, label] = FAR
-            for other in range(0, count, UNROLLED):
-                told_0, told_1, told_2, told_3 = told[other], told[other + 1], told[other + 2], told[other + 3]
-                for label in range(padded):
-                    low = min(told_0 + weight * pairwise[other, label], told_1 + weight * pairwise[other + 1, label])
-                    high = min(
-                        told_2 + weight * pairwise[other + 2, label], told_3 + weight * pairwise[other + 3, label]
-                    )
-                    incoming[twin, label] = min(incoming[twin, label], low, high)
-            for label in range(count):
-                least = min(least, incoming[twin, label])
-            for label in range(padded):
-                incoming[twin, label] -= least
-            bound += least
+            bound += _tell(told, number(weights[arc]), pairwise, incoming, twins[arc])
     return bound
 
 
