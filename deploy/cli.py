@@ -165,7 +165,7 @@ def _add_tools(command: Command) -> None:
     export.add_argument("--database", type=Path, help="read this scene.sqlite instead of the running store")
     _add_bus(export)
 
-    explain = command("explain", "say why a place carries its label", "prior-sg explain 12 --log out/demo/log.mcap")
+    explain = command("explain", "say why a place carries its label", "prior-sg explain 49 --log out/demo/log.mcap")
     explain.add_argument("place", type=int, help="id of the place, as in scene.json")
     explain.add_argument("--log", type=Path, help="ask the segmenter at the end of this log, not the running one")
     explain.add_argument("--json", action="store_true", help="print JSON")
