@@ -8,6 +8,7 @@ import numpy as np
 from schemas.codec import Message, Shape
 from schemas.frames import Intrinsics, Pose, check_pose
 
+_NO_NAMES = msgspec.field(default_factory=lambda: np.zeros(0, np.int16))
 _NO_MERGES = msgspec.field(default_factory=lambda: np.zeros((0, 2), np.int64))
 
 
@@ -23,7 +24,7 @@ class Detections(Message, frozen=True, kw_only=True):
     stamp_ns: int
     space: str  # embedding space
     detector: str  # its setting, for example segments
-    prompted: bool  # whether the detector was asked for a prior's objects, so that each detection is one of them
+    prompted: bool  # whether the detector looks for objects by name
     worker: str
     intrinsics: Intrinsics
     world_from_camera: Pose
@@ -33,9 +34,15 @@ class Detections(Message, frozen=True, kw_only=True):
     point_counts: Annotated[np.ndarray, Shape("int32", "detection")]  # at least 1 each
     points_camera_m: Annotated[np.ndarray, Shape("float16", "point", 3)]
     surface_m: Annotated[np.ndarray, Shape("float16", "row", "column")]  # coarse depth image, 0 = no measurement
+    sought: list[str] = []  # the names that a prompted detector was asked for
+    names: Annotated[np.ndarray, Shape("int16", "named")] = _NO_NAMES  # of each detection, the index into `sought`
 
     def check(self) -> None:
         check_pose(self.world_from_camera)
+        if len(self.names) != (len(self.scores) if self.sought else 0):
+            raise ValueError("names: not one per detection")
+        if len(self.names) and not (self.names.min() >= 0 and self.names.max() < len(self.sought)):
+            raise ValueError("names: no such name was sought")
         if (self.point_counts < 1).any() or self.point_counts.sum() != len(self.points_camera_m):
             raise ValueError("point_counts do not fit the points")
 

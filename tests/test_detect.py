@@ -3,16 +3,22 @@
 import json
 
 import cv2
+import msgspec
 import numpy as np
 import pytest
+from segmenter_world import prior, task
 
 from schemas.codec import decode, encode
 from schemas.frames import Intrinsics, Keyframe
 from schemas.objects import Detections
-from services.feature_pyramid import detect, service, torchvision_parts
+from schemas.priors import ObjectPrior, PriorList, PriorRequest, TaskInForce, TaskRequest
+from services.feature_pyramid import detect, service, torchvision_parts, vocabulary
 from services.feature_pyramid.core import Config
 from services.feature_pyramid.detect import Found, Grid
 from services.feature_pyramid.encoders import EncoderUnavailable
+from services.feature_pyramid.masks import load_masks
+from services.feature_pyramid.prompted import as_sentences, best_sentence
+from services.runtime.service import Ask
 
 CAMERA = Intrinsics(640, 480, 500.0, 500.0, 320.0, 240.0)
 # looking along world x: camera x is world -y, camera y is world -z
@@ -197,18 +203,18 @@ def test_detection_can_be_switched_off():
 
 
 @pytest.mark.parametrize(
-    ("setting", "prompts", "why"),
+    ("setting", "masks", "why"),
     [
-        ("segmnets", (), "no detector is called 'segmnets'"),
-        ("owlv2", ("stove",), "no detector is called 'owlv2'"),
-        ("owlv2:/nowhere", (), "detector_prompts"),
-        ("owlv2:/nowhere", ("stove",), "cannot be loaded"),
-        ("grounding_dino:/nowhere", ("stove",), "cannot be loaded"),
+        ("segmnets", "depth", "no detector is called 'segmnets'"),
+        ("owlv2:", "depth", "no detector is called 'owlv2:'"),
+        ("owlv2:/nowhere", "depth", "weights of the detector owlv2:/nowhere cannot be loaded"),
+        ("grounding_dino:/nowhere", "depth", "cannot be loaded"),
+        ("segments", "sam:/nowhere", "'segments' has none"),
     ],
 )
-def test_a_detector_that_cannot_be_loaded_says_so_in_a_sentence(setting, prompts, why):
+def test_a_detector_that_cannot_be_loaded_says_so_in_a_sentence(setting, masks, why):
     with pytest.raises(EncoderUnavailable, match=why) as caught:
-        detect.load_detector(Config(detector=setting, detector_prompts=prompts))
+        detect.load_detector(Config(detector=setting, detector_masks=masks))
     assert str(caught.value).count("\n") == 0 and str(caught.value).endswith(".")
 
 
@@ -264,11 +270,10 @@ def test_prompted_detectors_give_the_boxes_that_transformers_gives(network, tmp_
     torchvision_parts.load_if_installed()
     torch.manual_seed(0)
     network(tmp_path)
-    setting = f"{network.__name__}:{tmp_path}"
-    cfg = Config(detector=setting, detector_prompts=("stove", "bed"), detector_threshold=0.0, device="cpu")
+    cfg = Config(detector=f"{network.__name__}:{tmp_path}", detector_threshold=0.0, device="cpu")
     detector = detect.load_detector(cfg)
     color = np.random.default_rng(1).integers(0, 255, (480, 640, 3), dtype=np.uint8)
-    boxes_px, scores = detector.boxes(color)
+    boxes_px, scores, names = detector.boxes(color, ("stove", "bed"))
     if network is owlv2:
         prompts, padding = [["a photo of a stove", "a photo of a bed"]], "max_length"
     else:
@@ -276,12 +281,157 @@ def test_prompted_detectors_give_the_boxes_that_transformers_gives(network, tmp_
     read = detector.processor.image_processor.post_process_object_detection
     asked = detector.processor(images=[color], text=prompts, padding=padding, truncation=True, return_tensors="pt")
     with torch.inference_mode():
-        theirs = read(detector.model(**asked), threshold=0.0, target_sizes=[(480, 640)])[0]
+        outputs = detector.model(**asked)
+    theirs = read(outputs, threshold=0.0, target_sizes=[(480, 640)])[0]
     expected = np.clip(theirs["boxes"].numpy(), 0, (640, 480, 640, 480))
     inside = (expected[:, 2:] - expected[:, :2] >= 1).all(axis=1)
     assert inside.any()
     np.testing.assert_allclose(boxes_px, expected[inside], atol=0.01)
     np.testing.assert_allclose(scores, theirs["scores"].numpy()[inside], atol=1e-5)
-    found = detector.detect(color, np.full((480, 640), 3.0, np.float32), CAMERA, POSE)
-    assert found and all(one.mask.any() for one in found) and detector.prompted
+    each = outputs.logits[0].numpy()[:, [0, 1] if network is owlv2 else [1, 3]]  # one token each, after [CLS]
+    assert names.tolist() == each[inside].argmax(axis=1).tolist() and len(set(names.tolist())) == 2
+    alone = detector.boxes(color, ("bed",))
+    assert set(alone[2].tolist()) == {0}
+    found = detector.detect(color, np.full((480, 640), 3.0, np.float32), CAMERA, POSE, ("stove", "bed"))
+    assert found and all(one.mask.any() for one in found)
     assert [one.score for one in found] == sorted((one.score for one in found), reverse=True)
+    assert detector.detect(color, np.full((480, 640), 3.0, np.float32), CAMERA, POSE) == []
+
+
+def test_names_of_several_tokens_by_hand():
+    """[CLS] office chair . sofa . : the mean over a name's tokens decides, not the single best token."""
+    scores = np.array([[0, 0.9, 0.1, 0, 0.6, 0, 0, 0], [0, 0.8, 0.7, 0, 0.6, 0, 0, 0]])
+    assert best_sentence(scores, [101, 7, 8, 9, 5, 9, 102], stop=9).tolist() == [1, 0]
+    assert as_sentences(("Office chair", "St. Bernard dog.")) == "office chair. st  bernard dog."
+
+
+def sam(folder):
+    """A small SAM with random weights."""
+    import transformers
+
+    images = transformers.SamImageProcessor(size={"longest_edge": 64}, pad_size={"height": 64, "width": 64})
+    transformers.SamProcessor(images).save_pretrained(folder)
+    small = {"hidden_size": 16, "num_attention_heads": 2}
+    vision = small | {"num_hidden_layers": 1, "image_size": 64, "output_channels": 16, "global_attn_indexes": [0]}
+    prompts = {"hidden_size": 16, "image_size": 64, "image_embedding_size": 4, "mask_input_channels": 4}
+    config = transformers.SamConfig(
+        vision_config=vision | {"mlp_dim": 16, "num_pos_feats": 8},
+        prompt_encoder_config=prompts,
+        mask_decoder_config=small | {"mlp_dim": 16, "num_hidden_layers": 1, "iou_head_hidden_dim": 16},
+    )
+    transformers.SamModel(config).save_pretrained(folder)
+
+
+def test_masks_are_those_that_transformers_gives(tmp_path):
+    torch = pytest.importorskip("torch")
+    torchvision_parts.load_if_installed()
+    torch.manual_seed(0)
+    sam(tmp_path)
+    cfg = Config(detector="owlv2:x", detector_masks=f"sam:{tmp_path}", device="cpu")
+    masks = load_masks(cfg)
+    color = np.random.default_rng(1).integers(0, 255, (480, 640, 3), dtype=np.uint8)
+    boxes_px = np.array([[40, 60, 300, 400], [320, 10, 630, 200]], np.float32)
+    depth_m = np.full((480, 640), 3.0, np.float32)
+    depth_m[:, 500:] = 0
+    ours = masks.of(color, boxes_px, Grid.of(depth_m, 4))
+    asked = masks.processor(images=[color], input_boxes=[boxes_px.tolist()], return_tensors="pt")
+    with torch.inference_mode():
+        outputs = masks.model(**asked)
+    sizes = (asked["original_sizes"], asked["reshaped_input_sizes"])
+    theirs = masks.processor.image_processor.post_process_masks(outputs.pred_masks, *sizes)[0]
+    assert len(ours) == 2
+    for index, mask in enumerate(ours):
+        full = theirs[index, outputs.iou_scores[0, index].argmax()].numpy()
+        assert full.shape == (480, 640) and 0 < full.mean() < 1
+        assert (mask == full[2::4, 2::4] & (depth_m[2::4, 2::4] > 0)).all()
+    assert masks.of(color, boxes_px[:0], Grid.of(depth_m, 4)) == []
+
+
+class Named(detect.Detector):
+    """Finds the picture's place on the wall, under the last name that is sought."""
+
+    name, prompted = "named", True
+
+    def detect(self, color, depth_m, camera, world_from_camera, sought=()):
+        if not sought:
+            return []
+        mask = np.zeros((120, 160), bool)
+        mask[20:40, 60:90] = True
+        return [Found(np.array([240, 80, 360, 160], np.float32), mask, 0.9, len(sought) - 1)]
+
+
+def ready():
+    """A worker with that detector."""
+    cfg = Config()
+    return service.Worker("worker-7", Colours(), Named()), cfg
+
+
+def ran(state, cfg, *messages):
+    """What steps on messages yield: questions, and outputs by topic."""
+    asked, outputs = [], []
+    for message in messages:
+        for output in service.step(state, message, cfg):
+            if isinstance(output, Ask):
+                asked.append(output.request)
+            else:
+                outputs.append((output[0].name, output[1]))
+    return asked, outputs
+
+
+def test_a_prompted_detector_looks_for_the_objects_of_the_robots_prior():
+    color, depth_m, _ = room()
+    frame = keyframe(color, depth_m)
+    state, cfg = ready()
+    asked, outputs = ran(state, cfg, frame)
+    assert asked == [TaskRequest(robot="ada")] and [name for name, _ in outputs] == ["PYRAMID"]
+    job = prior(["kitchen", "bedroom"])
+    mine = task(robot="ada", environment=job.environment, task=job.task)
+    asked, outputs = ran(state, cfg, TaskInForce(robot="ada", task=mine), frame)
+    assert asked == [PriorRequest(environment=job.environment, task=job.task, regions=[])]
+    assert [name for name, _ in outputs] == ["PYRAMID"]
+    asked, outputs = ran(state, cfg, PriorList(priors=[job]), frame)
+    assert asked == [] and [name for name, _ in outputs] == ["PYRAMID", "DETECTIONS"]
+    detections = decode(Detections, encode(outputs[1][1]))
+    assert detections.sought == [item.name for item in job.objects] == ["oven", "bed"]
+    assert detections.names.tolist() == [1] and detections.prompted
+    other = msgspec.structs.replace(frame, robot="bob")
+    assert ran(state, cfg, other)[0] == [TaskRequest(robot="bob")]
+    fixed = Config(detector_prompts=("lamp",))
+    asked, outputs = ran(service.Worker("w", Colours(), Named()), fixed, frame)
+    assert asked == [] and outputs[1][1].sought == ["lamp"]
+
+
+def test_a_keyframe_made_ready_before_the_prior_changed_is_looked_at_again():
+    color, depth_m, _ = room()
+    frame, job = keyframe(color, depth_m), prior(["kitchen", "bedroom"])
+    orders = []
+    for ahead in (True, False):
+        state, cfg = ready()
+        if ahead:
+            service.prepare(state, [frame], cfg)
+        mine = task(robot="ada", environment=job.environment, task=job.task)
+        _, outputs = ran(state, cfg, mine, job, frame)
+        orders.append([encode(message) for _, message in outputs])
+        assert outputs[1][1].names.tolist() == [1] and not state.views
+        service.SERVICE.close(state)
+    assert orders[0] == orders[1]
+
+
+def test_the_newest_task_and_the_newest_prior_for_it_count():
+    known = vocabulary.Vocabulary()
+    home = prior(["kitchen"])
+    first, second = (
+        task(robot="ada", stamp_ns=stamp, environment="e", task=name) for stamp, name in ((5, "a"), (7, "b"))
+    )
+    answers = [
+        msgspec.structs.replace(
+            home, environment="e", task=name, objects=[ObjectPrior(name=o, phrases=[o]), home.objects[1]]
+        )
+        for name, o in (("a", "sofa"), ("b", "lamp"), ("b", "shelf"))
+    ]
+    for message in (second, first, *answers):
+        vocabulary.hear(known, message)
+    assert vocabulary.objects(known, "ada") == ("shelf", "bed")
+    vocabulary.hear(known, answers[1])  # told again: it is the newest
+    assert vocabulary.objects(known, "ada") == ("lamp", "bed")
+    assert list(vocabulary.questions(known, "ada")) == [] and vocabulary.objects(known, "bob") == ()

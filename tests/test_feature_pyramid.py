@@ -354,7 +354,7 @@ def _frames_seeing(folder, label):
 def test_declaration():
     declared = service.SERVICE
     assert declared.name == "feature_pyramid" and declared.scope == "fleet"
-    assert declared.job is ENCODE and declared.writes == (PYRAMID, DETECTIONS) and not declared.reads
+    assert declared.job is ENCODE and declared.writes == (PYRAMID, DETECTIONS)
     assert declared.key_fields(CFG) == {"space": SPACE} and declared.job_group(CFG) == SPACE
     assert TEXT.key_of(TextRequest(space=SPACE, concepts=[])) == f"psg/encoder/{SPACE}/text"
 

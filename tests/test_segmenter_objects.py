@@ -179,13 +179,23 @@ def test_a_pose_correction_moves_the_object_and_keeps_its_id():
 
 def test_beliefs_by_hand():
     """Standardised similarities 1 and -1 at temperature 2 beside a null at 0: e^2, e^-2 and 1."""
-    found = np.zeros((2, DIM))
+    found = np.zeros((1, DIM))
     found[:, :2] = (0.55, 0.05)  # with mean 0.3 and spread 0.25
-    answer = text(np.eye(2))
-    rows, known = naming.beliefs(found, np.array([False, True]), answer)
+    rows, known = naming.beliefs(found, text(np.eye(2)))
     odds = np.exp([2.0, -2.0])
     assert np.allclose(rows, odds / odds.sum(), atol=1e-6)
-    assert known == pytest.approx([odds.sum() / (odds.sum() + 1), 1.0], abs=1e-6)
+    assert known == pytest.approx([odds.sum() / (odds.sum() + 1)], abs=1e-6)
+
+
+def test_votes_by_hand():
+    """The encoder: the first of two, if any, which is 0.6 likely. The detector: the second, with 2 of 3 votes."""
+    votes = np.array([naming.said({"bed": 0.6, "stove": 0.3}, prior(["kitchen", "bedroom"])), [0.0, 0.0]])
+    assert votes[0] == pytest.approx([0.0, 2 / 3])  # the prior's objects are oven and bed
+    rows, known = naming.with_votes(np.array([[1.0, 0.0]] * 2), np.array([0.6, 0.6]), votes, trust=0.9)
+    # of the belief, 0.9 * 2/3 = 0.6 is the detector's; the encoder has 0.4, of which 0.6 is for the first
+    assert known == pytest.approx([0.6 + 0.4 * 0.6, 0.6])
+    assert rows[0] == pytest.approx([0.24 / 0.84, 0.6 / 0.84]) and rows[1] == pytest.approx([1.0, 0.0])
+    assert naming.said({}, prior(["kitchen"])).tolist() == [0.0, 0.0]
 
 
 class Run:
@@ -233,13 +243,23 @@ def test_objects_are_told_once_and_named_when_a_prior_comes():
     assert {item.id: item for item in snapshot.objects} == run.objects
 
 
-@pytest.mark.parametrize("prompted", [False, True])
-def test_only_objects_of_a_detector_that_knows_the_prior_have_a_word(prompted):
-    run = started(prompted=prompted).feed(task(), prior(["kitchen", "bedroom"]), TICK)
+@pytest.mark.parametrize(("sought", "word"), [([], 0.0), (["bed", "oven"], 1.0), (["piano", "fish"], 0.0)])
+def test_only_objects_that_were_sought_by_the_priors_names_have_a_word(sought, word):
+    names = np.arange(len(sought), dtype=np.int16)
+    run = started(prompted=bool(sought), sought=sought, names=names).feed(task(), prior(["kitchen", "bedroom"]), TICK)
     view = run.state.objects
     assert isinstance(view, ObjectView) and len(view.ids) == 2
     assert np.allclose(view.concepts.sum(axis=1), 1.0)
-    assert view.words.tolist() == ([1.0, 1.0] if prompted else [0.0, 0.0])
+    assert view.words == pytest.approx([word, word], abs=0.1) and (view.words > 0).all() == (word > 0)
+
+
+def test_the_detectors_name_outweighs_the_encoders():
+    """Encoded as bed and oven, found as oven and bed."""
+    names = {"sought": ["bed", "oven"], "names": np.array([1, 0], np.int16)}
+    encoded = started().feed(task(), prior(["kitchen", "bedroom"]), TICK).objects
+    detected = started(prompted=True, **names).feed(task(), prior(["kitchen", "bedroom"]), TICK).objects
+    assert [encoded[i].label for i in (0, 1)] == ["bed", "oven"]
+    assert [detected[i].label for i in (0, 1)] == ["oven", "bed"]
 
 
 def test_where_nothing_is_likely_enough_no_object_has_a_label_and_nothing_a_word():

@@ -27,7 +27,10 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
     batch_size: int = 0  # crops per forward pass, of one or several keyframes; 0 = what suits encoder and device
     threads: int = 0  # of the neural network library; 0 = its own choice (OMP_NUM_THREADS)
     detector: str = "segments"  # of objects; or none, grounding_dino:MODEL, owlv2:MODEL (a folder or a published name)
-    detector_prompts: tuple[str, ...] = ()  # names of the objects that grounding_dino and owlv2 are to find
+    detector_prompts: tuple[
+        str, ...
+    ] = ()  # names of what grounding_dino and owlv2 look for; empty = the prior's objects
+    detector_masks: str = "depth"  # what cuts their boxes out: the depth in its middle, or sam:MODEL
     detector_threshold: float = 0.3  # least score of what those find; the networks' authors advise 0.2 to 0.35
     object_point_m: float = 0.05  # side of the cubes of which a detection keeps one point each
     segments: SegmentsConfig = SegmentsConfig()  # of the detector segments; its grid is every detector's

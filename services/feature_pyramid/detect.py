@@ -9,6 +9,7 @@ from services.feature_pyramid.encoders import EncoderUnavailable
 from services.feature_pyramid.segments import find_segments
 
 CONTEXT = 1.2  # side of the square crop that is encoded, in longer sides of the box
+PROMPTED = ("grounding_dino", "owlv2")
 KINDS = "segments, none, grounding_dino:MODEL or owlv2:MODEL"
 
 
@@ -38,18 +39,27 @@ class Found(msgspec.Struct, frozen=True, eq=False):
     box_px: np.ndarray  # float32 (4,): left, top, right, bottom edge
     mask: np.ndarray  # bool (row, column) on the grid
     score: float  # in [0, 1]
+    name: int = 0  # index among the names that were sought; means nothing where none were
 
 
 class Detector:
     """Finds objects in a colour image with depth. Subclasses say how; this one finds none."""
 
     name = "none"
-    prompted = False
+    prompted = False  # whether it looks for objects by name; without names it finds none then
 
     def detect(
-        self, color: np.ndarray, depth_m: np.ndarray, camera: Intrinsics, world_from_camera: np.ndarray
+        self,
+        color: np.ndarray,
+        depth_m: np.ndarray,
+        camera: Intrinsics,
+        world_from_camera: np.ndarray,
+        sought: tuple[str, ...] = (),
     ) -> list[Found]:
-        """Objects of one image: `color` uint8 (h, w, 3) RGB, `depth_m` (h, w), 0 = no measurement; world z is up."""
+        """Objects of one image: `color` uint8 (h, w, 3) RGB, `depth_m` (h, w), 0 = no measurement; world z is up.
+
+        `sought` are the names of what a prompted detector looks for.
+        """
         return []
 
 
@@ -62,7 +72,12 @@ class Segments(Detector):
         self.cfg = cfg.segments
 
     def detect(
-        self, color: np.ndarray, depth_m: np.ndarray, camera: Intrinsics, world_from_camera: np.ndarray
+        self,
+        color: np.ndarray,
+        depth_m: np.ndarray,
+        camera: Intrinsics,
+        world_from_camera: np.ndarray,
+        sought: tuple[str, ...] = (),
     ) -> list[Found]:
         segments = find_segments(color, depth_m, camera, world_from_camera[:3, :3], self.cfg)
         height_px, width_px = depth_m.shape
@@ -72,11 +87,15 @@ class Segments(Detector):
 def load_detector(cfg: Config) -> Detector:
     """The detector of a setting, weights loaded. Raises EncoderUnavailable."""
     kind, _, model = cfg.detector.partition(":")
+    if cfg.detector_masks != "depth" and kind not in PROMPTED:
+        raise EncoderUnavailable(
+            f"feature_pyramid.detector_masks cuts out the boxes of prompted detectors; {cfg.detector!r} has none."
+        )
     if cfg.detector == "segments":
         return Segments(cfg)
     if cfg.detector == "none":
         return Detector()
-    if kind in {"grounding_dino", "owlv2"} and model:
+    if kind in PROMPTED and model:
         from services.feature_pyramid.prompted import Prompted
 
         return Prompted(kind, model, cfg)

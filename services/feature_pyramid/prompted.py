@@ -5,57 +5,55 @@ from typing import Any
 import numpy as np
 
 from schemas.frames import Intrinsics
-from services.feature_pyramid import torchvision_parts
+from services.feature_pyramid import pretrained
 from services.feature_pyramid.core import Config
 from services.feature_pyramid.detect import Detector, Found, Grid, mask_in_box, without_doubles
-from services.feature_pyramid.encoders import EncoderUnavailable, package
+from services.feature_pyramid.masks import load_masks
 
 MODELS = {"grounding_dino": "GroundingDinoForObjectDetection", "owlv2": "Owlv2ForObjectDetection"}
-AT_ONCE = 40  # prompts: GroundingDINO reads 256 tokens
+AT_ONCE = 40  # names in one question to GroundingDINO, which reads 256 tokens
 
 
 class Prompted(Detector):
-    """Boxes by the network; masks are the part of a box whose depth goes with its middle."""
+    """Boxes by the network; masks by SAM, or the part of a box whose depth goes with its middle."""
 
     prompted = True
 
     def __init__(self, kind: str, model: str, cfg: Config) -> None:
-        if not cfg.detector_prompts:
-            raise EncoderUnavailable(
-                f"the detector {cfg.detector} looks for what it is asked for; name the objects in "
-                "feature_pyramid.detector_prompts."
-            )
         self.name, self.kind, self.cfg = cfg.detector, kind, cfg
-        self.torch = package("torch")
-        torchvision_parts.load_if_installed()
-        transformers = package("transformers")
-        try:
-            self.processor = transformers.AutoProcessor.from_pretrained(model)
-            self.model = getattr(transformers, MODELS[kind]).from_pretrained(model).eval()
-        except (OSError, ValueError) as error:
-            raise EncoderUnavailable(
-                f"the weights of the detector {cfg.detector} cannot be loaded ({str(error).splitlines()[0]}); name a "
-                "folder that holds them or a model that this machine can download."
-            ) from error
-        cuda = cfg.device == "cuda" or (cfg.device == "auto" and self.torch.cuda.is_available())
-        self.device = "cuda" if cuda else "cpu"
-        self.model.to(self.device)
+        what = f"the detector {cfg.detector}"
+        self.processor, self.model, self.device = pretrained.load(what, MODELS[kind], model, cfg.device)
+        self.masks = load_masks(cfg)
 
     def detect(
-        self, color: np.ndarray, depth_m: np.ndarray, camera: Intrinsics, world_from_camera: np.ndarray
+        self,
+        color: np.ndarray,
+        depth_m: np.ndarray,
+        camera: Intrinsics,
+        world_from_camera: np.ndarray,
+        sought: tuple[str, ...] = (),
     ) -> list[Found]:
-        boxes_px, scores = self.boxes(color)
-        grid = Grid.of(depth_m, self.cfg.segments.cell_px)
+        if not sought:
+            return []
+        boxes_px, scores, names = self.boxes(color, sought)
         keep = np.flatnonzero(scores >= self.cfg.detector_threshold)
-        keep = keep[without_doubles(boxes_px[keep], scores[keep])]
-        found = [Found(boxes_px[i], mask_in_box(boxes_px[i], grid, camera), float(scores[i])) for i in keep]
-        return [one for one in found if one.mask.any()][: self.cfg.segments.most]
+        keep = keep[without_doubles(boxes_px[keep], scores[keep])][: self.cfg.segments.most]
+        grid = Grid.of(depth_m, self.cfg.segments.cell_px)
+        if self.masks is None:
+            masks = [mask_in_box(box_px, grid, camera) for box_px in boxes_px[keep]]
+        else:
+            masks = self.masks.of(color, boxes_px[keep], grid)
+        found = [Found(boxes_px[i], mask, float(scores[i]), int(names[i])) for i, mask in zip(keep, masks, strict=True)]
+        return [one for one in found if one.mask.any()]
 
-    def boxes(self, color: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Every box the network proposes, pixels (n, 4), inside the image, and its score (n,) for its best prompt."""
-        prompts = self.cfg.detector_prompts
-        parts = [self._asked(color, prompts[at : at + AT_ONCE]) for at in range(0, len(prompts), AT_ONCE)]
-        boxes, scores = (np.concatenate(values) for values in zip(*parts, strict=True))
+    def boxes(self, color: np.ndarray, sought: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Every box the network proposes, pixels (n, 4), inside the image; its score (n,), and for which name (n,)."""
+        at_once = AT_ONCE if self.kind == "grounding_dino" else len(sought)
+        parts = []
+        for first in range(0, len(sought), at_once):
+            boxes, scores, names = self._asked(color, sought[first : first + at_once])
+            parts.append((boxes, scores, names + first))
+        boxes, scores, names = (np.concatenate(values) for values in zip(*parts, strict=True))
         height_px, width_px = color.shape[:2]
         # OWLv2 sees the image padded to a square at its right or lower side
         scale_px = (width_px, height_px) if self.kind == "grounding_dino" else (max(width_px, height_px),) * 2
@@ -63,16 +61,41 @@ class Prompted(Detector):
         corners = [np.clip((middle + sign * size / 2) * scale_px, 0, (width_px, height_px)) for sign in (-1, 1)]
         boxes_px = np.concatenate(corners, axis=1).astype(np.float32)
         seen = (boxes_px[:, 2:] - boxes_px[:, :2] >= 1).all(axis=1)
-        return boxes_px[seen], scores[seen]
+        return boxes_px[seen], scores[seen], names[seen]
 
-    def _asked(self, color: np.ndarray, prompts: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray]:
-        """Boxes (n, 4) as middle and size, in shares of what the network sees, and the score of each."""
-        text: Any = [[f"a photo of a {prompt}" for prompt in prompts]]
-        if self.kind == "grounding_dino":
-            text = ". ".join(prompts).lower() + "."
-        padding = True if self.kind == "grounding_dino" else "max_length"
+    def _asked(self, color: np.ndarray, sought: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Boxes (n, 4) as middle and size, in shares of what the network sees; the score and best name of each."""
+        dino = self.kind == "grounding_dino"
+        text: Any = as_sentences(sought) if dino else [[f"a photo of a {name}" for name in sought]]
+        padding = True if dino else "max_length"
         asked = self.processor(images=[color], text=text, padding=padding, truncation=True, return_tensors="pt")
         with self.torch.inference_mode():
             outputs = self.model(**asked.to(self.device))
-        scores = outputs.logits[0].float().sigmoid().amax(dim=-1)
-        return outputs.pred_boxes[0].float().cpu().numpy(), scores.cpu().numpy()
+        logits, boxes = outputs.logits[0].float(), outputs.pred_boxes[0].float().cpu().numpy()
+        scores = logits.sigmoid().cpu().numpy()
+        if dino:
+            stop = self.processor.tokenizer.convert_tokens_to_ids(".")
+            names = best_sentence(scores, asked["input_ids"][0].tolist(), stop)
+        else:
+            names = logits.argmax(dim=1).cpu().numpy()
+        return boxes, scores.max(axis=1), names
+
+    @property
+    def torch(self) -> Any:
+        return pretrained.torch()
+
+
+def as_sentences(sought: tuple[str, ...]) -> str:
+    """Names as GroundingDINO wants them: in lower case, each ending in the only full stop it has."""
+    return " ".join(f"{name.lower().replace('.', ' ').strip()}." for name in sought)
+
+
+def best_sentence(token_scores: np.ndarray, token_ids: list[int], stop: int) -> np.ndarray:
+    """Which name (box,) scores best, on average over its tokens; names end with `stop`, the first follows a start mark.
+
+    `token_scores` (box, token) may have more columns than there are tokens. A name that was cut off does not count.
+    """
+    ends = [at for at, token in enumerate(token_ids) if token == stop]
+    starts = [1, *(end + 1 for end in ends[:-1])]
+    means = [token_scores[:, start:end].mean(axis=1) for start, end in zip(starts, ends, strict=True)]
+    return np.argmax(means, axis=0)

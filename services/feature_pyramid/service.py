@@ -12,17 +12,23 @@ from schemas.codec import Message
 from schemas.features import Pyramid, TextEmbeddings, TextRequest
 from schemas.frames import Keyframe
 from schemas.objects import Detections
-from schemas.topics import DETECTIONS, ENCODE, PYRAMID, TEXT
+from schemas.priors import PriorRequest, TaskRequest
+from schemas.topics import DETECTIONS, ENCODE, PRIOR, PRIORS, PYRAMID, TASK, TASK_IN_FORCE, TEXT
+from services.feature_pyramid import vocabulary
 from services.feature_pyramid.core import Config, Selection, coarse_surface, select_crops
 from services.feature_pyramid.detect import Detector, Found, lift, load_detector, object_crops
 from services.feature_pyramid.encoders import Encoder, Options, load_encoder, space_of
-from services.runtime.service import Identity, Output, Service
+from services.feature_pyramid.vocabulary import Vocabulary
+from services.runtime.service import Ask, Identity, Output, Service
+
+QUESTIONS = {TaskRequest: TASK_IN_FORCE, PriorRequest: PRIORS}
 
 
 class View(NamedTuple):
     """A keyframe, read: what is left to do is the encoder's."""
 
     selection: Selection
+    sought: tuple[str, ...]  # names of the objects that the detector was asked for
     found: list[Found]  # objects
     points_camera_m: list[np.ndarray]  # of each object, (point, 3)
     crops: list[np.ndarray]  # RGB, uint8 (side, side, 3): those selected, then one of each object
@@ -32,11 +38,12 @@ class View(NamedTuple):
 
 @dataclass
 class Worker:
-    """Loaded weights, the keyframes that are being made ready, and how many could not be read."""
+    """Loaded weights, what to look for, the keyframes that are being made ready, and how many could not be read."""
 
     instance: str
     encoder: Encoder
     detector: Detector
+    vocabulary: Vocabulary = field(default_factory=Vocabulary)
     broken: int = 0
     reader: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(1, thread_name_prefix="reader"))
     views: dict[tuple[str, int], Future[View]] = field(default_factory=dict)  # by robot and frame
@@ -57,24 +64,43 @@ def prepare(state: Worker, messages: list[Message], cfg: Config) -> None:
     """Read the keyframes that wait, on a thread of their own, while the encoder is at work on others."""
     for frame in messages:
         if isinstance(frame, Keyframe) and _key(frame) not in state.views:
-            state.views[_key(frame)] = state.reader.submit(view, frame, state.detector, cfg)
+            sought = look_for(state, frame.robot, cfg)
+            state.views[_key(frame)] = state.reader.submit(view, frame, state.detector, sought, cfg)
 
 
 def step(state: Worker, message: Message, cfg: Config) -> Iterator[Output]:
-    """A pyramid and detections per keyframe, empty when nothing is found or an image is broken: the job is done."""
+    """A pyramid and detections per keyframe, empty when nothing is found or an image is broken: the job is done.
+
+    A detector that is not yet told what to look for has not looked: its keyframes have no detections.
+    """
     if not isinstance(message, Keyframe):
+        vocabulary.hear(state.vocabulary, message)
         return
-    key = _key(message)
+    if state.detector.prompted and not cfg.detector_prompts:
+        for question in vocabulary.questions(state.vocabulary, message.robot):
+            yield Ask(QUESTIONS[type(question)], question)
+    key, sought = _key(message), look_for(state, message.robot, cfg)
     waiting = state.views.pop(key, None)
-    seen = waiting.result() if waiting is not None else view(message, state.detector, cfg)
+    seen = None if waiting is None else waiting.result()
+    if seen is None or seen.sought != sought:  # made ready before the prior changed
+        state.encoded.pop(key, None)
+        seen = view(message, state.detector, sought, cfg)
     state.broken += seen.broken
     embeddings = state.encoded.pop(key) if key in state.encoded else encode(state, seen)
     split = len(seen.selection.crops)
     yield PYRAMID, pyramid(state, message, seen, embeddings[:split])
-    yield DETECTIONS, detections(state, message, seen, embeddings[split:])
+    if sought or not state.detector.prompted:
+        yield DETECTIONS, detections(state, message, seen, embeddings[split:])
 
 
-def view(frame: Keyframe, detector: Detector, cfg: Config) -> View:
+def look_for(state: Worker, robot: str, cfg: Config) -> tuple[str, ...]:
+    """Names of the objects that the detector is asked for: those of the settings, else of the robot's prior."""
+    if not state.detector.prompted:
+        return ()
+    return cfg.detector_prompts or vocabulary.objects(state.vocabulary, robot)
+
+
+def view(frame: Keyframe, detector: Detector, sought: tuple[str, ...], cfg: Config) -> View:
     """Decode a keyframe, select its crops by depth, and detect; neither crops nor objects when an image is broken."""
     try:
         color, depth_m, broken = read_color(frame), read_depth(frame), False
@@ -83,10 +109,10 @@ def view(frame: Keyframe, detector: Detector, cfg: Config) -> View:
         broken = True
     camera = frame.intrinsics
     selection = select_crops(depth_m, camera, cfg)
-    found = [] if broken else detector.detect(color, depth_m, camera, frame.world_from_camera)
+    found = [] if broken else detector.detect(color, depth_m, camera, frame.world_from_camera, sought)
     found, points_camera_m = lift(found, depth_m, camera, cfg)
     crops = selection.crops.cut(color) + object_crops(found, camera.width_px, camera.height_px).cut(color)
-    return View(selection, found, points_camera_m, crops, coarse_surface(depth_m, cfg.surface_cell_px), broken)
+    return View(selection, sought, found, points_camera_m, crops, coarse_surface(depth_m, cfg.surface_cell_px), broken)
 
 
 def encode(state: Worker, seen: View) -> np.ndarray:
@@ -146,6 +172,8 @@ def detections(state: Worker, frame: Keyframe, seen: View, embeddings: np.ndarra
         point_counts=np.array([len(points_m) for points_m in seen.points_camera_m], np.int32),
         points_camera_m=np.concatenate([np.zeros((0, 3)), *seen.points_camera_m]).astype(np.float16),
         surface_m=seen.surface_m.astype(np.float16),
+        sought=list(seen.sought),
+        names=np.array([one.name for one in seen.found if seen.sought], np.int16),
     )
 
 
@@ -197,7 +225,9 @@ SERVICE = Service(
     config=Config,
     init=init,
     step=step,
+    reads=(TASK, PRIOR),
     writes=(PYRAMID, DETECTIONS),
+    asks=(TASK_IN_FORCE, PRIORS),
     answers={TEXT: answer_text},
     job=ENCODE,
     job_group=lambda cfg: space_of(cfg.space),

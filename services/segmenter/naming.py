@@ -106,28 +106,49 @@ def named(tracks: Tracks, prior: Prior | None, text: TextEmbeddings | None, cfg:
     if prior is None or text is None:
         return {track.id: Named(_entry(track, "", 0.0, 0.0, cfg), np.zeros(0), 0.0) for track in items}
     found = np.array([descriptor(track.embeddings) for track in items])
-    concepts, known = beliefs(found, np.array([track.prompted for track in items]), text)
+    seen, known = beliefs(found, text)
+    votes = np.array([said(track.votes, prior) for track in items])
+    concepts, sure = with_votes(seen, known, votes, cfg.detector_trust)
     result = {}
-    for track, row, sure in zip(items, concepts, known.tolist(), strict=True):
+    for track, row, certain, heard in zip(items, concepts, sure.tolist(), votes.sum(axis=1).tolist(), strict=True):
         best = int(row.argmax())
-        label = prior.objects[best].name if sure * row[best] >= cfg.label_least else ""
-        weight = sure * (1.0 if track.prompted else cfg.unprompted_weight)
-        result[track.id] = Named(_entry(track, label, float(row[best]), sure, cfg), row, weight)
+        label = prior.objects[best].name if certain * row[best] >= cfg.label_least else ""
+        weight = certain * (heard + (1.0 - heard) * cfg.unprompted_weight)
+        result[track.id] = Named(_entry(track, label, float(row[best]), certain, cfg), row, weight)
     return result
 
 
-def beliefs(found: np.ndarray, prompted: np.ndarray, text: TextEmbeddings) -> tuple[np.ndarray, np.ndarray]:
+def beliefs(found: np.ndarray, text: TextEmbeddings) -> tuple[np.ndarray, np.ndarray]:
     """P(c | o) (object, concept), rows sum to 1, and the probability (object,) that it is any of the concepts.
 
-    A softmax of the standardised similarities with the space's null class beside them, as the visual expert's. An
-    object of a prompted detector is one of the concepts by construction: it has no null class.
+    A softmax of the standardised similarities with the space's null class beside them, as the visual expert's.
     """
     scores = text.temperature * standardised(found, text)
     shift = scores.max(axis=1, keepdims=True)
     odds = np.exp(scores - shift)
     total = odds.sum(axis=1)
-    null = np.where(prompted, 0.0, np.exp(np.minimum(text.temperature * text.null_score - shift[:, 0], 700.0)))
+    null = np.exp(np.minimum(text.temperature * text.null_score - shift[:, 0], 700.0))
     return odds / total[:, None], total / (total + null)
+
+
+def said(votes: dict[str, float], prior: Prior) -> np.ndarray:
+    """Share (concept,) of each of the prior's objects in the votes; the rest went to other names."""
+    shares = np.array([votes.get(item.name, 0.0) for item in prior.objects])
+    return shares / max(sum(votes.values()), 1e-12)
+
+
+def with_votes(
+    concepts: np.ndarray, known: np.ndarray, votes: np.ndarray, trust: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Beliefs, as of `beliefs`, mixed with what detectors say: `votes` (object, concept) from `said`.
+
+    Where the prior's names have a share h of the votes, they get trust h of the belief; the rest stays as it was. Votes
+    for other names say nothing, for those are not what is asked.
+    """
+    weight = trust * votes.sum(axis=1)
+    joint = trust * votes + ((1.0 - weight) * known)[:, None] * concepts
+    sure = weight + (1.0 - weight) * known
+    return joint / np.maximum(sure, 1e-12)[:, None], sure
 
 
 def _entry(track: Track, label: str, probability: float, known: float, cfg: TrackingConfig) -> SceneObject:

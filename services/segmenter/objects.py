@@ -40,15 +40,17 @@ class TrackingConfig(msgspec.Struct, frozen=True, kw_only=True):
     label_least: float = (
         0.5  # probability of being one of the prior's objects from which on an object carries its label
     )
-    unprompted_weight: float = 0.0  # of objects of a detector that does not know the prior, in the object expert
+    detector_trust: float = 0.8  # share of an object's belief that the names have for which detectors found it
+    unprompted_weight: float = 0.0  # of objects that none of the prior's names was sought for, in the object expert
 
     def __post_init__(self) -> None:
         if not (self.cell_m > 0 and self.min_frames >= 1 and self.observations >= 1 and self.archive_frames >= 1):
             raise ValueError("cell_m, min_frames, observations and archive_frames must be positive")
         if not (0 < self.match_overlap <= 1 and 0 <= self.match_part <= 1 and 0 < self.merge_overlap <= 1):
             raise ValueError("match_overlap, match_part and merge_overlap are shares")
-        if not (0 <= self.label_least <= 1 and 0 <= self.unprompted_weight <= 1):
-            raise ValueError("label_least and unprompted_weight lie in [0, 1]")
+        shares = (self.label_least, self.detector_trust, self.unprompted_weight)
+        if not all(0 <= share <= 1 for share in shares):
+            raise ValueError("label_least, detector_trust and unprompted_weight lie in [0, 1]")
 
 
 @dataclass
@@ -60,7 +62,7 @@ class Track:
     hits: np.ndarray  # (cell,) detections that touched it
     embeddings: list[np.ndarray]  # (dim,) float16 each, the newest last
     sources: set[tuple[str, int, int]]  # detector, frame id and number of each detection
-    prompted: bool  # whether a detector that was asked for the prior's objects found it
+    votes: dict[str, float]  # sums of the detections' scores, by the name that they were found for
     missed: int = 0  # frames that looked at it in vain
 
     @property
@@ -146,7 +148,7 @@ def associate(tracks: Tracks, detections: Detections, cfg: TrackingConfig) -> No
     touched = []
     for index, cells in enumerate(seen):
         source = {(detections.detector, detections.frame_id, index)}
-        news = Track(-1, cells, np.ones_like(cells), [detections.embeddings[index]], source, detections.prompted)
+        news = Track(-1, cells, np.ones_like(cells), [detections.embeddings[index]], source, vote(detections, index))
         track = tracks.items.get(joined.get(index, -1))
         if track is None:
             news.id, track = tracks.next_id, news
@@ -232,7 +234,15 @@ def _extend(track: Track, more: Track, cfg: TrackingConfig) -> None:
     track.cells, track.hits = every, counts.astype(np.int64)
     track.embeddings = [*track.embeddings, *more.embeddings][-cfg.observations :]
     track.sources |= more.sources
-    track.prompted |= more.prompted
+    for name, score in more.votes.items():
+        track.votes[name] = track.votes.get(name, 0.0) + score
+
+
+def vote(detections: Detections, index: int) -> dict[str, float]:
+    """The name that a detection was found for, with its score; nothing where no names were sought."""
+    if not detections.sought:
+        return {}
+    return {detections.sought[detections.names[index]]: float(detections.scores[index])}
 
 
 def descriptor(embeddings: list[np.ndarray]) -> np.ndarray:
