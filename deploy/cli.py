@@ -249,6 +249,7 @@ def cmd_demo(arguments: argparse.Namespace) -> int:
 def cmd_run(arguments: argparse.Namespace) -> int:
     """The main job on a source of the user's."""
     from deploy import report
+    from deploy.evaluation.oracles import read_objects
     from deploy.run import Job, run
 
     if not Path(arguments.source).exists():
@@ -272,7 +273,7 @@ def cmd_run(arguments: argparse.Namespace) -> int:
         ),
     )
     result = run(job, console)
-    report.write(result, job.out, truth, console)
+    report.write(result, job.out, truth, console, read_objects(Path(arguments.source)))
     return 0
 
 

@@ -1,6 +1,8 @@
 """What a run leaves for people: tables on the terminal, files in the output folder."""
 
 import json
+import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +10,8 @@ from rich.console import Console
 from rich.table import Table
 
 from deploy.evaluation.metrics import GroundTruth, evaluate
+from deploy.evaluation.object_metrics import NO_DETECTOR, OBJECT_SHARES, object_scores
+from deploy.evaluation.oracles import TrueObject
 from deploy.export import map_png, places_png, scene_json, spark_dsg_graph
 from deploy.replay import Log, message_differences, undisturbed
 from deploy.run import Result
@@ -48,8 +52,17 @@ def region_table(scene: Scene) -> Table:
     return table
 
 
-def write(result: Result, out: Path, truth: dict[str, Any] | None, console: Console) -> None:
-    """Print the regions and the scores, and write scene.json, dsg.json, map.png, map-3d.png and metrics.json."""
+def write(
+    result: Result,
+    out: Path,
+    truth: dict[str, Any] | None,
+    console: Console,
+    objects: Sequence[TrueObject] = (),
+) -> None:
+    """Print the regions and the scores, and write scene.json, dsg.json, map.png, map-3d.png and metrics.json.
+
+    `truth` and `objects` are the regions and objects of the ground truth, where there are any.
+    """
     scene = result.scene
     console.print(region_table(scene))
     labelled = int((scene.place_regions >= 0).sum())
@@ -60,16 +73,33 @@ def write(result: Result, out: Path, truth: dict[str, Any] | None, console: Cons
         f"{result.counts.encoded_summary()}; "
         f"{result.counts.crops} of {result.counts.crops_total} crops encoded"
     )
-    if truth is not None:
-        metrics = evaluate(scene, result.voxels, GroundTruth.from_json(truth))
-        console.print("against the ground truth: " + ", ".join(f"{name} {metrics[name]:.3f}" for name in MAIN_METRICS))
-        if not set(scene.labels) & {region["label"] for region in truth["regions"]}:
-            console.print("no region name of this task is in the ground truth: only f1_g and miou_g compare anything")
+    if metrics := compare(result, truth, objects, console):
         (out / "metrics.json").write_text(json.dumps(metrics, indent=1))
     for kind, name in (("json", "scene.json"), ("spark-dsg", "dsg.json"), ("png", "map.png")):
         export(scene, result.voxels, kind, out / name, truth)
     names = ", ".join(("scene.json", "dsg.json", "map.png", "map-3d.png", result.log_path.name))
     console.print(f"written to {out}: {names} ({result.seconds:.0f} s)")
+
+
+def compare(
+    result: Result, truth: dict[str, Any] | None, objects: Sequence[TrueObject], console: Console
+) -> dict[str, float | None]:
+    """Scores of regions and objects, as far as there is a ground truth of them, also printed; None = no such score."""
+    scene, metrics = result.scene, dict[str, float]()
+    if truth is not None:
+        metrics |= evaluate(scene, result.voxels, GroundTruth.from_json(truth))
+        console.print("against the ground truth: " + ", ".join(f"{name} {metrics[name]:.3f}" for name in MAIN_METRICS))
+        if not set(scene.labels) & {region["label"] for region in truth["regions"]}:
+            console.print("no region name of this task is in the ground truth: only f1_g and miou_g compare anything")
+    if objects and result.counts.detectors - {NO_DETECTOR}:
+        found = object_scores(scene.objects, objects, [item.name for item in result.prior.objects], result.voxels)
+        shares = ", ".join(
+            f"{key.removeprefix('objects_').replace('_', ' ')} {found[key]:.3f}" for key in OBJECT_SHARES
+        )
+        counts = f"{found['objects_found']:.0f} found, {found['objects_true']:.0f} true of the prior's and seen"
+        console.print(f"objects against the ground truth: {counts}, {shares}")
+        metrics |= found
+    return {name: None if math.isnan(value) else value for name, value in metrics.items()}
 
 
 def export(scene: Scene, voxels: VoxelMap | None, kind: str, path: Path, truth: dict[str, Any] | None = None) -> None:

@@ -20,6 +20,7 @@ from deploy.supervisor import Supervisor
 from schemas.codec import DecodeError, Message, decode, encode
 from schemas.features import Pyramid
 from schemas.frames import IngestState, Keyframe
+from schemas.objects import Detections
 from schemas.places import MapRequest, VoxelMap
 from schemas.priors import Prior, Task
 from schemas.regions import RegionDelta
@@ -76,6 +77,7 @@ class Result:
     log_path: Path
     counts: "Counts"
     seconds: float
+    prior: Prior  # that the task got when it was given
 
 
 @dataclass
@@ -88,6 +90,7 @@ class Counts:
     crops_total: int = 0
     ingest: IngestState | None = None
     regions: RegionDelta | None = None
+    detectors: set[str] = field(default_factory=set)
 
     def __call__(self, sample: Sample, message: Message) -> None:
         """See one message."""
@@ -98,6 +101,8 @@ class Counts:
                 self.pyramids[message.frame_id] = self.pyramids.get(message.frame_id, 0) + 1
                 self.crops += len(message.embeddings)
                 self.crops_total += message.crops_total
+            case Detections():
+                self.detectors.add(message.detector)
             case RegionDelta():
                 self.regions = message
 
@@ -200,7 +205,7 @@ class Run:
             voxels = self.client.ask(VOXEL_MAP, MapRequest(robot=self.job.robot), 30.0)
         self.recorder.attachments["scene.msgpack"] = ("application/msgpack", encode(scene))
         self.recorder.attachments["voxels.msgpack"] = ("application/msgpack", encode(voxels))
-        return Result(scene, voxels, self.job.out / "log.mcap", self.counts, time.monotonic() - started_s)
+        return Result(scene, voxels, self.job.out / "log.mcap", self.counts, time.monotonic() - started_s, prior)
 
     def _start(self, names: list[str]) -> None:
         """Start services and wait until they are seen."""

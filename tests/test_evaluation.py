@@ -10,13 +10,18 @@ import pytest
 from msgspec.structs import replace as replace_struct
 from rich.console import Console
 from segmenter_world import DIM, ROBOT, ROOM_M, SPACE, place_delta, place_grid, prior, text, walk
+from test_segmenter_objects import BED, OVEN, sight
+from test_segmenter_objects import walk as around
 
 from deploy import cli
 from deploy.evaluation import command, methods, oracles, priors, runner
 from deploy.evaluation.metrics import GroundTruth, Reliability
+from deploy.evaluation.object_metrics import OBJECT_SCORES
 from deploy.evaluation.page import page, reliability_points, true_scene
 from deploy.evaluation.perception import Cache, EvaluationError, Perception, source_digest
 from deploy.evaluation.plots import line_plot
+from deploy.report import compare
+from deploy.run import Counts, Result
 from schemas.codec import encode
 from schemas.places import VoxelMap
 from services.segmenter.experts import REGISTRY
@@ -42,13 +47,14 @@ def perceived(concepts=np.eye(2)) -> Perception:
     known = {f"a {name}": row for name, row in zip(NAMES, concepts, strict=True)} | dict(
         zip(NAMES, concepts, strict=True)
     )
+    mixture = np.mean(concepts, axis=0)  # what is no room looks like all of them
     return Perception(
         name="two rooms",
         places=place_delta(positions, edges, snapshot=True),
         voxels=VoxelMap(robot=ROBOT, voxel_m=0.2, free=free, occupied=np.zeros((0, 3), np.int16)),
         pyramids=tuple(walk(2)),
         space=SPACE,
-        text=lambda asked: text(np.array([known[phrases[0]] for phrases in asked])),
+        text=lambda asked: text(np.array([known.get(phrases[0], mixture) for phrases in asked])),
     )
 
 
@@ -107,6 +113,67 @@ def test_the_object_oracle_counts_the_boxes_that_were_seen(case, tmp_path):
     unseeing = replace(unseeing, perception=replace(unseeing.perception, voxels=voxels))
     assert score(methods.ours(Config()), unseeing)["accuracy"] < 0.7
     assert score(methods.oracle(Config(), "objects"), unseeing)["accuracy"] > 0.9
+
+
+def with_detections(case, detector="segments"):
+    """A bed and an oven, seen eight times; the ground truth has the bed, and another that was never seen."""
+    boxes = [oracles.TrueObject("bed", *BED[:2]), oracles.TrueObject("bed", BED[0] + 9, BED[1] + 9)]
+    seen = tuple(
+        sight(frame, pose, [BED, OVEN] if detector != "none" else [], detector=detector)
+        for frame, pose in enumerate(around())
+    )
+    voxels = replace_struct(case.perception.voxels, occupied=np.array([[12, 8, 1]], np.int16))
+    perception = replace(case.perception, detections=seen, voxels=voxels)
+    return replace(case, perception=perception, objects=tuple(boxes))
+
+
+def test_objects_are_judged_where_the_truth_names_them(case):
+    scores = score(methods.ours(Config()), with_detections(case))
+    assert scores["objects_found"] == 2
+    assert scores["objects_true"] == 1
+    assert scores["objects_precision"] == 0.5
+    assert scores["objects_recall"] == 1.0
+    blind_to_objects = with_detections(case, "none")
+    for method, other in (
+        (methods.ours(Config()), case),
+        (methods.ours(Config()), blind_to_objects),
+        (replace(methods.ours(Config()), name="another"), with_detections(case)),
+    ):
+        assert not {key for key in score(method, other) if key.startswith("objects")}
+
+
+def test_scores_of_objects_stand_beside_the_others(case, capsys):
+    full, method = with_detections(case), methods.ours(Config())
+    sequences = [
+        runner.Dataset("a", Path("a"), full.truth, full.prior, full.objects),
+        runner.Dataset("b", Path("b"), full.truth, full.prior),
+    ]
+    found = runner.run(sequences, [method], lambda path, features: replace(full.perception, name=str(path)), quiet)
+    table = found.table()
+    assert list(table["sequences"]["a"]["ours"]) == [*runner.KEYS, *OBJECT_SCORES]
+    assert list(table["sequences"]["b"]["ours"]) == list(runner.KEYS)
+    assert table["mean"]["ours"]["objects_recall"] == 1.0
+    command.print_tables(found, Console())
+    assert "recall 100.0" in " ".join(capsys.readouterr().out.split())
+    assert "a: ours</td><td>0.500</td><td>1.000</td>" in page(found, {})
+
+
+def test_a_run_tells_how_well_it_found_objects(case, capsys):
+    full = with_detections(case)
+    items = methods.ours(Config()).run(full).objects
+    scene = replace_struct(methods.ours(Config()).run(case), objects=items)
+    counts = Counts(detectors={"segments"})
+    result = Result(scene, full.perception.voxels, Path("log.mcap"), counts, 1.0, full.prior)
+    found = compare(result, None, full.objects, Console(width=200))
+    assert found["objects_precision"] == 0.5
+    assert found["objects_named_precision"] is None  # nothing carries a name, and JSON knows no NaN
+    assert "2 found, 1 true of the prior's and seen, precision 0.500, recall 1.000" in capsys.readouterr().out
+    counts.detectors = {"none"}
+    assert compare(result, None, full.objects, Console()) == {}
+
+
+def quiet(what, done, total):
+    """Say nothing."""
 
 
 def test_a_crop_of_the_feature_oracle_carries_the_room_it_shows(case):

@@ -158,6 +158,20 @@ def print_tables(results: "Results", console: Console) -> None:
             cells = [_cell(results.mean(method.name, k, name), results.sd(method.name, k, name)) for k in SHOWN]
             table.add_row(method.name, *cells, f"{results.mean(method.name, 'seconds', name):.2f}")
         console.print(table)
+        for method in results.methods:
+            if name and results.judges_objects(method.name, name):
+                console.print(f"{method.name}, objects of {name}: {_objects(results, method.name, name)}")
+
+
+def _objects(results: "Results", method: str, sequence: str) -> str:
+    """The scores of the objects in one line; shares in percent, counts as means over the priors."""
+    from deploy.evaluation.object_metrics import OBJECT_COUNTS, OBJECT_SHARES
+
+    said = [f"{key.removeprefix('objects_')} {results.mean(method, key, sequence):.4g}" for key in OBJECT_COUNTS]
+    for key in OBJECT_SHARES:
+        shown = _cell(results.mean(method, key, sequence), results.sd(method, key, sequence))
+        said.append(f"{key.removeprefix('objects_').replace('_', ' ')} {shown}")
+    return ", ".join(said)
 
 
 @contextmanager

@@ -2,6 +2,7 @@
 true objects instead of detected ones."""
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -36,17 +37,19 @@ def read_objects(path: Path) -> tuple[TrueObject, ...]:
     return tuple(TrueObject(str(b["label"]), np.array(b["min_m"], float), np.array(b["max_m"], float)) for b in boxes)
 
 
+def in_view(objects: Sequence[TrueObject], voxels: VoxelMap) -> np.ndarray:
+    """Which objects the robot has seen (n,): their box holds the centre of an occupied voxel, or nearly does."""
+    occupied_m = (voxels.occupied + 0.5) * voxels.voxel_m
+    margin_m = voxels.voxel_m / 2
+    inside = ((occupied_m >= item.min_m - margin_m) & (occupied_m <= item.max_m + margin_m) for item in objects)
+    return np.array([held.all(axis=1).any() for held in inside], bool)
+
+
 def seen_objects(objects: tuple[TrueObject, ...], prior: Prior, voxels: VoxelMap) -> ObjectView:
     """The objects that the prior names and the robot has seen, that is, whose box holds an occupied voxel's centre."""
     names = [item.name for item in prior.objects]
-    occupied_m = (voxels.occupied + 0.5) * voxels.voxel_m
-    known = [item for item in objects if item.label in names]
-    margin_m = voxels.voxel_m / 2
-    seen = [
-        item
-        for item in known
-        if ((occupied_m >= item.min_m - margin_m) & (occupied_m <= item.max_m + margin_m)).all(axis=1).any()
-    ]
+    seen = [item for item, is_seen in zip(objects, in_view(objects, voxels), strict=True) if is_seen]
+    seen = [item for item in seen if item.label in names]
     concepts = np.eye(len(names))[[names.index(item.label) for item in seen]].reshape(-1, len(names))
     positions_m = np.array([(item.min_m + item.max_m) / 2 for item in seen]).reshape(-1, 3)
     return ObjectView(ids=np.arange(len(seen)), positions_m=positions_m, concepts=concepts)

@@ -11,6 +11,7 @@ import numpy as np
 
 from deploy.evaluation.methods import SWEEPS, Method
 from deploy.evaluation.metrics import NO_REGION, GroundTruth, Reliability
+from deploy.evaluation.object_metrics import OBJECT_COUNTS, OBJECT_SCORES, TOLERANCE_M
 from deploy.evaluation.plots import Point, line_plot
 from deploy.evaluation.runner import KEYS, NO_LABEL, Dataset, Picture, Results
 from deploy.map_image import draw_map
@@ -42,7 +43,7 @@ def page(results: Results, settings: dict[str, str]) -> str:
     groups = list(dict.fromkeys(method.group for method in results.methods))
     sections = [_scores(results, group) for group in groups if group not in SWEEPS]
     sections += [_sweep(results, group) for group in groups if group in SWEEPS]
-    sections += [_pictures(results), _calibration(results), _confusions(results), _timing(results)]
+    sections += [_objects(results), _pictures(results), _calibration(results), _confusions(results), _timing(results)]
     listed = "".join(
         f"<tr><td>{escape(key)}</td><td class=about>{escape(text)}</td></tr>" for key, text in settings.items()
     )
@@ -76,6 +77,22 @@ def _table(results: Results, methods: Sequence[Method], sequence: str) -> str:
             cells.append(f"<td>{f'<b>{shown}</b>' if mean == best[key] else shown}</td>")
         rows.append(f"<tr><td>{escape(method.name)}</td>{''.join(cells)}</tr>")
     return f"<table><tr><th>method</th>{head}</tr>{''.join(rows)}</table>"
+
+
+def _objects(results: Results) -> str:
+    """Objects against the ground truth's, where it names them."""
+    judged = [(m, s) for m in results.methods for s in results.sequences if results.judges_objects(m.name, s.name)]
+    if not judged:
+        return ""
+    rows = []
+    for method, sequence in judged:
+        values = {key: results.mean(method.name, key, sequence.name) for key in OBJECT_SCORES}
+        shown = ["–" if math.isnan(v) else f"{v:.4g}" if k in OBJECT_COUNTS else f"{v:.3f}" for k, v in values.items()]
+        cells = "".join(f"<td>{cell}</td>" for cell in shown)
+        rows.append(f"<tr><td>{escape(sequence.name)}: {escape(method.name)}</td>{cells}</tr>")
+    head = "".join(f"<th>{key.removeprefix('objects_').replace('_', ' ')}</th>" for key in OBJECT_SCORES)
+    about = f"One-to-one, the middle of a found box at most {TOLERANCE_M} m from the true box; mean over priors."
+    return f"<h2>Objects</h2><p>{about}</p><table><tr><th></th>{head}</tr>{''.join(rows)}</table>"
 
 
 def _best(key: str, values: list[float]) -> float:

@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from deploy.evaluation.methods import Case, Method
+from deploy.evaluation.methods import OURS, Case, Method
 from deploy.evaluation.metrics import SCORES, GroundTruth, Reliability, assign, evaluate, reliability
+from deploy.evaluation.object_metrics import NO_DETECTOR, OBJECT_SCORES, object_scores
 from deploy.evaluation.oracles import TrueObject
 from deploy.evaluation.perception import Perception, Report
 from deploy.evaluation.priors import variations
@@ -43,7 +44,7 @@ class Outcome:
     sequence: str
     method: Method
     prior: int  # 0 = the library's
-    scores: dict[str, float]  # by KEYS; NaN where a method has no such score
+    scores: dict[str, float]  # by KEYS, and by OBJECT_SCORES where objects are judged; NaN = no such score
 
 
 @dataclass(frozen=True)
@@ -77,7 +78,10 @@ class Results:
         return _summary(self._values(method, key, sequence), np.std)
 
     def table(self) -> dict[str, Any]:
-        """`{"sequences": {NAME: {METHOD: {...}}}, "mean": {METHOD: {...}}, "sd": {METHOD: {...}}}`; None = no score."""
+        """`{"sequences": {NAME: {METHOD: {...}}}, "mean": {METHOD: {...}}, "sd": {METHOD: {...}}}`; None = no score.
+
+        Rows have KEYS, and OBJECT_SCORES where objects were judged.
+        """
         names = [method.name for method in self.methods]
         return {
             "sequences": {s.name: {m: self._row(self.mean, m, s.name) for m in names} for s in self.sequences},
@@ -86,12 +90,20 @@ class Results:
         }
 
     def _row(self, summary: Callable[..., float], method: str, sequence: str = "") -> dict[str, float | None]:
-        values = {key: summary(method, key, sequence) for key in KEYS}
+        keys = (*KEYS, *OBJECT_SCORES) if self.judges_objects(method, sequence) else KEYS
+        values = {key: summary(method, key, sequence) for key in keys}
         return {key: None if math.isnan(value) else value for key, value in values.items()}
 
     def _values(self, method: str, key: str, sequence: str) -> list[float]:
-        found = (o for o in self.outcomes if o.method.name == method and sequence in ("", o.sequence))
-        return [o.scores[key] for o in found if not math.isnan(o.scores[key])]
+        found = [o.scores.get(key, math.nan) for o in self._of(method, sequence)]
+        return [value for value in found if not math.isnan(value)]
+
+    def judges_objects(self, method: str, sequence: str = "") -> bool:
+        """Whether any outcome of a method has scores of its objects."""
+        return any(OBJECT_SCORES[0] in outcome.scores for outcome in self._of(method, sequence))
+
+    def _of(self, method: str, sequence: str) -> list[Outcome]:
+        return [o for o in self.outcomes if o.method.name == method and sequence in ("", o.sequence)]
 
 
 def run(
@@ -139,6 +151,9 @@ def judge(method: Method, case: Case, prior: int = 0) -> tuple[Outcome, Picture]
     seconds = time.perf_counter() - started_s - encoding_s
     name, voxels = case.perception.name, case.perception.voxels
     scores = evaluate(scene, voxels, case.truth) | {"seconds": seconds}
+    if method.name == OURS and case.objects and any(d.detector != NO_DETECTOR for d in case.perception.detections):
+        names = [item.name for item in case.prior.objects]
+        scores |= object_scores(scene.objects, case.objects, names, voxels)
     assignment = assign(scene, voxels, case.truth)
     labels = {region.id: region.label or NO_LABEL for region in scene.regions}
     true_labels = {region.id: region.label for region in case.truth.regions}
