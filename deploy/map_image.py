@@ -1,4 +1,4 @@
-"""The scene from above: free space coloured by region, walls, the place graph, the trajectory and a legend.
+"""The scene from above: free space coloured by region, walls, objects, the place graph, the trajectory and a legend.
 
 World coordinates are turned by a quarter when the map is taller than wide, so that pictures are always landscape; the
 small axes in the corner say so. Everything is drawn at twice the size and scaled down, which smooths what OpenCV does
@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 
 from deploy.evaluation.metrics import voxel_owners
+from schemas.objects import SceneObject
 from schemas.places import VoxelMap
 from schemas.scene import Scene
 
@@ -26,6 +27,7 @@ BAND_M = (0.3, 1.9)  # heights above the floor that make walls and walkable spac
 CEILING_GAP_M = 0.3
 FURNITURE_SHARE, WALL_SHARE = 0.15, 0.7  # occupied part of a column within the band
 REGION_OPACITY = 0.62
+FURNITURE_M = 3.0  # a long sofa or kitchen counter
 
 INK, MUTED, WALL, FURNITURE = (31, 35, 40), (107, 114, 128), (75, 82, 92), (176, 182, 190)
 FREE, UNLABELLED, EDGE, PATH = (241, 243, 245), (208, 213, 219), (70, 76, 84), (20, 20, 24)
@@ -80,6 +82,19 @@ class Layers:
     labels: np.ndarray  # (i, j) index into `shown_labels`, of the region that owns most of the column; -1 = none
 
 
+@dataclass(frozen=True)
+class _Mark:
+    """One object as it is drawn."""
+
+    corners_m: np.ndarray  # (4, 2) of its box, drawing plane
+    label: str  # empty = unnamed
+
+    @classmethod
+    def of(cls, item: SceneObject, turned: bool) -> "_Mark":
+        (x0, y0, _), (x1, y1, _) = item.min_m, item.max_m
+        return cls(_plane(np.array([(x0, y0), (x1, y0), (x1, y1), (x0, y1)]), turned), item.label)
+
+
 class View:
     """From drawing plane (metres) to picture (pixels of the supersampled canvas), and the drawing itself."""
 
@@ -99,6 +114,10 @@ class View:
         """Sub-pixel positions (n, 2) of points (n, 2) of the drawing plane."""
         flipped = np.stack((plane_m[:, 0] - self.low_m[0], self.high_m[1] - plane_m[:, 1]), axis=1)
         return flipped * self.px_per_m + self.corner_px
+
+    def holds(self, at_m: np.ndarray) -> bool:
+        """Whether a point (2,) of the drawing plane is on the map."""
+        return bool(((at_m >= self.low_m) & (at_m <= self.high_m)).all())
 
     def lines(self, paths_m: list[np.ndarray], color: Color, width: float, opacity: float = 1.0) -> None:
         """Antialiased polylines through points of the drawing plane; width in pixels of the result."""
@@ -131,11 +150,15 @@ def draw_map(scene: Scene, voxel_map: VoxelMap | None, outlines_m: list[np.ndarr
     view = View(*_bounds(scene, layers, outlines_m, turned))
     colors = label_colors(scene)
     _paint_floor(view, layers, colors)
+    objects = [_Mark.of(item, turned) for item in scene.objects]
+    shown = [mark for mark in objects if view.holds(mark.corners_m.mean(axis=0))]
+    _draw_objects(view, shown)
     _draw_graph(view, scene, turned)
     _draw_trajectory(view, _plane(scene.trajectory, turned))
     for outline_m in outlines_m:
         _draw_dashed(view, _plane(outline_m, turned))
-    _draw_names(view, scene, turned)
+    taken = _draw_names(view, scene, turned)
+    _draw_object_names(view, shown, taken)
     _draw_title(view, scene)
     _draw_legend(view, scene, colors, with_truth=bool(outlines_m), with_walls=voxel_map is not None)
     _draw_scale(view, turned)
@@ -284,6 +307,34 @@ def _enlarged(view: View, layers: Layers, cells: np.ndarray) -> np.ndarray:
     return cv2.warpAffine(soft, to_cell, size, flags=cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP, borderValue=0)
 
 
+def _draw_objects(view: View, marks: list[_Mark]) -> None:
+    """The outline of each object's box, darker with a name, on a white rim that tells it from the graph.
+
+    Boxes wider than furniture are pieces of walls, or several things that touch: they stay without an outline.
+    """
+    drawn = [mark for mark in marks if float(np.ptp(mark.corners_m, axis=0).max()) <= FURNITURE_M]
+    boxes = [np.clip(mark.corners_m, view.low_m, view.high_m)[[0, 1, 2, 3, 0]] for mark in drawn]
+    view.lines(boxes, (255, 255, 255), 1.5, 0.5)
+    for color, named in ((MUTED, False), (INK, True)):
+        view.lines([box for box, mark in zip(boxes, drawn, strict=True) if bool(mark.label) == named], color, 0.5)
+
+
+def _draw_object_names(
+    view: View, marks: list[_Mark], taken: list[tuple[float, float, float, float]], size: int = 13
+) -> None:
+    """Small names in the middle of their boxes, the largest first; one that would cover another name is left out."""
+    for mark in sorted(marks, key=lambda mark: -float(np.ptp(mark.corners_m, axis=0).prod())):
+        if not mark.label:
+            continue
+        width, height = _text_width(mark.label, size * SUPERSAMPLING), size * SUPERSAMPLING
+        x, y = view.pixels(mark.corners_m.mean(axis=0)[None])[0] - (width / 2, -height / 3)
+        box = (float(x), float(y), float(width), float(height))
+        if any(_overlap(box, other) for other in taken):
+            continue
+        taken.append(box)
+        _outlined_text(view, mark.label, box, size, rim=1)
+
+
 def _draw_graph(view: View, scene: Scene, turned: bool) -> None:
     at_m = _plane(scene.positions_m, turned)
     row_of = {place: row for row, place in enumerate(scene.place_ids.tolist())}
@@ -319,8 +370,11 @@ def _draw_dashed(view: View, polygon_m: np.ndarray, dash_m: float = 0.16) -> Non
     view.lines(dashes, INK, 2.0)
 
 
-def _draw_names(view: View, scene: Scene, turned: bool, size: int = 22) -> None:
-    """Each region's label at its place nearest to its middle, moved up or down while labels would overlap."""
+def _draw_names(view: View, scene: Scene, turned: bool, size: int = 22) -> list[tuple[float, float, float, float]]:
+    """Each region's label at its place nearest to its middle, moved up or down while labels would overlap.
+
+    Returns where they stand: left, baseline, width and height on the canvas.
+    """
     taken: list[tuple[float, float, float, float]] = []
     for region in sorted(scene.regions, key=lambda region: -region.area_m2):
         rows = np.flatnonzero(scene.place_regions == region.id)
@@ -337,9 +391,16 @@ def _draw_names(view: View, scene: Scene, turned: bool, size: int = 22) -> None:
             if not any(_overlap(box, other) for other in taken):
                 break
         taken.append(box)
-        for offset in np.array([(a, b) for a in (-2, -1, 0, 1, 2) for b in (-2, -1, 0, 1, 2)]) * 2:
-            view.text(region.label, (box[0] + offset[0], box[1] + offset[1]), size, (255, 255, 255), True)
-        view.text(region.label, box[:2], size, INK, True)
+        _outlined_text(view, region.label, box, size, rim=2, bold=True)
+    return taken
+
+
+def _outlined_text(view: View, text: str, box: tuple[float, ...], size: int, *, rim: int, bold: bool = False) -> None:
+    """Text with a white rim, so that it can be read on anything."""
+    steps = range(-rim, rim + 1)
+    for offset in np.array([(a, b) for a in steps for b in steps]) * SUPERSAMPLING:
+        view.text(text, (box[0] + offset[0], box[1] + offset[1]), size, (255, 255, 255), bold)
+    view.text(text, (box[0], box[1]), size, INK, bold)
 
 
 def _overlap(one: tuple[float, ...], two: tuple[float, ...]) -> bool:
@@ -360,7 +421,7 @@ def _draw_title(view: View, scene: Scene) -> None:
 def _draw_legend(view: View, scene: Scene, colors: dict[str, Color], *, with_truth: bool, with_walls: bool) -> None:
     left = view.shape[1] - SUPERSAMPLING * (LEGEND_PX + MARGIN_PX)
     top = SUPERSAMPLING * (TITLE_PX + MARGIN_PX)
-    symbols = 4 + with_truth + 2 * with_walls
+    symbols = 4 + with_truth + 2 * with_walls + bool(scene.objects)
     room = int((view.shape[0] / SUPERSAMPLING - TITLE_PX - 2 * MARGIN_PX) / 36) - symbols - 3
     regions = sorted(scene.regions, key=lambda region: (-region.area_m2, region.id))
     view.text("region", (left, top), 16, MUTED)
@@ -400,6 +461,11 @@ def _draw_symbols(view: View, scene: Scene, left: int, top: int, *, with_truth: 
             _swatch(view, left, top, color)
     row("free, in no place" if not (scene.place_regions < 0).any() else "free, not labelled")
     _swatch(view, left, top, UNLABELLED if (scene.place_regions < 0).any() else FREE)
+    if scene.objects:
+        start, end = row("object")
+        half = np.array((0, middle / 2))
+        low, high = np.round((start - half, end + half)).astype(int).tolist()
+        cv2.rectangle(view.canvas, low, high, MUTED, SUPERSAMPLING // 2, cv2.LINE_AA)
     ends = row("place graph")
     stroke(ends, (150, 155, 162), 2)
     for end in ends:

@@ -167,7 +167,7 @@ def test_a_run_tells_how_well_it_found_objects(case, capsys):
     found = compare(result, None, full.objects, Console(width=200))
     assert found["objects_precision"] == 0.5
     assert found["objects_named_precision"] is None  # nothing carries a name, and JSON knows no NaN
-    assert "2 found, 1 true of the prior's and seen, precision 0.500, recall 1.000" in capsys.readouterr().out
+    assert "2 found, 1 true of the prior's and seen, precision 0.500, recall 1.000, " in capsys.readouterr().out
     counts.detectors = {"none"}
     assert compare(result, None, full.objects, Console()) == {}
 

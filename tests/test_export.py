@@ -295,6 +295,33 @@ def test_picture_shows_regions_walls_and_truth(tmp_path):
     assert (tmp_path / "again.png").read_bytes() == path.read_bytes()
 
 
+def seen_at(low, high, label=""):
+    """An object whose box spans these corners."""
+    middle = tuple((np.add(low, high) / 2).tolist())
+    shape = {"position_m": middle, "min_m": low, "max_m": high}
+    return SceneObject(id=1, label=label, probability=0.5, known=0.5, frames=3, **shape)
+
+
+def test_objects_are_outlined_and_named_without_hiding_the_map(tmp_path):
+    def drawn(*items):
+        map_png(changed(flat(), objects=list(items)), flat_map(), tmp_path / "map.png")
+        return cv2.imread(str(tmp_path / "map.png")).astype(int)[:, :1200]  # without the legend
+
+    def changed_by(item):
+        return np.abs(drawn(item) - drawn()).max(axis=-1) > 8
+
+    low, high = (2.0, 0.5, 0.0), (2.4, 0.9, 0.5)
+    outline = changed_by(seen_at(low, high))
+    assert 0 < outline.mean() < 0.01
+    rows, columns = np.nonzero(outline)
+    assert abs(np.ptp(rows) - np.ptp(columns)) <= 2  # a square
+    assert not outline[rows.min() + 6 : rows.max() - 5, columns.min() + 6 : columns.max() - 5].any()
+    named = changed_by(seen_at(low, high, "oven"))
+    assert named[rows.min() + 6 : rows.max() - 5, columns.min() + 6 : columns.max() - 5].any()
+    assert not changed_by(seen_at((1.0, 0.5, 0.0), (4.5, 0.9, 0.5))).any()  # wider than furniture
+    assert not changed_by(seen_at((90.0, 0.5, 0.0), (91.0, 0.9, 0.5), "oven")).any()  # off the map
+
+
 def test_tall_maps_lie_down(tmp_path):
     scene = flat()
     swap = [1, 0, 2]

@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from deploy.evaluation.object_metrics import NOTHING, OBJECT_SCORES, distances_m, object_scores, pairs
+from deploy.evaluation.object_metrics import NOTHING, OBJECT_SCORES, OBJECT_SHARES, distances_m, object_scores, pairs
 from deploy.evaluation.oracles import TrueObject
 from schemas.objects import SceneObject
 from schemas.places import VoxelMap
@@ -65,6 +65,13 @@ def test_half_a_metre_is_near_and_more_is_not():
     assert score([found("", 1.501)], [true("chair", 0)])["objects_recall"] == 0
 
 
+def test_centred_pairs_have_their_middles_near():
+    truth = [true("table", 0, side=3.0), true("table", 5)]
+    scores = score([found("", 0.5), found("", 5.5)], truth)  # both inside, the first at the rim of a large table
+    assert scores["objects_precision"] == scores["objects_recall"] == 1
+    assert scores["objects_centred_precision"] == scores["objects_centred_recall"] == 0.5
+
+
 def test_two_pieces_of_one_object_are_one_hit_and_one_error():
     scores = score([found("", 0.3), found("", 0.7)], [true("table", 0)])
     assert (scores["objects_precision"], scores["objects_recall"]) == (0.5, 1.0)
@@ -97,7 +104,7 @@ def test_a_pair_is_given_up_for_two():
 
 def test_shares_of_nothing_are_no_scores():
     scores = score([], [true("vase", 0)])
-    assert all(math.isnan(scores[name]) for name in OBJECT_SCORES[:4])
+    assert all(math.isnan(scores[name]) for name in OBJECT_SHARES)
     assert score([], [true("chair", 0)])["objects_recall"] == 0
     assert score([found("", 0.0)], [])["objects_precision"] == 0
 

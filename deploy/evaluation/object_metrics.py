@@ -6,8 +6,10 @@ Found and true objects are paired one to one: as many wanted ones as possible, t
 the nearest. A found object paired with a true one that is not wanted is *ignored*: the thing is there, but nobody asked
 for it, so it is neither right nor wrong. All else that is found and not paired with a wanted object is wrong.
 
-The named scores do the same with found objects that carry a label alone, and a pair must have the same name on both
-sides, letter by letter: a claim under a wrong name is wrong wherever it stands.
+The middle of a box that is far too large lies easily in some true box. The centred scores are stricter: there a pair's
+two middles are at most TOLERANCE_M apart. The named scores do the same as the first with found objects that carry a
+label alone, and a pair must have the same name on both sides, letter by letter: a claim under a wrong name is wrong
+wherever it stands.
 """
 
 import math
@@ -23,7 +25,14 @@ from schemas.places import VoxelMap
 TOLERANCE_M = 0.5
 NO_DETECTOR = "none"  # with it no objects are looked for, and there is nothing to judge
 NOTHING = -1  # paired with no true object
-OBJECT_SHARES = ("objects_precision", "objects_recall", "objects_named_precision", "objects_named_recall")
+OBJECT_SHARES = (
+    "objects_precision",
+    "objects_recall",
+    "objects_centred_precision",
+    "objects_centred_recall",
+    "objects_named_precision",
+    "objects_named_recall",
+)
 OBJECT_COUNTS = ("objects_found", "objects_true", "objects_ignored", "objects_named")
 OBJECT_SCORES = (*OBJECT_SHARES, *OBJECT_COUNTS)
 
@@ -35,24 +44,29 @@ def object_scores(
     voxels: VoxelMap,
     tolerance_m: float = TOLERANCE_M,
 ) -> dict[str, float]:
-    """Precision and recall by place alone and by place and name, and counts; by OBJECT_SCORES.
+    """Precision and recall by place, by centre and by place and name, and counts; by OBJECT_SCORES.
 
     `names` are those of the prior's objects, `voxels` tell what the robot has seen. `objects_found` counts all found
     objects, `objects_named` those with a label, `objects_true` the wanted ones, `objects_ignored` found ones that stand
     for a true object that is not wanted. A share of nothing is NaN.
     """
     wanted = in_view(true, voxels) & np.array([item.label in names for item in true], bool)
-    near = distances_m(found, true)
-    near[near > tolerance_m] = np.inf
     named = np.array([bool(item.label) for item in found], bool)
-    same = np.array([[a.label == b.label for b in true] for a in found], bool).reshape(near.shape)
-    by_place = pairs(near, wanted)
-    by_name = pairs(np.where(same, near, np.inf)[named], wanted)
-    precision, recall = _shares(by_place, wanted)
-    named_precision, named_recall = _shares(by_name, wanted)
-    counts = len(found), wanted.sum(), _ignored(by_place, wanted), named.sum()
-    shares = precision, recall, named_precision, named_recall
+    same = np.array([[a.label == b.label for b in true] for a in found], bool).reshape(len(found), len(true))
+    by_place, by_centre = distances_m(found, true), distances_m(found, [_middle(item) for item in true])
+    for distances in (by_place, by_centre):
+        distances[distances > tolerance_m] = np.inf
+    by_name = np.where(same, by_place, np.inf)[named]
+    pairings = [pairs(distances, wanted) for distances in (by_place, by_centre, by_name)]
+    shares = [share for columns in pairings for share in _shares(columns, wanted)]
+    counts = len(found), wanted.sum(), _ignored(pairings[0], wanted), named.sum()
     return dict(zip(OBJECT_SCORES, map(float, (*shares, *counts)), strict=True))
+
+
+def _middle(item: TrueObject) -> TrueObject:
+    """An object without extent, at the middle of its box."""
+    middle_m = (item.min_m + item.max_m) / 2
+    return TrueObject(item.label, middle_m, middle_m)
 
 
 def distances_m(found: Sequence[SceneObject], true: Sequence[TrueObject]) -> np.ndarray:
