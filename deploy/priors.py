@@ -346,6 +346,8 @@ def describe(prior: Prior, cfg: Config, console: Console) -> None:
         console.print("    holds " + ", ".join(f"{prior.objects[j].name} {prior.containment[i, j]:.0%}" for j in best))
         console.print("    touches " + ", ".join(f"{prior.regions[j].name} {prior.adjacency[i, j]:.0%}" for j in near))
         console.print("    looks like " + "; ".join(region.phrases[:3]))
+    if sized := [_size(item) for item in prior.objects if item.size_m is not None]:
+        console.print("[bold]sizes[/]  " + ", ".join(sized))
     made = prior.provenance
     console.print(f"prior {prior.digest()}: {len(prior.regions)} regions, {len(prior.objects)} objects")
     console.print(f"made by {made.source} ({made.detail}){_when(made)}: {made.note}")
@@ -356,6 +358,12 @@ def describe(prior: Prior, cfg: Config, console: Console) -> None:
 
 def _with_spread(value: float, spread: float | None) -> str:
     return f"{value:.0%}" + (f" ±{spread:.0%}" if spread is not None and spread >= 0.005 else "")
+
+
+def _size(item: ObjectPrior) -> str:
+    """Its name and sides in metres, and where its lower edge is if that is not the floor."""
+    sides = "×".join(f"{side_m:.2g}" for side_m in item.size_m or ())
+    return f"{item.name} {sides} m" + (f" at {item.bottom_m:.2g} m" if item.bottom_m else "")
 
 
 def _when(made: Provenance) -> str:

@@ -13,6 +13,7 @@ SUM_TOLERANCE = 1e-3
 # No prior that somebody means is larger; a message beyond is refused wherever it arrives.
 MOST_REGIONS, MOST_OBJECTS, MOST_PHRASES = 64, 512, 64
 LONGEST_NAME, LONGEST_PHRASE = 80, 240
+LARGEST_M, MOST_SPREAD = 1000.0, 2.0  # of an object's sides, and of their logarithm
 
 
 class Task(Message, frozen=True, kw_only=True):
@@ -51,10 +52,13 @@ class RegionPrior(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True)
 
 
 class ObjectPrior(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """One expected object."""
+    """One expected object; what size it usually is, where the prior says so."""
 
     name: str
     phrases: list[str]
+    size_m: tuple[float, float, float] | None = None  # longest and shortest horizontal side, height; medians
+    size_spread: float = 0.35  # standard deviation of a side's logarithm
+    bottom_m: float | None = None  # height of its lower edge above the floor: 0 = it stands there
 
 
 class Provenance(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
@@ -108,6 +112,8 @@ class Prior(Message, frozen=True, kw_only=True, omit_defaults=True):
         self._check_matrices()
         for region in self.regions:
             _check_region(region)
+        for item in self.objects:
+            _check_object(item)
         existence = [region.existence for region in self.regions]
         if abs(sum(existence) - 1) > SUM_TOLERANCE:
             raise ValueError("existence must be positive and sum to one")
@@ -161,6 +167,19 @@ def _check_region(region: RegionPrior) -> None:
         raise ValueError(f"{region.name}: inclination must lie between 0 and a right angle, its spread above 0")
     if not 0 < region.query_radius_m <= 100:
         raise ValueError(f"{region.name}: the query radius must lie between 0 and 100 m")
+
+
+def _check_object(item: ObjectPrior) -> None:
+    if item.size_m is not None:
+        longest, shortest, height = item.size_m
+        if not 0 < shortest <= longest <= LARGEST_M or not 0 < height <= LARGEST_M:
+            raise ValueError(
+                f"{item.name}: sides must lie between 0 and {LARGEST_M:g} m, the longest horizontal one first"
+            )
+    if not 0 < item.size_spread <= MOST_SPREAD:
+        raise ValueError(f"{item.name}: the spread of its size must lie between 0 and {MOST_SPREAD:g}")
+    if item.bottom_m is not None and not 0 <= item.bottom_m <= LARGEST_M:
+        raise ValueError(f"{item.name}: its lower edge must lie between 0 and {LARGEST_M:g} m above the floor")
 
 
 class PriorRequest(Message, frozen=True, kw_only=True):

@@ -14,6 +14,7 @@ OBJECTS = {
     "bedroom": ("bed", "lamp"),
     "bathroom": ("bath", "sink"),
 }
+SIZES_CM = {"door": (90, 10, 205, 0), "bed": (200, 150, 60, 0), "lamp": (30, 30, 50, 60)}  # all others: a cube of 60
 KNOWN_SHARES = {"hall": 20, "kitchen": 30, "bedroom": 40, "bathroom": 10}
 
 
@@ -36,6 +37,9 @@ def fill(schema: dict, path: tuple[str, ...] = ()) -> object:
 def percent(path: tuple[str, ...]) -> int:
     """A number for an entry: high where an object belongs to a region, else low."""
     fixed = {"inclination_deg": 0, "inclination_spread_deg": 5, "scale_cm": 80, "share": 25}
+    sides = ("longest_cm", "shortest_cm", "height_cm", "bottom_cm")
+    if path[-1] in sides:
+        return SIZES_CM.get(path[0], (60, 60, 60, 0))[sides.index(path[-1])]
     if path[-1] in fixed:
         return fixed[path[-1]]
     return 90 if path[-1] in OBJECTS.get(path[0], ()) else 60 if "hall" in path else 5

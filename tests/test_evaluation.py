@@ -24,6 +24,7 @@ from deploy.report import compare
 from deploy.run import Counts, Result
 from schemas.codec import encode
 from schemas.places import VoxelMap
+from schemas.priors import ObjectPrior
 from services.segmenter.experts import REGISTRY
 from services.segmenter.state import Config
 
@@ -208,7 +209,8 @@ def test_the_prior_oracle_counts(case):
 
 
 def test_variations_are_seeded_valid_and_differ():
-    first = prior(NAMES)
+    oven = ObjectPrior(name="oven", phrases=["an oven"], size_m=(0.6, 0.6, 0.9), bottom_m=0.0)
+    first = prior(NAMES, objects=[oven, ObjectPrior(name="bed", phrases=["a bed"])])
     found = priors.variations(first, 4, 0.5)
     again = priors.variations(first, 4, 0.5)
     assert found[0] is first
@@ -217,6 +219,7 @@ def test_variations_are_seeded_valid_and_differ():
     for one in found[1:]:
         one.check()
         assert [region.name for region in one.regions] == NAMES
+        assert one.objects == first.objects
         assert one.regions[0].phrases[0] == first.regions[0].phrases[0]
         assert set(one.regions[0].phrases) <= set(first.regions[0].phrases)
 

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from schemas.codec import decode, encode
-from schemas.priors import Prior, PriorRequest, Task
+from schemas.priors import ObjectPrior, Prior, PriorRequest, Task
 from services.prior_gateway import core, library, service
 from services.prior_gateway.archive import PREFERRED, Archive
 from services.prior_gateway.core import Config, Library, NoPrior, with_article
-from services.prior_gateway.knowledge import Environment, RegionEntry, TaskEntry, check_environment
+from services.prior_gateway.knowledge import Environment, RegionEntry, Size, TaskEntry, check_environment, with_sizes
 from services.prior_gateway.matching import contains, match_environment, match_task, stems, words
 from tests.gateway import Gateway
 
@@ -116,6 +116,64 @@ def test_knowledge_as_expected_of_a_home():
     assert touch(prior, "kitchen", "dining room") > touch(prior, "hallway", "bedroom") - 0.1 > 0.5
     assert touch(prior, "kitchen", "bathroom") < 0.1
     assert held(prior, "kitchen", "refrigerator") > 10 * held(prior, "bathroom", "refrigerator")
+
+
+def test_every_object_has_a_size_and_the_same_in_all_environments_unless_one_says_otherwise():
+    seen: dict[str, tuple] = {}
+    for environment in LIBRARY.environments:
+        for task in environment.tasks:
+            prior = prior_of(environment.name, task.name)
+            prior.check()
+            for item in prior.objects:
+                assert item.size_m is not None and item.bottom_m is not None, item.name
+                assert seen.setdefault(item.name, item.size_m) == item.size_m, item.name
+
+
+def test_sizes_as_expected_of_a_home():
+    sizes = {item.name: item for item in prior_of("house", "real-estate listing").objects}
+    assert sizes["sofa"].size_m[0] > 2 * sizes["nightstand"].size_m[0]
+    assert sizes["picture frame"].bottom_m > 1 > sizes["television"].bottom_m > sizes["sofa"].bottom_m == 0
+    assert sizes["refrigerator"].size_m[2] > 1.5
+
+
+def test_an_environment_may_say_otherwise_but_must_not_leave_out():
+    common = {name: Size(1.0, 0.5, 0.8, 0.0) for name in ("sofa", "tap", "lid")}
+    with pytest.raises(ValueError, match=r"no size of .'glass'"):
+        with_sizes(small_world(), common)
+    own = small_world(sizes={"sofa": Size(3.0, 0.5, 0.8, 0.0)})
+    prior = small_library(with_sizes(own, common | {"glass": Size(0.1, 0.1, 0.2, 0.9, 0.2)})).answer(
+        asked("pub", "drink"), Config()
+    )
+    found = {item.name: (item.size_m, item.bottom_m, item.size_spread) for item in prior.objects}
+    assert found["sofa"][0][0] == 3.0 and found["tap"] == ((1.0, 0.5, 0.8), 0.0, 0.35)
+    assert found["glass"] == ((0.1, 0.1, 0.2), 0.9, 0.2)
+    with pytest.raises(ValueError, match="does not hold"):
+        with_sizes(small_world(sizes={"sofá": Size(3.0, 0.5, 0.8, 0.0)}), common | {"glass": common["lid"]})
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"size_m": (0.5, 0.6, 1.0)}, "longest horizontal one first"),
+        ({"size_m": (0.5, 0.0, 1.0)}, "between 0 and"),
+        ({"size_m": (0.5, 0.2, float("nan"))}, "between 0 and"),
+        ({"size_spread": 0.0}, "spread of its size"),
+        ({"bottom_m": -0.1}, "lower edge"),
+    ],
+)
+def test_a_prior_with_an_impossible_size_is_refused(changes, says):
+    prior = prior_of("house", "real-estate listing")
+    broken = [msgspec.structs.replace(prior.objects[0], **changes), *prior.objects[1:]]
+    with pytest.raises(ValueError, match=says):
+        msgspec.structs.replace(prior, objects=broken).check()
+
+
+def test_a_prior_that_knows_no_sizes_keeps_its_digest():
+    bare = ObjectPrior(name="bed", phrases=["a bed"])
+    assert msgspec.msgpack.encode(bare) == msgspec.msgpack.encode({"name": "bed", "phrases": ["a bed"]}), (
+        "as before priors had sizes"
+    )
+    assert msgspec.convert({"name": "bed", "phrases": ["a bed"]}, ObjectPrior) == bare
 
 
 # Merging, by numbers worked by hand

@@ -106,7 +106,7 @@ def test_a_fleet_makes_one_call_shares_the_prior_and_keeps_the_key_secret(endpoi
             assert (pending.priors, pending.pending) == ([], True)
             wait_for(lambda: found, "a prior")
             assert conversations(model) == 1, "two robots, two gateways, one conversation"
-            assert model.calls == 5, "four turns, one of them repeated"
+            assert model.calls == 6, "five turns, one of them repeated"
             assert found[0].provenance.made_by in ("a", "b")
             wait_for(lambda: alive(client, "c"), "the third gateway")
             wait_for(lambda: list((tmp_path / "c").glob("*/*.prior")), "the third has the prior")
@@ -116,7 +116,7 @@ def test_a_fleet_makes_one_call_shares_the_prior_and_keeps_the_key_secret(endpoi
             client.publish(TASK, task("r3", "clean"))
             seconds = wait_for(lambda: found, "the late one answers alone")
             assert seconds < 1
-            assert model.calls == 5
+            assert model.calls == 6
         finally:
             for name in list(fleet.processes):
                 fleet.end(name)

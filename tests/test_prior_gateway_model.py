@@ -57,10 +57,13 @@ def broken_once(change, name):
 
 def test_top_down_regions_objects_matrices():
     draft, turns = drive(synthesis.synthesise(task(), PROMPTS, CFG))
-    assert [turn.name for turn in turns] == ["regions", "describe", "containment", "adjacency"]
+    assert [turn.name for turn in turns] == ["regions", "describe", "sizes", "containment", "adjacency"]
     assert draft.regions == list(REGIONS)
     assert draft.objects == ["door", "coat rack", "stove", "sink", "bed", "lamp", "bath"]
     assert draft.existence == pytest.approx([0.2, 0.3, 0.4, 0.1])
+    assert draft.sizes_m[[0, 4, 5]] == pytest.approx(
+        np.array([[0.9, 0.1, 2.05, 0], [2, 1.5, 0.6, 0], [0.3, 0.3, 0.5, 0.6]])
+    )
     assert draft.containment[1, 2] == pytest.approx(0.9)
     assert draft.containment[2, 2] == pytest.approx(0.05)
     assert draft.adjacency[0] == pytest.approx([1, 0.6, 0.6, 0.6])
@@ -72,7 +75,7 @@ def test_fixed_vocabulary_keeps_names_and_asks_for_everything_else():
     names = ["Quiet Area", "games area", "sun lounge"]
     draft, turns = drive(synthesis.synthesise(task(names), PROMPTS, CFG))
     assert draft.regions == names
-    assert [turn.name for turn in turns] == ["fixed_regions", "describe", "containment", "adjacency"]
+    assert [turn.name for turn in turns] == ["fixed_regions", "describe", "sizes", "containment", "adjacency"]
     assert "Quiet Area, games area, sun lounge" in turns[0].messages[-1][1]
 
 
@@ -85,14 +88,14 @@ def test_one_region_needs_no_adjacency():
 def test_small_models_are_asked_region_by_region():
     cfg = msgspec.structs.replace(CFG, regions_per_call=1)
     draft, turns = drive(synthesis.synthesise(task(), PROMPTS, cfg))
-    assert [turn.name for turn in turns] == ["regions", *["describe"] * 4, *["containment"] * 4, "adjacency"]
+    assert [turn.name for turn in turns] == ["regions", *["describe"] * 4, "sizes", *["containment"] * 4, "adjacency"]
     assert draft.containment.shape == (4, 7)
 
 
 def test_reasoning_comes_before_the_answer():
     cfg = msgspec.structs.replace(CFG, reason=True)
     _, turns = drive(synthesis.synthesise(task(), PROMPTS, cfg))
-    assert [turn.schema is None for turn in turns] == [True, False] * 4
+    assert [turn.schema is None for turn in turns] == [True, False] * 5
     roles = [role for role, _ in turns[1].messages]
     assert roles == ["system", "user", "assistant", "user"]
     assert turns[1].messages[2][1] == "Let me think about this place."
@@ -118,6 +121,10 @@ def is_description(answer):
     return is_matrix(answer) and "phrases" in answer.get("hall", {})
 
 
+def is_sizes(answer):
+    return is_matrix(answer) and "height_cm" in answer.get("door", {})
+
+
 def put(*path, value=None, drop=False):
     def change(answer):
         at = answer
@@ -131,6 +138,7 @@ def put(*path, value=None, drop=False):
     return change
 
 
+SIDES = ("longest_cm", "shortest_cm", "height_cm", "bottom_cm")
 FAULTS = {
     "a name twice": (is_regions, put("regions", 1, "name", value="Hall"), "'hall' is named more than once"),
     "no name": (is_regions, put("regions", 1, "name", value=" ?"), "neither letter nor digit"),
@@ -144,6 +152,16 @@ FAULTS = {
     "no phrase": (is_description, put("hall", "phrases", value=["", " "]), "there is no phrase"),
     "an endless phrase": (is_description, put("hall", "phrases", value=["x" * 999]), "longer than"),
     "a vertical spread": (is_description, put("hall", "inclination_spread_deg", value=0), "its spread above 0"),
+    "size in metres": (
+        is_sizes,
+        lambda answer: {name: {side: value / 100 for side, value in row.items()} for name, row in answer.items()},
+        "look like metres",
+    ),
+    "sides swapped": (is_sizes, put("door", "shortest_cm", value=95), "shortest side is longer"),
+    "no height": (is_sizes, put("door", "height_cm", value=0), "between 0 and"),
+    "size of an unknown object": (is_sizes, put("moon", value=dict.fromkeys(SIDES, 9)), "no object 'moon'"),
+    "size left out": (is_sizes, put("bed", drop=True), "'bed' is missing"),
+    "below the floor": (is_sizes, put("bed", "bottom_cm", value=-20), "lower edge"),
     "scale in metres": (is_description, put("hall", "scale_cm", value=0.75), "no sensible distance"),
     "another shape": (is_description, put("hall", "phrases", value="a door"), "form asked for"),
     "an object missing": (is_containment, put("hall", "stove", drop=True), "the object 'stove' of 'hall' is missing"),
@@ -170,7 +188,7 @@ FAULTS = {
 def test_a_faulty_answer_goes_back_with_its_faults(case):
     which, change, says = FAULTS[case]
     draft, turns = drive(synthesis.synthesise(task(), PROMPTS, CFG), broken_once(change, which))
-    assert len(turns) == 5, "one repair"
+    assert len(turns) == 6, "one repair"
     repair = next(turn for turn in turns if "cannot be used" in turn.messages[-1][1])
     assert re.search(says, repair.messages[-1][1]), repair.messages[-1][1]
     assert repair.messages[-2][0] == "assistant"
@@ -261,6 +279,7 @@ def draft_of(regions, objects, held, touching, **changes):
         "inclination_deg": np.tile((0.0, 5.0), (count, 1)),
         "query_radius_m": np.full(count, 0.75),
         "objects": objects,
+        "sizes_m": np.ones((len(objects), 4)),
         "containment": np.array(held, dtype=float),
         "adjacency": np.array(touching, dtype=float),
     }
@@ -295,6 +314,17 @@ def test_samples_are_aligned_over_synonyms_and_averaged():
     assert prior.spread.containment[0, sofa] == pytest.approx(0.1, abs=1e-6)
     assert prior.spread.support.tolist() == [1.0, 1.0]
     assert prior.regions[0].phrases[:2] == ["a living room", "inside lounge"]
+
+
+def test_sizes_are_geometric_means_and_their_differences_widen_the_spread():
+    one = draft_of(["a"], ["x", "y"], [[0.2, 0.2]], [[1]], sizes_m=np.array([[1.0, 0.5, 0.8, 0.0], [2, 1, 3, 0.4]]))
+    two = draft_of(["a"], ["y", "x"], [[0.2, 0.2]], [[1]], sizes_m=np.array([[2.0, 1.0, 3.0, 0.8], [4, 0.5, 0.8, 0]]))
+    x, y = combined([one, two]).objects
+    assert x.size_m == pytest.approx((2.0, 0.5, 0.8)) and x.bottom_m == 0.0
+    # logarithms of the longest side: 0 and log 4, variance (log 2)^2; mean over three sides
+    assert x.size_spread == pytest.approx(np.sqrt(0.35**2 + np.log(2) ** 2 / 3))
+    assert y.size_m == pytest.approx((2.0, 1.0, 3.0)) and y.bottom_m == pytest.approx(0.6)
+    assert y.size_spread == pytest.approx(0.35)
 
 
 def test_one_sample_has_no_spread_and_keeps_everything():

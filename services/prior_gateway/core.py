@@ -195,7 +195,7 @@ def compose(
         task=task.task,
         vocabulary=task.regions,
         regions=[_region(one, share, bool(task.regions), cfg) for one, share in zip(chosen, existence, strict=True)],
-        objects=[ObjectPrior(name=name, phrases=_object_phrases(name, chosen, cfg)) for name in objects],
+        objects=[_object(name, chosen, cfg) for name in objects],
         containment=_containment(chosen, objects, extra, cfg).astype(np.float32),
         adjacency=_adjacency(chosen, cfg).astype(np.float32),
         provenance=provenance,
@@ -312,6 +312,17 @@ def _object_names(chosen: Sequence[Chosen], extra: dict[str, dict[str, float]]) 
     listed = [name for member in members for name in member.objects]
     of_task = [name for name, held in extra.items() if any(member.name in held for member in members)]
     return list(dict.fromkeys([*listed, *of_task]))
+
+
+def _object(name: str, chosen: Sequence[Chosen], cfg: Config) -> ObjectPrior:
+    """An object with its phrases, and its size as the first environment has it that knows it."""
+    item = ObjectPrior(name=name, phrases=_object_phrases(name, chosen, cfg))
+    sizes = [one.environment.sizes[name] for one in chosen if one.environment and name in one.environment.sizes]
+    if not sizes:
+        return item
+    size = sizes[0]
+    sides_m = (size.longest_m, size.shortest_m, size.height_m)
+    return msgspec.structs.replace(item, size_m=sides_m, size_spread=size.spread, bottom_m=size.bottom_m)
 
 
 def _object_phrases(name: str, chosen: Sequence[Chosen], cfg: Config) -> list[str]:

@@ -5,6 +5,16 @@ from dataclasses import dataclass
 import msgspec
 
 
+class Size(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
+    """What size an object usually is: the line of numbers in `library/sizes.toml`; metres."""
+
+    longest_m: float  # horizontal sides
+    shortest_m: float
+    height_m: float
+    bottom_m: float  # height of the lower edge above the floor
+    spread: float = 0.35  # standard deviation of a side's logarithm
+
+
 class RegionEntry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """One base region: what it is called, looks like, holds and touches."""
 
@@ -39,6 +49,7 @@ class Environment(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     tasks: list[TaskEntry]
     synonyms: list[str] = []
     objects: dict[str, list[str]] = {}  # further phrases of an object
+    sizes: dict[str, Size] = {}  # of objects that are of another size here than elsewhere
 
     def region(self, name: str) -> RegionEntry:
         """The base region of that name; raises KeyError."""
@@ -65,6 +76,18 @@ class Chosen:
     environment: Environment | None
     members: tuple[RegionEntry, ...]
     how: str = ""  # how the name was understood, for the provenance
+
+
+def with_sizes(environment: Environment, common: dict[str, Size]) -> Environment:
+    """The environment with the size of each of its objects: its own word, else the common one. Raises ValueError."""
+    listed = [held for region in environment.regions for held in region.objects]
+    listed += [held for task in environment.tasks for held in task.objects]
+    sizes = {**common, **environment.sizes}
+    if unknown := sorted({*listed} - sizes.keys()):
+        raise ValueError(f"environment {environment.name!r}: no size of {unknown}")
+    if unused := sorted(environment.sizes.keys() - {*listed}):
+        raise ValueError(f"environment {environment.name!r}: sizes of {unused}, which it does not hold")
+    return msgspec.structs.replace(environment, sizes={name: sizes[name] for name in dict.fromkeys(listed)})
 
 
 def check_environment(environment: Environment) -> None:

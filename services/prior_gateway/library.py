@@ -1,13 +1,18 @@
-"""The curated knowledge that ships with the gateway: one TOML file per environment under `library/`."""
+"""The curated knowledge that ships with the gateway: under `library/`, one TOML file per environment, and one with the
+sizes of all objects."""
 
 import hashlib
 import tomllib
 from importlib.resources import files
+from typing import TypeVar
 
 import msgspec
 
 from services.prior_gateway.core import Library
-from services.prior_gateway.knowledge import Environment, check_environment
+from services.prior_gateway.knowledge import Environment, Size, check_environment, with_sizes
+
+SIZES = "sizes.toml"
+K = TypeVar("K")
 
 
 class Listing(msgspec.Struct, frozen=True, kw_only=True):
@@ -21,21 +26,28 @@ class Listing(msgspec.Struct, frozen=True, kw_only=True):
 
 def load() -> Library:
     """Read and check every file; raises ValueError that names the file."""
-    found: list[Environment] = []
     content = hashlib.blake2b(digest_size=6)
     folder = files("services.prior_gateway") / "library"
-    for file in sorted(folder.iterdir(), key=lambda file: file.name):
-        if not file.name.endswith(".toml"):
-            continue
-        text = file.read_text(encoding="utf-8")
+    texts = {file.name: file.read_text(encoding="utf-8") for file in folder.iterdir() if file.name.endswith(".toml")}
+    sizes = _read(SIZES, texts[SIZES], dict[str, Size])
+    found = []
+    for name, text in sorted(texts.items()):
         content.update(text.encode())
-        try:
-            environment = msgspec.convert(tomllib.loads(text), Environment)
-            check_environment(environment)
-        except (tomllib.TOMLDecodeError, msgspec.ValidationError, ValueError) as error:
-            raise ValueError(f"{file.name}: {error}") from error
-        found.append(environment)
+        if name != SIZES:
+            environment = _read(name, text, Environment)
+            try:
+                check_environment(environment)
+                found.append(with_sizes(environment, sizes))
+            except ValueError as error:
+                raise ValueError(f"{name}: {error}") from error
     return Library(environments=tuple(found), version=content.hexdigest())
+
+
+def _read(name: str, text: str, kind: type[K]) -> K:
+    try:
+        return msgspec.convert(tomllib.loads(text), kind)
+    except (tomllib.TOMLDecodeError, msgspec.ValidationError) as error:
+        raise ValueError(f"{name}: {error}") from error
 
 
 def environments() -> list[Listing]:

@@ -1,8 +1,9 @@
 """A prior graph from a language model, as a conversation (paper, Prior Graph Extraction; pure).
 
 Top-down: regions, then the objects that are relevant and discriminative with geometry and appearance of each region,
-then P(o | r), then P(ri <-> rj). The conversation is a generator: it yields what to say and is sent what was answered;
-whoever drives it owns network, retries and time. Every answer is checked; a faulty one goes back with its faults.
+then the objects' sizes, then P(o | r), then P(ri <-> rj). The conversation is a generator: it yields what to say and is
+sent what was answered; whoever drives it owns network, retries and time. Every answer is checked; a faulty one goes
+back with its faults.
 """
 
 import json
@@ -22,6 +23,7 @@ PROMPT_FIELDS: dict[str, set[str]] = {
     "regions": {"environment", "task", "most_regions"},
     "fixed_regions": {"environment", "task", "regions"},
     "describe": {"environment", "task", "regions", "batch"},
+    "sizes": {"environment", "objects", "batch"},
     "containment": {"environment", "task", "regions", "objects", "batch"},
     "adjacency": {"environment", "task", "regions"},
     "revise": {"environment", "task", "regions", "disagreements"},
@@ -32,8 +34,10 @@ PROMPT_FIELDS: dict[str, set[str]] = {
 MOST_FAULTS = 12  # told at once
 LONGEST_ECHO = 8000  # characters of a faulty answer that go back to the model
 ASYMMETRY = 15.0  # percent by which two statements about one pair may differ; their mean counts
+OBJECTS_PER_REGION = 8  # asked for
 MOST_LISTED = 16  # objects or phrases of one region
 LEAST, MOST = 0.01, 0.99  # no estimate of a model is certain
+LARGEST_CM, HIGHEST_CM = 10_000, 2_000  # sides of an object, and its lower edge above the floor
 
 Schema = dict[str, Any]
 A = TypeVar("A")
@@ -63,6 +67,12 @@ class SynthesisConfig(msgspec.Struct, frozen=True, kw_only=True):
         """The form of a whole number."""
         form: Schema = {"type": "integer", "minimum": low, "maximum": high}
         return form | {"enum": np.linspace(low, high, self.steps).round().astype(int).tolist()} if self.steps else form
+
+    @property
+    def length(self) -> Schema:
+        """The form of a side in centimetres; steps, if any, are geometric, up to the size of a room."""
+        form = self.number(1, LARGEST_CM)
+        return form | {"enum": np.geomspace(2, 1000, self.steps).round().astype(int).tolist()} if self.steps else form
 
     @property
     def percent(self) -> Schema:
@@ -101,6 +111,7 @@ class Draft:
     inclination_deg: np.ndarray  # (region, 2): mean, standard deviation
     query_radius_m: np.ndarray  # (region,)
     objects: list[str]
+    sizes_m: np.ndarray  # (object, 4): longest and shortest horizontal side, height, lower edge above the floor
     containment: np.ndarray  # (region, object)
     adjacency: np.ndarray  # (region, region), diagonal 1
 
@@ -117,6 +128,15 @@ class Described(msgspec.Struct):
     inclination_deg: float
     inclination_spread_deg: float
     scale_cm: float
+
+
+class Sized(msgspec.Struct):
+    """What a model says of the size of one object."""
+
+    longest_cm: float
+    shortest_cm: float
+    height_cm: float
+    bottom_cm: float
 
 
 class Placed(msgspec.Struct):
@@ -182,6 +202,9 @@ def synthesise(task: Task, prompts: Prompts, cfg: SynthesisConfig) -> Dialogue[D
         described |= yield from describe(talk, batch)
     objects = list(dict.fromkeys(name for region in regions for name in described[region].objects))
     talk.fields["objects"] = ", ".join(objects)
+    sized: dict[str, Sized] = {}
+    for batch in batches(objects, OBJECTS_PER_REGION * cfg.regions_per_call):
+        sized |= yield from sizes(talk, batch)
     held: dict[str, dict[str, float]] = {}
     for batch in batches(regions, cfg.regions_per_call):
         held |= yield from containment(talk, batch, objects)
@@ -196,6 +219,7 @@ def synthesise(task: Task, prompts: Prompts, cfg: SynthesisConfig) -> Dialogue[D
         inclination_deg=np.array([(entry.inclination_deg, entry.inclination_spread_deg) for entry in one_by_one]),
         query_radius_m=np.array([entry.scale_cm / 100 for entry in one_by_one]),
         objects=objects,
+        sizes_m=np.array([msgspec.structs.astuple(sized[name]) for name in objects]) / 100,
         containment=_probability([[held[region][name] for name in objects] for region in regions]),
         adjacency=touching,
     )
@@ -246,7 +270,7 @@ def describe(talk: Talk, batch: list[str]) -> Dialogue[dict[str, Described]]:
     form = _object(
         {
             "phrases": {"type": "array", "items": TEXT, "minItems": 2, "maxItems": 5},
-            "objects": {"type": "array", "items": TEXT, "minItems": 2, "maxItems": 8},
+            "objects": {"type": "array", "items": TEXT, "minItems": 2, "maxItems": OBJECTS_PER_REGION},
             "inclination_deg": talk.cfg.number(0, 90),
             "inclination_spread_deg": talk.cfg.number(1, 45),
             "scale_cm": talk.cfg.number(20, 999),
@@ -265,6 +289,25 @@ def describe(talk: Talk, batch: list[str]) -> Dialogue[dict[str, Described]]:
         return found, [fault for name, entry in found.items() for fault in _faults_of_description(name, entry)]
 
     return (yield from talk.ask("describe", _object(dict.fromkeys(batch, form)), read, batch=", ".join(batch)))
+
+
+def sizes(talk: Talk, batch: list[str]) -> Dialogue[dict[str, Sized]]:
+    """Size of some objects, and how high above the floor they begin."""
+    side, lower = talk.cfg.length, talk.cfg.number(0, 250)
+    form = _object({"longest_cm": side, "shortest_cm": side, "height_cm": side, "bottom_cm": lower})
+
+    def read(text: str) -> tuple[dict[str, Sized], list[str]]:
+        found, faults = parse(text, dict[str, Sized])
+        if found is None:
+            return {}, faults
+        faults = _faults_of_keys("object", found, batch)
+        faults += [fault for name, entry in found.items() for fault in _faults_of_size(name, entry)]
+        longest = [entry.longest_cm for entry in found.values()]
+        if any(value != round(value) for value in longest) and max(longest) <= 10:
+            faults.append("the lengths look like metres; give centimetres")
+        return found, faults
+
+    return (yield from talk.ask("sizes", _object(dict.fromkeys(batch, form)), read, batch=", ".join(batch)))
 
 
 def containment(talk: Talk, batch: list[str], objects: list[str]) -> Dialogue[dict[str, dict[str, float]]]:
@@ -448,6 +491,18 @@ def _faults_of_description(name: str, entry: Described) -> list[str]:
         faults.append(f"{name!r}: inclination must be 0 to 90 degrees, its spread above 0")
     if not 10 <= entry.scale_cm <= 10000:
         faults.append(f"{name!r}: scale_cm {entry.scale_cm:g} is no sensible distance in centimetres")
+    return faults
+
+
+def _faults_of_size(name: str, entry: Sized) -> list[str]:
+    sides = (entry.longest_cm, entry.shortest_cm, entry.height_cm)
+    faults = []
+    if min(sides) <= 0 or max(sides) > LARGEST_CM:
+        faults.append(f"{name!r}: sides are centimetres between 0 and {LARGEST_CM}")
+    if entry.shortest_cm > entry.longest_cm:
+        faults.append(f"{name!r}: the shortest side is longer than the longest")
+    if not 0 <= entry.bottom_cm <= HIGHEST_CM:
+        faults.append(f"{name!r}: its lower edge is 0 to {HIGHEST_CM} centimetres above the floor")
     return faults
 
 
