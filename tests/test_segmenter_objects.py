@@ -88,7 +88,7 @@ def test_boxes_seen_from_a_walk_become_one_object_each_with_their_size():
         vector = objects.descriptor(track.embeddings)
         low, high, axis = BED if vector[1] > vector[0] else OVEN
         assert vector[axis] > 0.97 and track.frames == 8
-        found = track.box_m(CFG.cell_m)
+        found = track.box_m(CFG)
         assert np.abs(found[0, :2] - low[:2]).max() < 0.5 and np.abs(found[1, 2] - high[2]) <= CFG.cell_m + 0.01
         assert (np.abs(found.mean(axis=0) - (low + high) / 2) < 0.4).all()
 
@@ -100,7 +100,7 @@ def test_a_repeated_frame_changes_nothing():
     assert [track.frames for track in tracks.items.values()] == [1]
 
 
-def test_halves_become_one_object_when_a_view_joins_them_and_the_older_id_stays():
+def test_halves_become_one_object_when_two_views_join_them_and_the_older_id_stays():
     pose = look(-1.0, 1.8, 0.0)
     middle = (BED[0][1] + BED[1][1]) / 2
     left = (BED[0], np.array((BED[1][0], middle - 0.1, BED[1][2])), 1)
@@ -109,6 +109,8 @@ def test_halves_become_one_object_when_a_view_joins_them_and_the_older_id_stays(
     tracks = seen(frames)
     assert sorted(tracks.items) == [0, 1]
     objects.observe(tracks, sight(2, pose, [BED]), CFG)
+    assert sorted(tracks.items) == [0, 1]  # one look may err
+    objects.observe(tracks, sight(3, pose, [BED]), CFG)
     assert sorted(tracks.items) == [0]
     assert tracks.merged == [(1, 0)]
 
@@ -120,6 +122,70 @@ def test_two_objects_with_the_same_cells_merge_into_the_older():
     objects.observe(tracks, sight(2, walk()[3], [BED]), CFG)
     assert list(tracks.items) == [0] and tracks.merged == [(1, 0)]
     assert tracks.items[0].frames == 3
+
+
+def halves_of_the_bed(gap_m):
+    """Two boxes, and their embeddings' axes, that one careless look takes for one bed."""
+    middle = (BED[0][1] + BED[1][1]) / 2
+    left = (BED[0], np.array((BED[1][0], middle - gap_m / 2, BED[1][2])), 1)
+    right = (np.array((BED[0][0], middle + gap_m / 2, BED[0][2])), BED[1], 0)
+    return left, right
+
+
+def test_two_objects_that_the_first_looks_took_for_one_are_split_and_the_one_seen_more_keeps_the_id():
+    pose = look(-1.0, 1.8, 0.0)
+    left, right = halves_of_the_bed(0.8)
+    frames = [sight(i, pose, [BED]) for i in range(2)]
+    frames += [sight(2 + i, pose, [left, right]) for i in range(12)]
+    frames += [sight(14 + i, pose, [left]) for i in range(4)]
+    tracks = objects.Tracks(SPACE)
+    ids = []
+    for frame in frames:
+        objects.observe(tracks, frame, CFG)
+        ids.append(sorted(tracks.items))
+    assert ids[1] == [0] and ids[-1][0] == 0 and len(ids[-1]) == 2 and ids[-1] == ids[13]
+    first, second = tracks.items.values()
+    for track, truth in ((first, left), (second, right)):
+        assert track.box_m(CFG) == pytest.approx(np.array(truth[:2]), abs=2 * CFG.cell_m)
+        assert objects.descriptor(track.embeddings)[truth[2]] > 0.9
+    assert first.frames > second.frames >= 10 and not first.sources & second.sources
+    again = objects.Tracks(SPACE, archive=dict(tracks.archive))
+    objects.renew(again, SPACE, CFG)
+    assert [set(track.sources) for track in again.items.values()] == [first.sources, second.sources]
+
+
+def test_an_object_that_a_post_cuts_in_two_but_every_look_shows_whole_stays_one():
+    pose = look(-1.0, 1.8, 0.0)
+    parts = halves_of_the_bed(0.8)
+    clouds = [transform(inverse(pose), side(part, pose[:3, 3])) for part in parts]
+    whole = sight(0, pose, [BED])
+    points = np.concatenate(clouds).astype(np.float16)
+    tracks = objects.Tracks(SPACE)
+    for number in range(20):
+        counts = np.array([len(points)], np.int32)
+        frame = msgspec.structs.replace(whole, frame_id=number, points_camera_m=points, point_counts=counts)
+        objects.observe(tracks, frame, CFG)
+    (track,) = tracks.items.values()
+    assert len(objects._parts(track.firm(CFG.firm_share))) == 2 and track.frames == 20
+
+
+def test_parts_against_a_flood_fill():
+    rng = np.random.default_rng(3)
+    numbers = np.unique(rng.integers(0, 12, (220, 3)), axis=0)
+    waiting, groups = {tuple(row) for row in numbers.tolist()}, []
+    while waiting:
+        group, edge = set(), [waiting.pop()]
+        while edge:
+            cell = edge.pop()
+            group.add(cell)
+            close = {other for other in waiting if max(abs(a - b) for a, b in zip(cell, other, strict=True)) <= 1}
+            waiting -= close
+            edge += close
+        groups.append(group)
+    parts = objects._parts(np.sort(objects.packed(numbers)))
+    assert len(groups) > 3
+    assert sorted(sorted(map(tuple, objects.unpacked(part).tolist())) for part in parts) == sorted(map(sorted, groups))
+    assert [len(part) for part in parts] == sorted(map(len, groups), reverse=True)
 
 
 @pytest.mark.parametrize(("surface_m", "left"), [(9.0, 0), (1.0, 1)], ids=["looked at", "hidden"])
@@ -167,14 +233,14 @@ def test_a_pose_correction_moves_the_object_and_keeps_its_id():
     truth = seen([sight(i, pose, [BED, OVEN]) for i, pose in enumerate(poses)])
     tracks = seen([sight(i, pose, [BED, OVEN], said=off @ pose) for i, pose in enumerate(poses)])
     tracks.next_id = 50
-    wrong = {number: track.box_m(CFG.cell_m) for number, track in tracks.items.items()}
+    wrong = {number: track.box_m(CFG) for number, track in tracks.items.items()}
     for index, pose in enumerate(poses):
         objects.move(tracks, index, pose)
     objects.renew(tracks, SPACE, CFG)
     assert tracks.items.keys() == wrong.keys() and tracks.next_id == 50
     for number, track in tracks.items.items():
-        assert (track.box_m(CFG.cell_m) == truth.items[number].box_m(CFG.cell_m)).all()
-        assert wrong[number][0, 1] - track.box_m(CFG.cell_m)[0, 1] == pytest.approx(3.0, abs=0.2)
+        assert (track.box_m(CFG) == truth.items[number].box_m(CFG)).all()
+        assert wrong[number][0, 1] - track.box_m(CFG)[0, 1] == pytest.approx(3.0, abs=0.2)
 
 
 def test_beliefs_by_hand():

@@ -19,6 +19,7 @@ def load(what: str, kind: str, model: str, device: str) -> tuple[Any, Any, str]:
     cuda = device == "cuda" or (device == "auto" and torch().cuda.is_available())
     torchvision_parts.load_if_installed()
     transformers = package("transformers")
+    transformers.utils.logging.disable_progress_bar()
     try:
         processor = transformers.AutoProcessor.from_pretrained(model)
         network = getattr(transformers, kind).from_pretrained(model).eval()

@@ -152,7 +152,7 @@ def with_votes(
 
 
 def _entry(track: Track, label: str, probability: float, known: float, cfg: TrackingConfig) -> SceneObject:
-    low_m, high_m = np.round(track.box_m(cfg.cell_m), 3)
+    low_m, high_m = np.round(track.box_m(cfg), 3)
     return SceneObject(
         id=track.id,
         label=label,

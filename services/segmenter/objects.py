@@ -2,17 +2,22 @@
 
 A detection's points, moved into the world, fill cells of a grid. It belongs to the object whose cells it shares, the
 descriptor deciding between several; objects that come to share most of their cells become one, the older stays. An
+object whose cells lie in two parts that few detections show together is two; the part shown more often keeps the id. An
 object seen once, and not again although several later frames looked at it, was none.
 
 Detections stay in an archive, without their images: a corrected pose, or another embedding space, associates them
 afresh. An object then keeps the id under which most of its detections were known.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import msgspec
 import numpy as np
 from scipy.optimize import linear_sum_assignment
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from schemas.codec import copied
 from schemas.objects import Detections
@@ -28,10 +33,17 @@ class TrackingConfig(msgspec.Struct, frozen=True, kw_only=True):
     """How detections become objects, and how loudly these speak; the paper leaves these values open."""
 
     cell_m: float = 0.15  # grid of an object's surface; surfaces one cell apart count as the same
-    match_overlap: float = 0.5  # of a detection and an object: least share of one in the other
+    match_overlap: float = 0.4  # of a detection and an object: least share of one in the other
     match_part: float = 0.1  # and least share the other way round: a cup on a table is not the table
     descriptor_weight: float = 0.5  # of the cosine similarity against the overlap, between several candidates
     merge_overlap: float = 0.6  # mean of both shares from which two objects are one
+    box_share: float = 0.2  # of an object's frames that must show a cell for it to lie in the object's box
+    firm_share: float = 0.33  # of an object's frames that must show a cell for it to hold two parts together
+    split_frames: int = 4  # an object seen in fewer frames is not split
+    split_joint: float = (
+        0.25  # of the detections that show the lesser of two parts: if fewer show both, it is split off
+    )
+    part_share: float = 0.2  # of a detection's cells that must lie in a part, for it to show that part
     min_frames: int = 2  # keyframes that must have detected an object
     patience_frames: int = 5  # later frames that look at it in vain, after which one seen in fewer is dropped
     max_depth_m: float = 6.0  # frames farther away do not count as looking
@@ -64,17 +76,22 @@ class Track:
     sources: set[tuple[str, int, int]]  # detector, frame id and number of each detection
     votes: dict[str, float]  # sums of the detections' scores, by the name that they were found for
     missed: int = 0  # frames that looked at it in vain
+    look_again: int = 0  # number of frames from which on it is looked at whether it is two
 
     @property
     def frames(self) -> int:
         """Keyframes in which it was detected."""
         return len({frame for _, frame, _ in self.sources})
 
-    def box_m(self, cell_m: float) -> np.ndarray:
-        """Corners (2, 3) of the box around its cells; those touched once are left out of one seen three times."""
-        solid = self.cells[self.hits > 1] if self.frames > 2 and (self.hits > 1).any() else self.cells
-        numbers = unpacked(solid)
-        return np.stack((numbers.min(axis=0), numbers.max(axis=0) + 1)) * cell_m
+    def firm(self, share: float = 0.0) -> np.ndarray:
+        """Its cells, sorted, that at least a share of its frames shows; once it has three frames, one is not enough."""
+        least = max(share * self.frames, 2 if self.frames > 2 else 1)
+        return self.cells[self.hits >= min(least, self.hits.max())]
+
+    def box_m(self, cfg: TrackingConfig) -> np.ndarray:
+        """Corners (2, 3) of the box around what enough of its frames show."""
+        numbers = unpacked(self.firm(cfg.box_share))
+        return np.stack((numbers.min(axis=0), numbers.max(axis=0) + 1)) * cfg.cell_m
 
 
 @dataclass
@@ -113,7 +130,7 @@ def move(tracks: Tracks, frame_id: int, world_from_camera: np.ndarray) -> None:
 
 def renew(tracks: Tracks, space: str, cfg: TrackingConfig) -> None:
     """Associate all stored detections of a space afresh; ids last by the detections that objects share."""
-    fresh = Tracks(space=space)
+    fresh = Tracks(space=space, archive=tracks.archive)
     for (kept_space, _, _), detections in tracks.archive.items():
         if kept_space == space:
             associate(fresh, detections, cfg)
@@ -157,6 +174,7 @@ def associate(tracks: Tracks, detections: Detections, cfg: TrackingConfig) -> No
             _extend(track, news, cfg)
         touched.append(track.id)
     _merge(tracks, touched, cfg)
+    _split(tracks, touched, cfg)
     _forget(tracks, detections, set(touched), cfg)
     tracks.changed = True
 
@@ -192,10 +210,12 @@ def _merge(tracks: Tracks, touched: list[int], cfg: TrackingConfig) -> None:
         track = tracks.items.get(waiting.pop())
         if track is None:
             continue
+        cells = track.firm()
         for other in list(tracks.items.values()):
             if other.id == track.id or not _close(track.cells, other.cells):
                 continue
-            if shared(track.cells, other.cells) + shared(other.cells, track.cells) >= 2 * cfg.merge_overlap:
+            others = other.firm()
+            if shared(cells, others) + shared(others, cells) >= 2 * cfg.merge_overlap:
                 into, gone = (track, other) if track.id < other.id else (other, track)
                 _extend(into, gone, cfg)
                 del tracks.items[gone.id]
@@ -204,12 +224,81 @@ def _merge(tracks: Tracks, touched: list[int], cfg: TrackingConfig) -> None:
                 break
 
 
+def _split(tracks: Tracks, touched: list[int], cfg: TrackingConfig) -> None:
+    """Objects whose firm cells fall into two parts that few detections show together become two."""
+    for number in dict.fromkeys(touched):
+        track = tracks.items.get(number)
+        if track is None or track.frames < max(cfg.split_frames, track.look_again):
+            continue
+        track.look_again = track.frames + max(1, track.frames // 4)
+        parts = _parts(track.firm(cfg.firm_share))
+        if len(parts) < 2:
+            continue
+        halves = _halves(tracks, track, parts[0], parts[1], cfg)
+        if halves is not None:
+            tracks.items[number], split_off = halves
+            split_off.id, tracks.next_id = tracks.next_id, tracks.next_id + 1
+            tracks.items[split_off.id] = split_off
+
+
+def _parts(cells: np.ndarray) -> list[np.ndarray]:
+    """Cells (sorted) that touch each other, also at corners, the largest group first."""
+    near = cells[:, None] + AROUND
+    at = np.minimum(np.searchsorted(cells, near), len(cells) - 1)
+    row, column = np.nonzero(cells[at] == near)
+    links = csr_array((np.ones(len(row), bool), (row, at[row, column])), shape=(len(cells),) * 2)
+    count, labels = connected_components(links, directed=False)
+    return sorted((cells[labels == part] for part in range(count)), key=len, reverse=True)
+
+
+def _halves(
+    tracks: Tracks, track: Track, one: np.ndarray, other: np.ndarray, cfg: TrackingConfig
+) -> tuple[Track, Track] | None:
+    """What the object becomes if it is two, that with more frames first and under the old id; None if it is one.
+
+    Its detections are taken from the archive; every cell of theirs goes with the nearer part.
+    """
+    tree = cKDTree(np.concatenate((unpacked(one), unpacked(other))))
+    both, shown, halves = 0, [0, 0], (_blank(track), _blank(track))
+    for detections, index, cells in _views(tracks, track, cfg):
+        _, nearest = tree.query(unpacked(cells))
+        sides = [cells[nearest < len(one)], cells[nearest >= len(one)]]
+        main = int(len(sides[1]) > len(sides[0]))
+        joint = len(sides[1 - main]) >= cfg.part_share * len(cells)
+        both += joint
+        for side, half in enumerate(halves):
+            if side == main:
+                source = {(detections.detector, detections.frame_id, index)}
+                said = [detections.embeddings[index]], source, vote(detections, index)
+                _extend(half, Track(-1, sides[side], np.ones_like(sides[side]), *said), cfg)
+            elif joint:
+                _extend(half, Track(-1, sides[side], np.ones_like(sides[side]), [], set(), {}), cfg)
+            shown[side] += side == main or joint
+    if both >= cfg.split_joint * min(shown) or min(half.frames for half in halves) == 0:
+        return None
+    kept, split_off = sorted(halves, key=lambda half: -half.frames)
+    return kept, split_off
+
+
+def _blank(track: Track) -> Track:
+    none = np.zeros(0, np.int64)
+    return Track(track.id, none, none, [], set(), {}, look_again=track.look_again)
+
+
+def _views(tracks: Tracks, track: Track, cfg: TrackingConfig) -> Iterator[tuple[Detections, int, np.ndarray]]:
+    """The object's detections that the archive holds, by frame: message, index, and cells in the world."""
+    for detector, frame_id, index in sorted(track.sources, key=lambda source: (source[1], source)):
+        detections = tracks.archive.get((tracks.space, detector, frame_id))
+        if detections is not None:
+            yield detections, index, _clouds(detections, cfg.cell_m)[index]
+
+
 def _forget(tracks: Tracks, detections: Detections, touched: set[int], cfg: TrackingConfig) -> None:
     """Count frames that look at a barely seen object in vain; enough of them, and it is dropped."""
     doubtful = [t for t in tracks.items.values() if t.frames < cfg.min_frames and t.id not in touched]
     if not doubtful:
         return
-    centres_m = np.array([track.box_m(cfg.cell_m).mean(axis=0) for track in doubtful])
+    centres_m = np.array([track.box_m(cfg).mean(axis=0) for track in doubtful])
     none = np.zeros(0, np.float32)
     view = descriptors.Frame(
         inverse(detections.world_from_camera),
