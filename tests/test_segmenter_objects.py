@@ -118,7 +118,7 @@ def test_halves_become_one_object_when_two_views_join_them_and_the_older_id_stay
 def test_two_objects_with_the_same_cells_merge_into_the_older():
     tracks = seen([sight(0, walk()[3], [BED]), sight(1, walk()[3], [OVEN])])
     younger, older = tracks.items[1], tracks.items[0]
-    younger.cells, younger.hits = older.cells.copy(), older.hits.copy()
+    younger.cells, younger.hits, younger.bounds = older.cells.copy(), older.hits.copy(), older.bounds.copy()
     objects.observe(tracks, sight(2, walk()[3], [BED]), CFG)
     assert list(tracks.items) == [0] and tracks.merged == [(1, 0)]
     assert tracks.items[0].frames == 3

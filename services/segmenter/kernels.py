@@ -1,4 +1,4 @@
-"""Compiled loops of the integration kernel; what they compute stands in `descriptors` (pure)."""
+"""Compiled loops; what they compute stands in `descriptors` and `objects` (pure)."""
 
 import numpy as np
 from numba import njit
@@ -52,3 +52,19 @@ def accumulate(
             target = sums[slots[start + row]]
             for column in range(dim):
                 target[column] += products[row, column]
+
+
+@njit(cache=True, nogil=True)
+def count_near(cells: np.ndarray, others: np.ndarray, steps: np.ndarray) -> int:
+    """How many of the cells have, at one of the steps from them, one of the others or its neighbour on the last axis.
+
+    All int64 and sorted; a step along the last axis is 1.
+    """
+    count = 0
+    for cell in cells:
+        for step in steps:
+            at = np.searchsorted(others, cell + step - 1)
+            if at < len(others) and others[at] <= cell + step + 1:
+                count += 1
+                break
+    return count

@@ -23,10 +23,12 @@ from schemas.codec import copied
 from schemas.objects import Detections
 from services.geometry import inverse, transform
 from services.segmenter import descriptors
+from services.segmenter.kernels import count_near
 
 AXIS_BITS = 21  # of a cell's number for each axis: 200 km of 0.1 m cells
 _STEPS = np.stack(np.meshgrid(*[(-1, 0, 1)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
 AROUND = (_STEPS[:, 0] << 2 * AXIS_BITS) + (_STEPS[:, 1] << AXIS_BITS) + _STEPS[:, 2]  # a cell and its 26 neighbours
+COLUMNS = AROUND[_STEPS[:, 2] == 0]  # and the middles of the nine columns that these are
 
 
 class TrackingConfig(msgspec.Struct, frozen=True, kw_only=True):
@@ -77,6 +79,10 @@ class Track:
     votes: dict[str, float]  # sums of the detections' scores, by the name that they were found for
     missed: int = 0  # frames that looked at it in vain
     look_again: int = 0  # number of frames from which on it is looked at whether it is two
+    bounds: np.ndarray = field(init=False)  # (2, 3) least and greatest cell numbers
+
+    def __post_init__(self) -> None:
+        self.bounds = _bounds(self.cells)
 
     @property
     def frames(self) -> int:
@@ -190,10 +196,9 @@ def _matches(tracks: Tracks, detections: Detections, seen: list[np.ndarray], cfg
     """Object id by detection: at most one each, the sum of overlap and similarity as large as possible."""
     items = list(tracks.items.values())
     scores = np.zeros((len(seen), len(items)))
-    for column, track in enumerate(items):
-        for row, cells in enumerate(seen):
-            if not _close(cells, track.cells):
-                continue
+    for row, cells in enumerate(seen):
+        for column in _near(_bounds(cells), items):
+            track = items[column]
             shares = shared(cells, track.cells), shared(track.cells, cells)
             if max(shares) >= cfg.match_overlap and min(shares) >= cfg.match_part:
                 cosine = float(descriptor(track.embeddings) @ detections.embeddings[row].astype(np.float64))
@@ -211,8 +216,9 @@ def _merge(tracks: Tracks, touched: list[int], cfg: TrackingConfig) -> None:
         if track is None:
             continue
         cells = track.firm()
-        for other in list(tracks.items.values()):
-            if other.id == track.id or not _close(track.cells, other.cells):
+        items = list(tracks.items.values())
+        for other in (items[index] for index in _near(track.bounds, items)):
+            if other.id == track.id:
                 continue
             others = other.firm()
             if shared(cells, others) + shared(others, cells) >= 2 * cfg.merge_overlap:
@@ -321,6 +327,7 @@ def _extend(track: Track, more: Track, cfg: TrackingConfig) -> None:
     every, where = np.unique(np.concatenate((track.cells, more.cells)), return_inverse=True)
     counts = np.bincount(where, np.concatenate((track.hits, more.hits)), minlength=len(every))
     track.cells, track.hits = every, counts.astype(np.int64)
+    track.bounds = np.stack((np.minimum(track.bounds[0], more.bounds[0]), np.maximum(track.bounds[1], more.bounds[1])))
     track.embeddings = [*track.embeddings, *more.embeddings][-cfg.observations :]
     track.sources |= more.sources
     for name, score in more.votes.items():
@@ -351,15 +358,24 @@ def descriptor(embeddings: list[np.ndarray]) -> np.ndarray:
 
 def shared(cells: np.ndarray, others: np.ndarray) -> float:
     """Share of the cells that are at most one cell from one of the others (both sorted)."""
-    near = (cells[:, None] + AROUND).ravel()
-    at = np.minimum(np.searchsorted(others, near), len(others) - 1)
-    return float((others[at] == near).reshape(len(cells), -1).any(axis=1).mean())
+    return count_near(cells, others, COLUMNS) / len(cells)
 
 
-def _close(cells: np.ndarray, others: np.ndarray) -> bool:
-    """Whether the first axes, by which cells are sorted, overlap."""
-    step = 2 << 2 * AXIS_BITS
-    return bool(cells[0] <= others[-1] + step and others[0] <= cells[-1] + step)
+def _bounds(cells: np.ndarray) -> np.ndarray:
+    """Least and greatest numbers (2, 3) of some cells; of none, a box that is near nothing."""
+    if not len(cells):
+        return np.array([[1 << AXIS_BITS] * 3, [-(1 << AXIS_BITS)] * 3])
+    numbers = unpacked(cells)
+    return np.stack((numbers.min(axis=0), numbers.max(axis=0)))
+
+
+def _near(bounds: np.ndarray, items: list[Track]) -> list[int]:
+    """Indices of the objects whose bounds overlap a box, or touch it."""
+    if not items:
+        return []
+    every = np.array([track.bounds for track in items])
+    touches = (every[:, 0] <= bounds[1] + 1) & (every[:, 1] >= bounds[0] - 1)
+    return np.flatnonzero(touches.all(axis=1)).tolist()
 
 
 def packed(numbers: np.ndarray) -> np.ndarray:
