@@ -13,6 +13,7 @@ import zenoh
 
 from deploy.benches import features as bench_features
 from deploy.benches import segmenter
+from deploy.benches.encoder_swap import encoder_swap
 from deploy.benches.kernel import kernel
 from deploy.benches.learning import learning_bench
 from deploy.benches.places import place_bench
@@ -62,6 +63,11 @@ def features() -> tuple[dict, dict]:
 def attacked_pool(seconds: float) -> tuple[dict, dict]:
     """A pool whose workers are killed, frozen, slowed and added at random."""
     return bench_features.attacked(_sample_keyframes(), seconds, rate_hz=40.0)
+
+
+def exchanged_encoder() -> tuple[dict, dict]:
+    """A worker of another embedding space joins in mid-run; see `deploy.benches.encoder_swap`."""
+    return encoder_swap(SAMPLE)
 
 
 def bus() -> tuple[dict, dict]:
@@ -176,6 +182,7 @@ BENCHES: dict[str, Callable[[], tuple[dict, dict]]] = {
     "segmenter": segmenter.updates,
     "task": segmenter.switch,
     "learning": learning_bench,
+    "encoder_swap": exchanged_encoder,
     "e2e": e2e,
 }
 

@@ -474,7 +474,9 @@ def test_a_backfill_encodes_what_the_reader_lacks_in_its_space():
     for number in range(4):
         list(core.accept(state, frame(number, number), Config(every_frame=True)))
     fresh = Backfill(robot="a", space="new/space", frame_ids=np.array([1, 3]))
-    assert not list(step(state, fresh, Config()))  # 0 and 2 may be on the way
+    assert [job.frame_id for _, job in step(state, fresh, Config())] == [0]  # 2 may be on the way
+    assert not list(step(state, Backfill(robot="a", space="new/space", frame_ids=np.array([0, 2])), Config()))
+    assert not list(step(state, Backfill(robot="a", space="new/space", frame_ids=np.zeros(0, int)), Config()))
     wish = Backfill(robot="a", space="new/space", frame_ids=np.array([1, 3, 99]), settled=True)
     jobs = list(step(state, wish, Config()))
     assert [(topic, job.frame_id, job.space) for topic, job in jobs] == [

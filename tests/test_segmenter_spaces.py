@@ -84,6 +84,21 @@ def test_a_new_space_is_filled_up_and_takes_over_without_a_label_lost():
     assert run.state.archive.frame_ids == {frame.frame_id for frame in frames}
 
 
+def test_a_stream_that_goes_on_does_not_hold_up_the_change():
+    """The newest keyframes reach the old space first, always: those on the way are not waited for, older ones are."""
+    positions, edges, frames = world()
+    new = turned(frames)
+    run = TwoSpaces(cfg=CFG).feed(place_delta(positions, edges), task(), prior(ROOMS), *frames[:-2], TICK)
+    run.feed(*new[:-6], *frames[-2:], TICK)  # six are missing, of which three may be on the way
+    assert run.state.spaces.force == SPACE
+    run.feed(*new[-5:-3], TICK)  # three are newer than all it has, and an older one is missing
+    assert run.state.spaces.force == SPACE
+    run.feed(new[-6], TICK, TICK)  # its words are asked for first
+    assert run.state.spaces.force == NEW
+    run.feed(*new[-3:], TICK)
+    assert run.state.archive.frame_ids == {frame.frame_id for frame in frames}
+
+
 def test_evidence_after_the_change_is_that_of_a_run_in_the_new_space():
     run, frames = started()
     run.feed(*turned(frames), TICK, TICK)

@@ -213,13 +213,16 @@ def encoded(state: State, done: JobDone) -> Iterator[Written]:
 def backfill(state: State, wish: Backfill) -> Iterator[Written]:
     """Encode archived keyframes again, in one space: those that the asking reader lacks. They give way to new ones.
 
-    Unless the reader has settled, the newest ones are left out: their pyramids may be on the way to it.
+    Unless the reader has settled, the newest ones are left out: their pyramids may be on the way to it. Those older
+    than all it knows are not: they were there before it, or before the workers of that space.
     """
     known = set(wish.frame_ids.tolist())
-    newest = max(known, default=-1)
-    settled = [k for k in state.archive if k.frame_id <= newest][:-ON_THE_WAY] if not wish.settled else state.archive
-    for keyframe in settled:
-        if keyframe.frame_id not in known:
+    oldest, newest = min(known, default=0), max(known, default=-1)
+    later = [keyframe for keyframe in state.archive if oldest <= keyframe.frame_id <= newest]
+    on_the_way = set() if wish.settled else {keyframe.frame_id for keyframe in later[-ON_THE_WAY:]}
+    for keyframe in state.archive:
+        wanted = wish.settled or keyframe.frame_id <= newest
+        if wanted and keyframe.frame_id not in known | on_the_way:
             yield ENCODE, msgspec.structs.replace(keyframe, space=wish.space)
 
 

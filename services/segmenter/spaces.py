@@ -23,6 +23,7 @@ class SpacesConfig(msgspec.Struct, frozen=True, kw_only=True):
     coverage: float = 0.98  # share of the observed places that the new space must have observed too
     backfill_ticks: int = 6  # after a start, a newcomer, or the last pyramid, before asking: late ones may yet arrive
     repeat_ticks: int = 40  # between questions while keyframes are missing
+    late_frames: int = 3  # newest keyframes that it may lack when it takes over: their pyramids are on the way
     patience_ticks: int = 20  # without growth, after which a newcomer is tried although keyframes are missing
     silent_frames: int = (
         8  # pyramids of another space since the last of this one, after which this one counts as silent
@@ -102,9 +103,11 @@ def questions(spaces: Spaces, in_force: descriptors.Archive, robot: str, cfg: Sp
 
 
 def successor(spaces: Spaces, in_force: descriptors.Archive, cfg: SpacesConfig) -> str | None:
-    """A space worth trying: it has every frame that the present one has, or has stopped growing."""
+    """A space worth trying: it has every frame that the present one has, but the newest, or has stopped growing."""
     for name, rival in spaces.rivals.items():
-        complete = in_force.frame_ids <= rival.archive.frame_ids
+        missing = in_force.frame_ids - rival.archive.frame_ids
+        newest = max(rival.archive.frame_ids, default=-1)
+        complete = len(missing) <= cfg.late_frames and all(frame_id > newest for frame_id in missing)
         grown = len(rival.archive) > max(rival.tried_frames, 0)
         if _comes(rival, cfg) and grown and (complete or rival.still_ticks >= cfg.patience_ticks):
             return name
