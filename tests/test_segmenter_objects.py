@@ -10,6 +10,7 @@ from schemas.features import TextRequest
 from schemas.frames import PoseUpdate
 from schemas.objects import Detections, ObjectDelta
 from schemas.places import SnapshotRequest
+from schemas.priors import ObjectPrior, RegionPrior
 from schemas.status import Tick
 from schemas.topics import OBJECT_SNAPSHOT
 from services.geometry import inverse, transform
@@ -244,13 +245,39 @@ def test_a_pose_correction_moves_the_object_and_keeps_its_id():
 
 
 def test_beliefs_by_hand():
-    """Standardised similarities 1 and -1 at temperature 2 beside a null at 0: e^2, e^-2 and 1."""
+    """Standardised similarities 1 and -1 at temperature 2 beside a null at 0: e^2, e^-2 and 1, then with evidence."""
     found = np.zeros((1, DIM))
     found[:, :2] = (0.55, 0.05)  # with mean 0.3 and spread 0.25
-    rows, known = naming.beliefs(found, text(np.eye(2)))
-    odds = np.exp([2.0, -2.0])
-    assert np.allclose(rows, odds / odds.sum(), atol=1e-6)
-    assert known == pytest.approx([odds.sum() / (odds.sum() + 1)], abs=1e-6)
+    for evidence in (np.zeros((1, 2)), np.log([[0.25, 3.0]])):
+        rows, known = naming.beliefs(found, text(np.eye(2)), evidence)
+        odds = np.exp([2.0, -2.0]) * np.exp(evidence[0])
+        assert np.allclose(rows, odds / odds.sum(), atol=1e-6)
+        assert known == pytest.approx([odds.sum() / (odds.sum() + 1)], abs=1e-6)
+
+
+def test_commonness_by_hand():
+    """Regions of 0.8 and 0.2: the first object 0.8 * 0.5 + 0.2 * 0.1, the second 0.2 * 0.9."""
+    regions = [RegionPrior(name=name, phrases=[name], existence=share) for name, share in (("a", 0.8), ("b", 0.2))]
+    held = np.array([[0.5, 0.0], [0.1, 0.9]], np.float32)
+    assert naming.commonness(prior(["a", "b"], regions=regions, containment=held)) == pytest.approx([0.7, 0.3])
+
+
+def test_boxes_decide_where_looks_do_not():
+    """Two things that look like an oven and like a bed alike; the prior knows what size these are."""
+    both = np.full(DIM, 0.0)
+    both[:2] = 1.0
+    sized = [
+        ObjectPrior(name="oven", phrases=["an oven"], size_m=(0.6, 0.6, 0.9), size_spread=0.2, bottom_m=0.0),
+        ObjectPrior(name="bed", phrases=["a bed"], size_m=(1.6, 1.2, 0.6), size_spread=0.2, bottom_m=0.0),
+    ]
+    frames = [sight(i, pose, [BED, OVEN]) for i, pose in enumerate(walk())]
+    frames = [msgspec.structs.replace(f, embeddings=np.array([both, both], np.float16) / 2**0.5) for f in frames]
+    positions, edges = place_grid(1)
+    for entries, labels in ((None, ["", ""]), (sized, ["bed", "oven"])):
+        known = prior(["kitchen", "bedroom"], **({"objects": entries} if entries else {}))
+        run = Run(Config(tracking=objects.TrackingConfig(label_least=0.6)))
+        run.feed(place_delta(positions, edges), *frames, TICK, task(), known, TICK)
+        assert sorted(item.label for item in run.objects.values()) == labels
 
 
 def test_votes_by_hand():

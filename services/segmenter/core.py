@@ -140,7 +140,7 @@ def follow_objects(state: State, cfg: Config) -> Iterator[ObjectDelta]:
     text = None if prior is None else state.texts.get(_concept_key(state.spaces.force, object_concepts(prior)))
     if not tracks.changed or (text is None and prior is not None and prior.objects and tracks.items):
         return
-    now = naming.named(tracks, prior, text, cfg.tracking)
+    now = naming.named(tracks, prior, text, cfg.tracking, graph=state.graph, size_cfg=cfg.sizes)
     digest = "" if alignment is None else alignment.digest
     ledger = state.object_ledger
     delta = ledger.tell(state.robot, state.epoch, state.stamp_ns, now=now, merged=tracks.merged, digest=digest)

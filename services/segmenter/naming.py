@@ -8,8 +8,11 @@ import numpy as np
 from schemas.features import TextEmbeddings
 from schemas.objects import ObjectDelta, SceneObject
 from schemas.priors import Prior
+from services.segmenter import sizes
 from services.segmenter.experts.context import ObjectView, standardised
+from services.segmenter.graph import PlaceGraph
 from services.segmenter.objects import Track, TrackingConfig, Tracks, descriptor
+from services.segmenter.sizes import SizeConfig
 
 VISIBLE_CHANGE = 0.02  # smaller changes of a probability are not sent
 
@@ -98,7 +101,15 @@ class ObjectLedger:
         )
 
 
-def named(tracks: Tracks, prior: Prior | None, text: TextEmbeddings | None, cfg: TrackingConfig) -> dict[int, Named]:
+def named(
+    tracks: Tracks,
+    prior: Prior | None,
+    text: TextEmbeddings | None,
+    cfg: TrackingConfig,
+    *,
+    graph: PlaceGraph,
+    size_cfg: SizeConfig,
+) -> dict[int, Named]:
     """Every object that was seen often enough; without a prior and its text, none has a label."""
     items = [track for track in tracks.items.values() if track.frames >= cfg.min_frames]
     if not items:
@@ -106,7 +117,9 @@ def named(tracks: Tracks, prior: Prior | None, text: TextEmbeddings | None, cfg:
     if prior is None or text is None:
         return {track.id: Named(_entry(track, "", 0.0, 0.0, cfg), np.zeros(0), 0.0) for track in items}
     found = np.array([descriptor(track.embeddings) for track in items])
-    seen, known = beliefs(found, text)
+    boxes = sizes.measured(items, cfg, graph, size_cfg)
+    fits = sizes.log_ratios(boxes, prior.objects, size_cfg)
+    seen, known = beliefs(found, text, np.log(commonness(prior)) + fits)
     votes = np.array([said(track.votes, prior) for track in items])
     concepts, sure = with_votes(seen, known, votes, cfg.detector_trust)
     result = {}
@@ -118,17 +131,26 @@ def named(tracks: Tracks, prior: Prior | None, text: TextEmbeddings | None, cfg:
     return result
 
 
-def beliefs(found: np.ndarray, text: TextEmbeddings) -> tuple[np.ndarray, np.ndarray]:
+def beliefs(found: np.ndarray, text: TextEmbeddings, evidence: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """P(c | o) (object, concept), rows sum to 1, and the probability (object,) that it is any of the concepts.
 
-    A softmax of the standardised similarities with the space's null class beside them, as the visual expert's.
+    A softmax of the standardised similarities with the space's null class beside them, as the visual expert's, to which
+    `evidence` (object, concept) is added: what else speaks for a concept against the null class. Before anybody looks,
+    an object is as likely any of the prior's as none.
     """
-    scores = text.temperature * standardised(found, text)
+    scores = text.temperature * standardised(found, text) + evidence
     shift = scores.max(axis=1, keepdims=True)
     odds = np.exp(scores - shift)
     total = odds.sum(axis=1)
     null = np.exp(np.minimum(text.temperature * text.null_score - shift[:, 0], 700.0))
     return odds / total[:, None], total / (total + null)
+
+
+def commonness(prior: Prior) -> np.ndarray:
+    """P(c | E0) (concept,) of an object that is one of the prior's: sum over r of P(r | E0) P(c | r), summing to 1."""
+    existence = np.array([region.existence for region in prior.regions])
+    common = np.maximum(existence @ prior.containment.astype(np.float64), 1e-9)
+    return common / common.sum()
 
 
 def said(votes: dict[str, float], prior: Prior) -> np.ndarray:

@@ -20,6 +20,7 @@ from services.segmenter.incremental import Settings, Solver
 from services.segmenter.objects import TrackingConfig, Tracks
 from services.segmenter.places import Places
 from services.segmenter.sharing import SharingConfig
+from services.segmenter.sizes import SizeConfig
 from services.segmenter.spaces import Spaces, SpacesConfig
 
 
@@ -36,6 +37,7 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
     geometry: GeometryConfig = msgspec.field(default_factory=GeometryConfig)
     objects: ObjectSettings = msgspec.field(default_factory=ObjectSettings)
     tracking: TrackingConfig = msgspec.field(default_factory=TrackingConfig)
+    sizes: SizeConfig = msgspec.field(default_factory=SizeConfig)
     beta: float = 2.0  # weight of the pairwise term (paper)
     edge_decay_m: float = 2.0  # w_dist = exp(-length / edge_decay_m)
     edge_sum: float = 3.0  # sum of w_dist at a place, whatever the graph's density and scale; 0 = w_dist as it is
