@@ -1,5 +1,7 @@
 """Objects: synthetic boxes seen from a walk become objects with lasting ids; names, deltas, pose corrections."""
 
+import math
+
 import msgspec
 import numpy as np
 import pytest
@@ -245,14 +247,33 @@ def test_a_pose_correction_moves_the_object_and_keeps_its_id():
 
 
 def test_beliefs_by_hand():
-    """Standardised similarities 1 and -1 at temperature 2 beside a null at 0: e^2, e^-2 and 1, then with evidence."""
+    """Standardised similarities 1 and -1 at temperature 2 beside none: e^2, e^-2 and e^2, then with evidence."""
     found = np.zeros((1, DIM))
     found[:, :2] = (0.55, 0.05)  # with mean 0.3 and spread 0.25
     for evidence in (np.zeros((1, 2)), np.log([[0.25, 3.0]])):
         rows, known = naming.beliefs(found, text(np.eye(2)), evidence)
         odds = np.exp([2.0, -2.0]) * np.exp(evidence[0])
         assert np.allclose(rows, odds / odds.sum(), atol=1e-6)
-        assert known == pytest.approx([odds.sum() / (odds.sum() + 1)], abs=1e-6)
+        assert known == pytest.approx([odds.sum() / (odds.sum() + math.exp(2.0**2 / 2))], abs=1e-6)
+
+
+def test_known_is_what_bayes_says_of_similarities_that_scatter_as_the_temperature_claims():
+    """Half of the objects are none of the concepts, with similarities around 0; of the others, one is around tau."""
+    rng = np.random.default_rng(0)
+    tau, count, concepts = 2.0, 20000, DIM
+    true = rng.integers(0, concepts, count)
+    none = rng.random(count) < 0.5
+    z = rng.standard_normal((count, concepts))
+    z[np.flatnonzero(~none), true[~none]] += tau
+    answer = text(np.eye(concepts))  # similarity 0.3 on average, with a spread of 0.25
+    found = 0.3 + 0.25 * z
+    rows, known = naming.beliefs(found, answer, np.full((1, concepts), -math.log(concepts)))
+    for low, high in ((0.0, 0.2), (0.2, 0.5), (0.5, 0.8), (0.8, 1.0)):
+        chosen = (known >= low) & (known < high)
+        assert (~none[chosen]).mean() == pytest.approx(known[chosen].mean(), abs=0.03)
+    certain = rows.max(axis=1) * known
+    right = (rows.argmax(axis=1) == true) & ~none
+    assert right[certain > 0.5].mean() == pytest.approx(certain[certain > 0.5].mean(), abs=0.03)
 
 
 def test_commonness_by_hand():
@@ -275,8 +296,7 @@ def test_boxes_decide_where_looks_do_not():
     positions, edges = place_grid(1)
     for entries, labels in ((None, ["", ""]), (sized, ["bed", "oven"])):
         known = prior(["kitchen", "bedroom"], **({"objects": entries} if entries else {}))
-        run = Run(Config(tracking=objects.TrackingConfig(label_least=0.6)))
-        run.feed(place_delta(positions, edges), *frames, TICK, task(), known, TICK)
+        run = Run().feed(place_delta(positions, edges), *frames, TICK, task(), known, TICK)
         assert sorted(item.label for item in run.objects.values()) == labels
 
 

@@ -72,9 +72,11 @@ def test_the_floor_is_where_the_lowest_sphere_nearby_rests():
 def test_measures_of_a_track_in_a_room():
     cells = packed(block(14, 6, 5) + np.array((0, 0, 2)))
     track = Track(0, cells, np.ones_like(cells), [], set(), {})
-    found = sizes.measured([track], TrackingConfig(cell_m=CELL_M), graph_of([(1, 3, 1.0, 0.85)]), CFG)
+    tracking = TrackingConfig(cell_m=CELL_M)
+    found = sizes.measured([track], tracking, graph_of([(1, 3, 1.0, 0.85)]), CFG)
     assert found.sides_m[0] == pytest.approx((2.1, 0.9, 0.75))
     assert found.bottoms_m == pytest.approx([0.3 - 0.15])
+    assert sizes.measured([track], tracking, graph_of([(1, 3, 1.0, 0.2)]), CFG).bottoms_m.tolist() == [0.0]
 
 
 def test_likelihood_by_hand():

@@ -134,15 +134,18 @@ def named(
 def beliefs(found: np.ndarray, text: TextEmbeddings, evidence: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """P(c | o) (object, concept), rows sum to 1, and the probability (object,) that it is any of the concepts.
 
-    A softmax of the standardised similarities with the space's null class beside them, as the visual expert's, to which
-    `evidence` (object, concept) is added: what else speaks for a concept against the null class. Before anybody looks,
-    an object is as likely any of the prior's as none.
+    A softmax over the concepts c of tau z(c) + evidence(c): the standardised similarity z with the space's temperature
+    tau, as the visual expert's, and (object, concept) what else speaks for c, log P(c) among it. Beside them stands the
+    null class: similarities of what is no concept scatter like the background's, as N(0, 1). A temperature of tau says
+    that those of c itself scatter as N(tau, 1), so that the odds of c against none are exp(tau z - tau^2 / 2). Before
+    anybody looks, an object is as likely one of the concepts as none. The space's null score is no help here: it is
+    made for the sum over a few regions, of which the largest counts, not for a mean over a hundred concepts.
     """
     scores = text.temperature * standardised(found, text) + evidence
     shift = scores.max(axis=1, keepdims=True)
     odds = np.exp(scores - shift)
     total = odds.sum(axis=1)
-    null = np.exp(np.minimum(text.temperature * text.null_score - shift[:, 0], 700.0))
+    null = np.exp(np.minimum(text.temperature**2 / 2 - shift[:, 0], 700.0))
     return odds / total[:, None], total / (total + null)
 
 

@@ -60,7 +60,8 @@ def measured(tracks: Sequence[Track], tracking: TrackingConfig, graph: PlaceGrap
     centres_m = np.array([(cells.min(axis=0) + cells.max(axis=0) + 1) / 2 for cells in numbers]) * cell_m
     lows_m = np.array([cells[:, 2].min() for cells in numbers]) * cell_m
     sides_m = np.array([sides(cells) for cells in numbers]) * cell_m
-    return Boxes(sides_m, lows_m - floor_below(centres_m, graph, cfg.floor_steps), cell_m)
+    floors_m = floor_below(centres_m, graph, cfg.floor_steps)  # or lower: nothing reaches below the floor
+    return Boxes(sides_m, np.maximum(lows_m - floors_m, 0.0), cell_m)
 
 
 def sides(cells: np.ndarray) -> np.ndarray:
