@@ -38,12 +38,14 @@ from schemas.topics import (
 )
 from services.runtime.service import Ask, Identity
 from services.segmenter import core, inference, report, swap
+from services.segmenter.adaptation import Adaptation, AdaptationConfig
 from services.segmenter.balance import BalanceConfig
 from services.segmenter.experts.context import ObjectView
 from services.segmenter.service import SERVICE
 from services.segmenter.state import Config
 
 CFG = Config()
+OPEN = Config(edge_clearance_m=0.0)  # as if no way were narrow
 ROOMS = ["kitchen", "hall", "bedroom"]
 TICK = Tick(stamp_ns=10**18)
 
@@ -372,7 +374,7 @@ def test_following_the_deltas_equals_the_snapshot():
 def test_what_is_kept_up_to_date_equals_what_is_found_afresh(seed):
     """After any history, asking every expert again and describing every region again changes nothing."""
     rng = np.random.default_rng(seed)
-    cfg = Config(balance=BalanceConfig(tolerance=0.0))
+    cfg = Config(balance=BalanceConfig(tolerance=0.0), adaptation=AdaptationConfig(tolerance=0.0))
     positions, edges, frames = world()
     run = Run(cfg=cfg).feed(task(), prior(ROOMS), place_delta(positions, edges))
     oven = ObjectView(ids=np.array([3]), positions_m=np.array([(2.0, 2.0, 1.0)]), concepts=np.array([(1.0, 0.0)]))
@@ -386,12 +388,14 @@ def test_what_is_kept_up_to_date_equals_what_is_found_afresh(seed):
             inference.see_objects(run.state, oven, cfg)
         fields = {"removed_ids": removed, "merged_ids": merged.reshape(-1, 2), "place_ids": back, "revision": revision}
         run.feed(place_delta(positions[back], edges if len(back) else edges[:0], **fields), frame)
-    run.feed(TICK)
+    run.feed(TICK, TICK, TICK)
     state, places = run.state, run.state.places
+    assert not state.dirty and len(state.adaptation.directions)
     columns = ("labels", "regions", "unary", "posteriors", "inclination_rad", "support", "anisotropy")
     kept = {name: getattr(places, name).copy() for name in columns}
     before, beliefs = dict(run.reader.regions), dict(run.reader.beliefs)
     places.stale[:] = places.reshaped[:] = places.doubtful[:] = places.unbelieved[:] = True
+    state.adaptation = Adaptation()
     state.weights = inference.edge_weights(state.graph, cfg)
     inference.evaluate_experts(state, True, cfg)
     inference.believe(state, cfg)
@@ -539,14 +543,17 @@ def test_edge_weights_by_hand(scale):
     positions = scale * np.array([(0.0, 0.0, 1.0), (1.0, 0.0, 1.0), (2.0, 0.0, 1.0), (1.0, 1.0, 1.0)])
     positions[:, 2] = 1.0
     run = Run().feed(place_delta(positions, np.array([(0, 1), (1, 2), (1, 3)])))
-    np.testing.assert_allclose(inference.edge_weights(run.state.graph, CFG), np.sqrt(3.0), rtol=1e-6)
+    np.testing.assert_allclose(inference.edge_weights(run.state.graph, OPEN), np.sqrt(3.0), rtol=1e-6)
+    doors = run.state.graph.clearances_m  # 0.4 m from the posts on each side
+    assert np.allclose(doors, 0.4)
+    np.testing.assert_allclose(inference.edge_weights(run.state.graph, CFG), np.sqrt(3.0) / 2, rtol=1e-6)
 
 
 def test_edge_weights_fall_with_length():
     """Path of 1 m and 3 m: w = 0.60653, 0.22313; 3 w / sqrt(d_u d_v) = 3 sqrt(w / 0.82966) = 2.5651, 1.5558."""
     positions = np.array([(0.0, 0.0, 1.0), (1.0, 0.0, 1.0), (4.0, 0.0, 1.0)])
     run = Run().feed(place_delta(positions, np.array([(0, 1), (1, 2)])))
-    np.testing.assert_allclose(inference.edge_weights(run.state.graph, CFG), (2.5651, 1.5558), atol=1e-4)
+    np.testing.assert_allclose(inference.edge_weights(run.state.graph, OPEN), (2.5651, 1.5558), atol=1e-4)
 
 
 def test_a_label_the_encoder_favours_everywhere_does_not_take_the_map():

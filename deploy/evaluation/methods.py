@@ -122,7 +122,6 @@ def ours(config: Config) -> Method:
 
 def ablations(config: Config) -> list[Method]:
     """Experts switched on one by one (the paper's table), then single parts taken away."""
-    kernel = config.kernel
 
     def bare(case: Case) -> Prior:
         return priors.with_one_phrase(case.prior)
@@ -130,27 +129,29 @@ def ablations(config: Config) -> list[Method]:
     def large(case: Case) -> list[Pyramid]:
         return [oracles.top_layer(pyramid) for pyramid in case.perception.pyramids]
 
-    unscaled = msgspec.structs.replace(kernel, gamma=ANY_SCALE)
-    heard = msgspec.structs.replace(config.tracking, unprompted_weight=1.0)
-    unhidden = msgspec.structs.replace(kernel, occlusion_tolerance_m=NEVER_M)
+    def but(part: str, **changes: Any) -> Variant:
+        """Ours with a part's settings changed."""
+        changed = msgspec.structs.replace(getattr(config, part), **changes)
+        return Variant(msgspec.structs.replace(config, **{part: changed}))
+
+    unscaled = but("kernel", gamma=ANY_SCALE)
     parts = {
-        "no sharing": (
-            Variant(msgspec.structs.replace(config, sharing=msgspec.structs.replace(config.sharing, steps=0))),
-            "each place is compared with the regions for itself",
-        ),
-        "no balance": (
-            Variant(msgspec.structs.replace(config, balance=msgspec.structs.replace(config.balance, limit=0.0))),
-            "labels that the encoder favours everywhere are not corrected",
-        ),
+        "no sharing": (but("sharing", steps=0), "each place is compared with the regions for itself"),
+        "no balance": (but("balance", limit=0.0), "labels that the encoder favours everywhere are not corrected"),
+        "no adaptation": (but("adaptation", weight=0.0), "regions are recognised by their text alone"),
         "no pairwise term": (Variant(msgspec.structs.replace(config, beta=0.0)), "beta = 0"),
+        "doors are open": (
+            Variant(msgspec.structs.replace(config, edge_clearance_m=0.0)),
+            "narrow ways bind places as firmly as wide ones",
+        ),
         "all objects speak": (
-            Variant(msgspec.structs.replace(config, tracking=heard)),
+            but("tracking", unprompted_weight=1.0),
             "also those of a detector that does not know the prior's",
         ),
-        "no scale trust": (Variant(msgspec.structs.replace(config, kernel=unscaled)), "crops of any scale count alike"),
-        "no occlusion test": (Variant(msgspec.structs.replace(config, kernel=unhidden)), "hidden places count as seen"),
+        "no scale trust": (unscaled, "crops of any scale count alike"),
+        "no occlusion test": (but("kernel", occlusion_tolerance_m=NEVER_M), "hidden places count as seen"),
         "global feature": (
-            Variant(msgspec.structs.replace(config, kernel=unscaled), pyramids=large),
+            replace(unscaled, pyramids=large),
             "only the pyramid's largest crops, which show nearly the whole image",
         ),
         "one phrase": (Variant(config, prior=bare), "each region is described by its name alone"),

@@ -19,6 +19,7 @@ from schemas.priors import Prior, PriorEvidence, PriorList, PriorRequest, Task, 
 from schemas.regions import RegionDelta
 from schemas.status import Tick
 from services.segmenter import descriptors, geometry, naming, objects, observed, spaces
+from services.segmenter.adaptation import Adaptation
 from services.segmenter.experts.context import ObjectView
 from services.segmenter.graph import apply
 from services.segmenter.inference import (
@@ -86,6 +87,7 @@ def follow_places(state: State, delta: PlaceDelta, cfg: Config) -> None:
         state.reformed.update(state.places.regions[step.removed].tolist())
         state.ledger.forget(state.places.slots[step.removed])
         state.compared += len(step.removed)
+        state.unadapted += len(step.removed) + int(step.touched.sum())
         state.evidence.remove(before.ids[step.removed].tolist())
         state.places = state.places.realigned(step)
         state.places.reshaped |= geometry.disturbed(before, step, cfg.geometry.neighbourhood_m)
@@ -198,7 +200,7 @@ def follow_spaces(state: State, cfg: Config) -> Iterator[TextRequest]:
         spaces.refuse(state.spaces, name)
         return
     state.archive, state.evidence = spaces.succeed(state.spaces, name), evidence
-    state.places.stale[:], state.dirty = True, True
+    state.adaptation, state.places.stale[:], state.dirty = Adaptation(), True, True
     if state.alignment is not None and text is not None:
         state.alignment = replace(state.alignment, text=text)
 
@@ -256,6 +258,7 @@ def align(state: State, cfg: Config) -> bool:
         _reintegrate(state, np.arange(len(state.graph.ids)), cfg)
     state.places = state.places.relabelled(len(prior.regions))
     state.bias, state.compared = np.zeros(len(prior.regions)), len(state.graph.ids)
+    state.adaptation = Adaptation()
     if len(prior.objects) != state.objects.concepts.shape[1] or former is not None:
         state.objects = ObjectView()  # its columns are the former prior's objects
     state.tracks.changed = True
@@ -287,7 +290,7 @@ def _segment(state: State, switched: bool, idle: bool, cfg: Config) -> Iterator[
     changes = partition(state)
     believe(state, cfg)
     delta = publish(state, changes, switched or state.ledger.source is None, cfg)
-    state.dirty = state.solver.pending > 0 or state.compared > 0
+    state.dirty = state.solver.pending > 0 or state.compared > 0 or state.unadapted > 0
     if delta is not None:
         yield delta
 

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from schemas.regions import RegionEvent
-from services.segmenter import beliefs, geometry, regions, sharing, swap
+from services.segmenter import adaptation, beliefs, geometry, regions, sharing, swap
 from services.segmenter.balance import label_bias
 from services.segmenter.experts import REGISTRY, Vote
 from services.segmenter.experts.context import Context, ObjectView, standardised
@@ -17,6 +17,7 @@ from services.segmenter.graph import PlaceGraph
 from services.segmenter.state import Config, State
 
 BIAS_SAMPLE = 4096  # places that stand for all when the map's bias is computed
+RESTING_TICKS = 2  # without a pyramid, after which the map rests
 
 
 @dataclass
@@ -55,13 +56,56 @@ def votes(state: State, rows: np.ndarray, cfg: Config) -> dict[str, Vote]:
     return {name: (np.maximum(log_probabilities, floor), sure) for name, (log_probabilities, sure) in answers.items()}
 
 
+def adapt(state: State, idle: bool, cfg: Config) -> None:
+    """What the labels look like in this map, after enough of it was seen anew or when it rests."""
+    alignment, places = state.alignment, state.places
+    assert alignment is not None
+    state.unadapted += int(places.stale.sum())
+    seen = np.flatnonzero(state.evidence.frames[places.slots] > 0)
+    rests = idle and state.spaces.still_ticks >= RESTING_TICKS
+    if not (rests and state.unadapted) and state.unadapted <= cfg.adaptation.patience * len(seen):
+        return
+    state.unadapted = 0
+    if not (cfg.adaptation.weight and len(seen)):
+        return
+    found, trust = state.evidence.descriptors(places.slots), state.evidence.trust[places.slots]
+    similarity = standardised(found, alignment.text)
+
+    def labels_of(own: np.ndarray) -> np.ndarray:
+        everywhere = np.zeros_like(similarity)
+        everywhere[seen] = own
+        return _visual_labels(state, everywhere, seen, cfg)
+
+    masses = np.minimum(trust[seen], cfg.sharing.trust_limit)
+    now = adaptation.adapted(found[seen], similarity[seen], masses, labels_of, cfg.adaptation)
+    if adaptation.differs(now, state.adaptation, found[seen], similarity[seen], cfg.adaptation.tolerance):
+        state.adaptation = now
+        places.stale[seen] = True
+
+
+def _visual_labels(state: State, own: np.ndarray, rows: np.ndarray, cfg: Config) -> np.ndarray:
+    """The label (row,) that each of some places looks most like, from the own similarities (place, label) of all."""
+    assert state.alignment is not None
+    trust, near = state.evidence.trust[state.places.slots], state.graph.adjacency
+    around = sharing.shared(own, trust, near, state.weights, rows=rows, cfg=cfg.sharing)
+    scores = state.alignment.text.temperature * around
+    return np.argmax(scores + _bias(state, scores, cfg), axis=1)
+
+
+def _bias(state: State, scores: np.ndarray, cfg: Config) -> np.ndarray:
+    """The bias of each label, from the scores (place, label) of the observed places."""
+    assert state.alignment is not None
+    existence = np.array([region.existence for region in state.alignment.prior.regions])
+    return label_bias(scores[:: max(len(scores) // BIAS_SAMPLE, 1)], existence, cfg.balance)
+
+
 def compare(state: State) -> None:
     """Similarity of the places whose evidence changed, each for itself, with each label."""
     alignment, places, rows = state.alignment, state.places, np.flatnonzero(state.places.stale)
     assert alignment is not None
     found = state.evidence.descriptors(places.slots[rows])
     if found.shape[1]:  # after the first pyramid
-        places.own_similarity[rows] = standardised(found, alignment.text)
+        places.own_similarity[rows] = standardised(found, alignment.text) + state.adaptation.similarity(found)
     places.stale[rows], places.unshared[rows] = False, True
 
 
@@ -100,13 +144,11 @@ def see_objects(state: State, view: ObjectView, cfg: Config) -> None:
 def rebalance(state: State, idle: bool, cfg: Config) -> None:
     """The map's bias, after enough of the map was seen anew or when idle; everybody asks again when it has moved."""
     assert state.alignment is not None
-    places, prior = state.places, state.alignment.prior
+    places = state.places
     seen = np.flatnonzero(state.evidence.frames[places.slots] > 0)
     if not state.compared or not (idle or state.compared > cfg.balance.patience * len(seen)):
         return
-    sample = seen[:: max(len(seen) // BIAS_SAMPLE, 1)]
-    scores = state.alignment.text.temperature * places.similarity[sample]
-    bias = label_bias(scores, np.array([region.existence for region in prior.regions]), cfg.balance)
+    bias = _bias(state, state.alignment.text.temperature * places.similarity[seen], cfg)
     state.compared = 0
     if np.abs(bias - state.bias).max(initial=0.0) > cfg.balance.tolerance:
         state.bias = bias
@@ -116,6 +158,7 @@ def rebalance(state: State, idle: bool, cfg: Config) -> None:
 def evaluate_experts(state: State, idle: bool, cfg: Config) -> None:
     """Unary potentials wherever an expert may have changed its mind (eqs. product_of_experts, unary_potential)."""
     reshape(state, cfg)
+    adapt(state, idle, cfg)
     compare(state)
     share(state, cfg)
     rebalance(state, idle, cfg)

@@ -19,7 +19,7 @@ from services.segmenter.graph import Adjacency
 class SharingConfig(msgspec.Struct, frozen=True, kw_only=True):
     """How far evidence is shared. Chosen on the development sequences with perturbed priors."""
 
-    steps: int = 4  # 0 = every place for itself (paper)
+    steps: int = 6  # 0 = every place for itself (paper)
     share: float = 0.8  # of the neighbours' mean in each step
     trust_limit: float = 5.0  # sum of trust above which a place counts no more: a few good looks
     gain: float = 1.4  # of the averages: errors that cancel take some of the spread with them

@@ -11,6 +11,7 @@ from schemas.priors import Prior, PriorEvidence, Task
 from schemas.regions import Region
 from services.deltas import Follower
 from services.segmenter import descriptors, naming, publication
+from services.segmenter.adaptation import Adaptation, AdaptationConfig
 from services.segmenter.balance import BalanceConfig
 from services.segmenter.experts import REGISTRY
 from services.segmenter.experts.context import ObjectSettings, ObjectView
@@ -44,11 +45,14 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
     solver: Settings = msgspec.field(default_factory=Settings)
     budget_ms: float = 40.0  # of solving per keyframe; the rest is done when idle. 0 = as long as it takes
     look_ms: float = 2.0  # of solving between two looks at the budget, see Budget
-    edge_clearance_m: float = 0.0  # > 0: w_dist times min(clearance / edge_clearance_m, 1); no gain seen, so off
+    edge_clearance_m: float = (
+        0.8  # w_dist times min(clearance / edge_clearance_m, 1): half of it in a usual door; 0 = off
+    )
     probability_floor: float = 1e-6  # least probability in a logarithm, so that every cost is finite
     object_phrases: int = 2  # objects whose phrases join a region's concept, the most discriminative first
     sharing: SharingConfig = msgspec.field(default_factory=SharingConfig)  # beyond the paper
     balance: BalanceConfig = msgspec.field(default_factory=BalanceConfig)  # beyond the paper
+    adaptation: AdaptationConfig = msgspec.field(default_factory=AdaptationConfig)  # beyond the paper
     temperature: float = 6.0  # of the posteriors, see services.segmenter.beliefs; least calibration error on dev
     trust_half: float = 0.5  # sum of trust at which half of the unknown mass is left
     predicted_trust: float = 1.0  # sum of trust below which a place counts as predicted; one close look gives about 2
@@ -111,6 +115,8 @@ class State:
     texts: dict[tuple[str, ...], TextEmbeddings] = field(default_factory=dict)  # by space and concepts
     alignment: Alignment | None = None
     solver: Solver = field(default_factory=Solver)
+    adaptation: Adaptation = field(default_factory=Adaptation)
+    unadapted: int = 0  # places whose evidence or edges changed, or that left, since that was looked at
     bias: np.ndarray = field(default_factory=lambda: np.zeros(0))  # (label,) of the visual scores in this map
     compared: int = 0  # places whose similarity was computed, or that left, since the bias was
     next_region_id: int = 0
