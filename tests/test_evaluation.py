@@ -154,6 +154,8 @@ def test_scores_of_objects_stand_beside_the_others(case, capsys):
     assert list(table["sequences"]["a"]["ours"]) == [*runner.KEYS, *OBJECT_SCORES]
     assert list(table["sequences"]["b"]["ours"]) == list(runner.KEYS)
     assert table["mean"]["ours"]["objects_recall"] == 1.0
+    seen = found.pictures[0].scene
+    assert seen.objects and not true_scene(seen, full.truth).objects
     command.print_tables(found, Console())
     assert "recall 100.0" in " ".join(capsys.readouterr().out.split())
     assert "a: ours</td><td>0.500</td><td>1.000</td>" in page(found, {})

@@ -152,7 +152,7 @@ def _image(title: str, scene: Scene, voxels: VoxelMap, sequence: Dataset, labels
 
 
 def true_scene(scene: Scene, truth: GroundTruth) -> Scene:
-    """The same places with the ground truth's regions."""
+    """The same places with the ground truth's regions, and without the objects that were found."""
     ids = truth.region_of(scene.positions_m)
     regions = []
     for region in truth.regions:
@@ -169,7 +169,7 @@ def true_scene(scene: Scene, truth: GroundTruth) -> Scene:
                 area_m2=area_m2,
             )
             regions.append(entry)
-    return msgspec.structs.replace(scene, regions=regions, place_regions=ids)
+    return msgspec.structs.replace(scene, regions=regions, place_regions=ids, objects=[])
 
 
 def _calibration(results: Results) -> str:
