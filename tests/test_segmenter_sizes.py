@@ -25,10 +25,10 @@ def block(*counts):
     return np.stack(np.meshgrid(*[np.arange(count) for count in counts], indexing="ij"), axis=-1).reshape(-1, 3)
 
 
-def graph_of(places, edges=()):
+def graph_of(places, edges=(), **changes):
     positions_m = np.array([place[:3] for place in places], np.float32)
     radii_m = np.array([place[3] for place in places], np.float32)
-    delta = place_delta(positions_m, np.array(edges, np.int64).reshape(-1, 2), radii_m=radii_m)
+    delta = place_delta(positions_m, np.array(edges, np.int64).reshape(-1, 2), radii_m=radii_m, **changes)
     return apply(PlaceGraph(), delta, replaces=True).graph
 
 
@@ -67,6 +67,22 @@ def test_the_floor_is_where_the_lowest_sphere_nearby_rests():
     assert sizes.floor_below(points_m, graph, 1) == pytest.approx([0.0, 0.0, 3.1])
     assert sizes.floor_below(points_m, graph, 0) == pytest.approx([0.9, 0.4, 3.6])
     assert np.isnan(sizes.floor_below(points_m, PlaceGraph(), 3)).all()
+
+
+def test_places_on_the_ground_tell_the_floor_themselves():
+    """Their radii lie along it."""
+    flat = {
+        "surface_ids": np.array([0]),
+        "ellipses": np.ones((1, 3), np.float32),
+        "hull_counts": np.array([3]),
+        "hulls_m": np.eye(3, 2, dtype=np.float32),
+    }
+    graph = graph_of([(0, 0, 0.05, 1.5)], **flat)
+    assert sizes.floor_below(np.zeros((1, 3)), graph, 3) == pytest.approx([0.05])
+    later = place_delta(np.zeros((0, 3)), np.zeros((0, 2)), revision=1)
+    assert (
+        apply(graph, later, replaces=False).graph.on_ground and not apply(graph, later, replaces=True).graph.on_ground
+    )
 
 
 def test_measures_of_a_track_in_a_room():

@@ -25,6 +25,7 @@ class PlaceGraph:
     radii_m: np.ndarray = field(default_factory=lambda: _empty("float64"))  # (place,)
     edges: np.ndarray = field(default_factory=lambda: _empty("int64", 2))  # (edge, 2) rows, smaller first, sorted
     clearances_m: np.ndarray = field(default_factory=lambda: _empty("float64"))  # (edge,)
+    on_ground: bool = False  # 2D places: they lie on the ground, and their radii along it
 
     def rows(self, place_ids: np.ndarray) -> np.ndarray:
         """Row of each id, -1 where there is no such place."""
@@ -106,6 +107,7 @@ def apply(graph: PlaceGraph, delta: PlaceDelta, replaces: bool) -> Step:
         ids=np.insert(graph.ids[kept], at, new),
         positions_m=np.insert(graph.positions_m[kept], at, 0.0, axis=0),
         radii_m=np.insert(graph.radii_m[kept], at, 0.0),
+        on_ground=len(delta.surface_ids) > 0 or (graph.on_ground and not replaces),
     )
     rows = after.rows(upserted)
     moved = ~old

@@ -68,9 +68,8 @@ def sides(cells: np.ndarray) -> np.ndarray:
     """Longest and shortest horizontal side and height (3,), in cells, of the upright box of least area around `cells`
     (cell, 3); it may be turned about the vertical."""
     height = np.ptp(cells[:, 2]) + 1
-    flat = np.unique(cells[:, :2], axis=0)
     cos, sin = np.cos(ANGLES), np.sin(ANGLES)
-    along, across = flat @ np.stack((cos, sin)), flat @ np.stack((-sin, cos))
+    along, across = cells[:, :2] @ np.stack((cos, sin)), cells[:, :2] @ np.stack((-sin, cos))
     extents = np.stack((np.ptp(along, axis=0), np.ptp(across, axis=0))) + 1
     longest, shortest = extents[:, np.prod(extents, axis=0).argmin()].tolist()
     return np.array((max(longest, shortest), min(longest, shortest), height))
@@ -80,11 +79,11 @@ def floor_below(points_m: np.ndarray, graph: PlaceGraph, steps: int) -> np.ndarr
     """Height (point,) of the floor at the place nearest to each point; NaN where there are no places.
 
     The free sphere of a place ends at or above the floor; of some place nearby it rests on it. The lowest sphere within
-    `steps` edges therefore tells the floor, of the own storey and not of one that lies below it.
+    `steps` edges therefore tells the floor, of the own storey and not of one that lies below it. 2D places lie on it.
     """
     if not len(graph.ids):
         return np.full(len(points_m), np.nan)
-    floors_m = graph.positions_m[:, 2].astype(np.float64) - graph.radii_m
+    floors_m = graph.positions_m[:, 2] - (0.0 if graph.on_ground else graph.radii_m)
     for _ in range(steps):
         around_m = floors_m.copy()
         for one, other in ((0, 1), (1, 0)):
