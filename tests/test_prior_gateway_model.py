@@ -92,6 +92,16 @@ def test_small_models_are_asked_region_by_region():
     assert draft.containment.shape == (4, 7)
 
 
+def test_sides_are_chosen_from_geometric_steps_where_the_server_knows_no_bounds():
+    cfg = msgspec.structs.replace(CFG, steps=10)
+    _, turns = drive(synthesis.synthesise(task(), PROMPTS, cfg))
+    form = next(turn.schema for turn in turns if turn.name == "sizes")["properties"]["door"]["properties"]
+    assert form["height_cm"]["enum"] == [2, 4, 8, 16, 32, 63, 126, 251, 501, 1000]
+    assert form["bottom_cm"]["enum"][0] == 0
+    many = msgspec.structs.replace(CFG, steps=200).length["enum"]
+    assert len(many) == len(set(many))
+
+
 def test_reasoning_comes_before_the_answer():
     cfg = msgspec.structs.replace(CFG, reason=True)
     _, turns = drive(synthesis.synthesise(task(), PROMPTS, cfg))

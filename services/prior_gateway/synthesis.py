@@ -71,8 +71,9 @@ class SynthesisConfig(msgspec.Struct, frozen=True, kw_only=True):
     @property
     def length(self) -> Schema:
         """The form of a side in centimetres; steps, if any, are geometric, up to the size of a room."""
-        form = self.number(1, LARGEST_CM)
-        return form | {"enum": np.geomspace(2, 1000, self.steps).round().astype(int).tolist()} if self.steps else form
+        form: Schema = {"type": "integer", "minimum": 1, "maximum": LARGEST_CM}
+        steps = np.unique(np.geomspace(2, 1000, self.steps).round().astype(int)).tolist()
+        return form | {"enum": steps} if self.steps else form
 
     @property
     def percent(self) -> Schema:
