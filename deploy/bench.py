@@ -8,25 +8,20 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import msgspec
-import zenoh
-
 from deploy.benches import features as bench_features
 from deploy.benches import segmenter
+from deploy.benches.bus import bus_bench
 from deploy.benches.encoder_swap import encoder_swap
 from deploy.benches.kernel import kernel
 from deploy.benches.learning import learning_bench
 from deploy.benches.places import place_bench
 from deploy.benches.swap import swap_bench
-from schemas.codec import decode, encode
 from schemas.frames import Keyframe
 from schemas.priors import PriorRequest, Task
-from schemas.topics import KEYFRAME, PRIORS, TEXT, Query
+from schemas.topics import PRIORS, TEXT, Query
 from services.ingest.sources import open_source
 from services.registry import BY_NAME
-from services.runtime.bus import Sample, pack_header
 from services.runtime.service import Ask, Identity
-from services.runtime.zenoh_bus import ZenohBus, client_config, free_endpoint, open_router
 
 SAMPLE = Path(__file__).parent / "sample" / "home.mcap"
 
@@ -71,63 +66,8 @@ def exchanged_encoder() -> tuple[dict, dict]:
 
 
 def bus() -> tuple[dict, dict]:
-    """Typed publish → handler through a router, as share of bare Zenoh put → callback of the same size."""
-    endpoint = free_endpoint("tcp/127.0.0.1:0")
-    stop = open_router(endpoint)
-    metrics: dict[str, float] = {}
-    try:
-        for name, size, number in (("150kB", 150_000, 600), ("1.5MB", 1_500_000, 80)):
-            half = os.urandom(size // 2)
-            keyframe = msgspec.structs.replace(_sample_keyframes()[0], color=half, depth=half)
-            typed = _typed_rate(endpoint, keyframe, number)
-            with zenoh.open(client_config(endpoint)) as reader, zenoh.open(client_config(endpoint)) as writer:
-                bare = _bare_rate(reader, writer, encode(keyframe), number)
-            metrics |= {f"throughput_ratio_{name}": typed / bare, f"messages_per_s_{name}": typed}
-    finally:
-        stop()
-    metrics["throughput_ratio"] = min(value for name, value in metrics.items() if name.startswith("throughput"))
-    return metrics, {"path": "client, router, client on loopback"}
-
-
-def _typed_rate(endpoint: str, keyframe: Keyframe, number: int) -> float:
-    reader, writer = ZenohBus(endpoint), ZenohBus(endpoint)
-    received: list[Keyframe] = []
-
-    def receive(sample: Sample) -> None:
-        received.append(decode(Keyframe, sample.payload))
-
-    reader.subscribe(KEYFRAME, KEYFRAME.pattern("bench"), receive, _ignore)
-    time.sleep(0.5)
-    key = KEYFRAME.key_of(keyframe)
-
-    def put(sequence: int) -> None:
-        writer.put(KEYFRAME, key, encode(keyframe), pack_header("bench", sequence, time.time_ns()))
-
-    rate = _rate(put, lambda: len(received), number)
-    reader.close()
-    writer.close()
-    return rate
-
-
-def _bare_rate(reader: Any, writer: Any, payload: bytes, number: int) -> float:
-    received: list[bytes] = []
-    reader.declare_subscriber("bench/bare", lambda sample: received.append(sample.payload.to_bytes()))
-    publisher = writer.declare_publisher("bench/bare", congestion_control=zenoh.CongestionControl.BLOCK)
-    time.sleep(0.5)
-    return _rate(lambda sequence: publisher.put(payload), lambda: len(received), number)
-
-
-def _rate(put: Callable[[int], None], received: Callable[[], int], number: int) -> float:
-    started_s = time.perf_counter()
-    for sequence in range(number):
-        put(sequence)
-    while received() < number and time.perf_counter() - started_s < 60:
-        time.sleep(0.001)
-    return received() / (time.perf_counter() - started_s)
-
-
-def _ignore(topic: object, number: int) -> None:
-    """A missed sample shows in the rate."""
+    """The typed bus against bare Zenoh."""
+    return bus_bench(_sample_keyframes()[0])
 
 
 class Pipeline:

@@ -44,21 +44,21 @@ class Shape:
     __slots__ = ("dims", "dtype", "finite")
 
     def __init__(self, dtype: str, *dims: str | int, finite: bool = True) -> None:
-        self.dtype, self.dims, self.finite = dtype, dims, finite
+        self.dtype, self.dims, self.finite = np.dtype(dtype), dims, finite and np.dtype(dtype).kind == "f"
 
     def check(self, field: str, array: Any, lengths: dict[str, int]) -> None:
         """Raise ValueError unless `array` fits; `lengths` collects the named dimensions of the whole message."""
         if not isinstance(array, np.ndarray):
             raise ValueError(f"{field}: expected an array")
-        if array.dtype.name != self.dtype:
-            raise ValueError(f"{field}: dtype {array.dtype.name}, expected {self.dtype}")
+        if array.dtype != self.dtype:
+            raise ValueError(f"{field}: dtype {array.dtype.name}, expected {self.dtype.name}")
         if array.ndim != len(self.dims):
             raise ValueError(f"{field}: {array.ndim} dimensions, expected {len(self.dims)}")
         for length, dim in zip(array.shape, self.dims, strict=True):
             expected = dim if isinstance(dim, int) else lengths.setdefault(dim, length)
             if length != expected:
                 raise ValueError(f"{field}: shape {array.shape}, expected {dim} = {expected}")
-        if self.finite and array.dtype.kind == "f" and not np.isfinite(array).all():
+        if self.finite and not np.isfinite(array).all():
             raise ValueError(f"{field}: not finite")
 
 

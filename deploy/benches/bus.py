@@ -1,0 +1,130 @@
+"""What the typed bus costs on top of bare Zenoh: two processes, as every writer and reader are, joined by a router.
+
+Both ways carry the same bytes: typed messages are encoded, published, validated and handed to a handler; bare ones are
+put and handed to a callback. They take turns, and the median of their ratios counts.
+"""
+
+import multiprocessing
+import os
+import statistics
+import threading
+import time
+from collections.abc import Callable
+from multiprocessing.connection import Connection
+from typing import Any
+
+import msgspec
+import zenoh
+
+from schemas.codec import decode, encode
+from schemas.frames import Keyframe
+from schemas.topics import KEYFRAME
+from services.runtime.bus import Sample, pack_header
+from services.runtime.zenoh_bus import ZenohBus, client_config, free_endpoint, open_router
+
+SIZES = {"150kB": (150_000, 1500), "1.5MB": (1_500_000, 200)}  # bytes, messages of one turn
+TURNS = 5
+BARE_KEY = "bench/bare"
+TIMEOUT_S = 60.0
+
+
+def bus_bench(keyframe: Keyframe) -> tuple[dict, dict]:
+    """Typed publish → handler through a router, as share of bare Zenoh put → callback of the same size."""
+    endpoint = free_endpoint("tcp/127.0.0.1:0")
+    stop = open_router(endpoint)
+    metrics: dict[str, float] = {}
+    try:
+        for name, (size, number) in SIZES.items():
+            half = os.urandom(size // 2)
+            message = msgspec.structs.replace(keyframe, color=half, depth=half)
+            rates = [
+                (_rate(endpoint, message, number, True), _rate(endpoint, message, number, False)) for _ in range(TURNS)
+            ]
+            metrics[f"throughput_ratio_{name}"] = statistics.median(typed / bare for typed, bare in rates)
+            metrics[f"messages_per_s_{name}"] = statistics.median(typed for typed, _ in rates)
+            metrics[f"bare_messages_per_s_{name}"] = statistics.median(bare for _, bare in rates)
+    finally:
+        stop()
+    metrics["throughput_ratio"] = min(value for name, value in metrics.items() if name.startswith("throughput"))
+    return metrics, {"path": "process, router, process on loopback", "turns": TURNS}
+
+
+def _rate(endpoint: str, message: Keyframe, number: int, typed: bool) -> float:
+    """Messages per second that arrive in another process."""
+    context = multiprocessing.get_context("spawn")
+    here, there = context.Pipe()
+    reader = context.Process(target=_read, args=(endpoint, number, typed, there), daemon=True)
+    reader.start()
+    try:
+        _received(here)  # it is subscribed
+        (_write_typed if typed else _write_bare)(endpoint, message, number, here)
+        return _received(here)
+    finally:
+        reader.terminate()
+        reader.join()
+
+
+def _received(pipe: Connection) -> Any:
+    if not pipe.poll(TIMEOUT_S):
+        raise TimeoutError("the reader of the bus bench says nothing")
+    return pipe.recv()
+
+
+def _write_typed(endpoint: str, message: Keyframe, number: int, pipe: Connection) -> None:
+    bus, key = ZenohBus(endpoint), KEYFRAME.key_of(message)
+    try:
+        _write(lambda sequence: bus.put(KEYFRAME, key, encode(message), _header(sequence)), number, pipe)
+    finally:
+        bus.close()
+
+
+def _write_bare(endpoint: str, message: Keyframe, number: int, pipe: Connection) -> None:
+    payload = encode(message)
+    with zenoh.open(client_config(endpoint)) as session:
+        publisher = session.declare_publisher(BARE_KEY, congestion_control=zenoh.CongestionControl.BLOCK)
+        _write(lambda sequence: publisher.put(payload), number, pipe)
+
+
+def _write(put: Callable[[int], None], number: int, pipe: Connection) -> None:
+    """One message ahead, so that reader and writer have found each other; the reader then waits for the others."""
+    put(0)
+    _received(pipe)
+    for sequence in range(1, number + 1):
+        put(sequence)
+    _received(pipe)
+    pipe.send(None)
+
+
+def _read(endpoint: str, number: int, typed: bool, pipe: Connection) -> None:
+    """In the reader's process."""
+    arrivals_s: list[float] = []
+    first, last = threading.Event(), threading.Event()
+
+    def handle(message: Any) -> None:
+        arrivals_s.append(time.perf_counter())
+        first.set()
+        if len(arrivals_s) > number:
+            last.set()
+
+    if typed:
+        bus = ZenohBus(endpoint)
+        bus.subscribe(KEYFRAME, KEYFRAME.pattern("bench"), lambda sample: handle(_decoded(sample)), lambda *_: None)
+    else:
+        session = zenoh.open(client_config(endpoint))
+        session.declare_subscriber(BARE_KEY, lambda sample: handle(sample.payload.to_bytes()))
+    time.sleep(0.5)  # until the router has told the writers
+    pipe.send(None)
+    first.wait(TIMEOUT_S)
+    pipe.send(None)
+    last.wait(TIMEOUT_S)
+    pipe.send(None)
+    pipe.recv()
+    pipe.send((len(arrivals_s) - 1) / (arrivals_s[-1] - arrivals_s[0]))
+
+
+def _decoded(sample: Sample) -> Keyframe:
+    return decode(Keyframe, sample.payload)
+
+
+def _header(sequence: int) -> bytes:
+    return pack_header("bench", sequence, time.time_ns())
