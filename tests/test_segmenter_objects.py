@@ -153,7 +153,7 @@ def test_two_objects_that_the_first_looks_took_for_one_are_split_and_the_one_see
         assert objects.descriptor(track.embeddings)[truth[2]] > 0.9
     assert first.frames > second.frames >= 10 and not first.sources & second.sources
     again = objects.Tracks(SPACE, archive=dict(tracks.archive))
-    objects.renew(again, SPACE, CFG)
+    objects.renew(again, SPACE, 99, CFG)
     assert [set(track.sources) for track in again.items.values()] == [first.sources, second.sources]
 
 
@@ -238,12 +238,37 @@ def test_a_pose_correction_moves_the_object_and_keeps_its_id():
     tracks.next_id = 50
     wrong = {number: track.box_m(CFG) for number, track in tracks.items.items()}
     for index, pose in enumerate(poses):
-        objects.move(tracks, index, pose)
-    objects.renew(tracks, SPACE, CFG)
+        objects.move(tracks, {index: pose})
+    objects.renew(tracks, SPACE, 99, CFG)
     assert tracks.items.keys() == wrong.keys() and tracks.next_id == 50
     for number, track in tracks.items.items():
         assert (track.box_m(CFG) == truth.items[number].box_m(CFG)).all()
         assert wrong[number][0, 1] - track.box_m(CFG)[0, 1] == pytest.approx(3.0, abs=0.2)
+
+
+def test_a_renewal_in_slices_with_new_frames_between_equals_one_in_one_go():
+    off = np.eye(4)
+    off[:3, 3] = (0.0, 3.0, 0.0)
+    poses = walk(8)
+    frames = [sight(i, pose, [BED, OVEN], said=off @ pose) for i, pose in enumerate(poses[:6])]
+    late = [sight(i, poses[i], [BED, OVEN]) for i in (6, 7)]
+    whole, sliced = seen(frames), seen(frames)
+    for tracks in (whole, sliced):
+        objects.move(tracks, {0: poses[0]})
+        objects.renew(tracks, SPACE, 2, CFG)
+        objects.move(tracks, dict(enumerate(poses[:6])))  # another correction: all over again
+    objects.renew(whole, SPACE, 99, CFG)
+    for frame in late:
+        objects.observe(whole, frame, CFG)
+    before = dict(sliced.items)
+    for step in range(3):
+        assert objects.outdated(sliced, SPACE) and sliced.items == before
+        objects.renew(sliced, SPACE, 3, CFG)
+        if step < 2:
+            objects.observe(sliced, late[step], CFG)
+    assert not objects.outdated(sliced, SPACE) and sliced.items.keys() == whole.items.keys() == before.keys()
+    for number, track in whole.items.items():
+        assert (sliced.items[number].cells == track.cells).all() and sliced.items[number].sources == track.sources
 
 
 def test_beliefs_by_hand():
@@ -405,7 +430,7 @@ def test_detections_of_another_space_wait_until_it_is_in_force():
     there = dict(run.objects)
     run.feed(*[sight(i, pose, [OVEN], space="other/space") for i, pose in enumerate(walk())], TICK)
     assert run.objects == there
-    objects.renew(run.state.tracks, "other/space", run.cfg.tracking)
+    objects.renew(run.state.tracks, "other/space", 99, run.cfg.tracking)
     assert [track.frames for track in run.state.tracks.items.values()] == [8]
 
 

@@ -23,6 +23,7 @@ from services.segmenter.adaptation import Adaptation
 from services.segmenter.experts.context import ObjectView
 from services.segmenter.graph import apply
 from services.segmenter.inference import (
+    RESTING_TICKS,
     Budget,
     believe,
     edge_weights,
@@ -136,8 +137,12 @@ def detect(state: State, detections: Detections, cfg: Config) -> None:
 def follow_objects(state: State, cfg: Config) -> Iterator[ObjectDelta]:
     """Tell what became of the objects, and let the experts see it. Names wait for the text of the prior's objects."""
     tracks, alignment = state.tracks, state.alignment
-    if tracks.moved or tracks.space != state.spaces.force:
-        objects.renew(tracks, state.spaces.force, cfg.tracking)
+    if objects.outdated(tracks, state.spaces.force):
+        rests = state.spaces.still_ticks >= RESTING_TICKS
+        frames = cfg.tracking.renew_frames_at_rest if rests else cfg.tracking.renew_frames
+        objects.renew(tracks, state.spaces.force, frames, cfg.tracking)
+    if tracks.space != state.spaces.force:
+        return
     prior = None if alignment is None else alignment.prior
     text = None if prior is None else state.texts.get(_concept_key(state.spaces.force, object_concepts(prior)))
     if not tracks.changed or (text is None and prior is not None and prior.objects and tracks.items):
@@ -170,9 +175,9 @@ def correct_poses(state: State, poses: PoseUpdate, cfg: Config) -> None:
     for frame_id, world_from_camera in zip(poses.frame_ids.tolist(), poses.world_from_camera, strict=True):
         state.poses[frame_id] = world_from_camera.copy()
         spaces.move(state.spaces, frame_id, world_from_camera)
-        objects.move(state.tracks, frame_id, world_from_camera)
         for frame in state.archive.move(frame_id, world_from_camera) or ():
             affected[descriptors.visible(frame, state.graph.positions_m, cfg.kernel)] = True
+    objects.move(state.tracks, {frame_id: state.poses[frame_id] for frame_id in poses.frame_ids.tolist()})
     if affected.any():
         _reintegrate(state, np.flatnonzero(affected), cfg)
         state.dirty = True

@@ -9,6 +9,7 @@ Detections stay in an archive, without their images: a corrected pose, or anothe
 afresh. An object then keeps the id under which most of its detections were known.
 """
 
+from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
@@ -50,6 +51,8 @@ class TrackingConfig(msgspec.Struct, frozen=True, kw_only=True):
     patience_frames: int = 5  # later frames that look at it in vain, after which one seen in fewer is dropped
     max_depth_m: float = 6.0  # frames farther away do not count as looking
     observations: int = 32  # embeddings kept per object, the newest
+    renew_frames: int = 64  # associated afresh per half second after a correction of poses, or of another space
+    renew_frames_at_rest: int = 512  # likewise, while no pyramids come
     archive_frames: int = 2000  # frames whose detections are kept, over all spaces, the newest
     label_least: float = (
         0.5  # probability of being one of the prior's objects from which on an object carries its label
@@ -58,8 +61,9 @@ class TrackingConfig(msgspec.Struct, frozen=True, kw_only=True):
     unprompted_weight: float = 0.0  # of objects that none of the prior's names was sought for, in the object expert
 
     def __post_init__(self) -> None:
-        if not (self.cell_m > 0 and self.min_frames >= 1 and self.observations >= 1 and self.archive_frames >= 1):
-            raise ValueError("cell_m, min_frames, observations and archive_frames must be positive")
+        counts = (self.min_frames, self.observations, self.archive_frames, self.renew_frames, self.renew_frames_at_rest)
+        if not (self.cell_m > 0 and min(counts) >= 1):
+            raise ValueError("cell_m and numbers of frames and observations must be positive")
         if not (0 < self.match_overlap <= 1 and 0 <= self.match_part <= 1 and 0 < self.merge_overlap <= 1):
             raise ValueError("match_overlap, match_part and merge_overlap are shares")
         shares = (self.label_least, self.detector_trust, self.unprompted_weight)
@@ -79,15 +83,11 @@ class Track:
     votes: dict[str, float]  # sums of the detections' scores, by the name that they were found for
     missed: int = 0  # frames that looked at it in vain
     look_again: int = 0  # number of frames from which on it is looked at whether it is two
+    frames: int = field(init=False)  # keyframes in which it was detected
     bounds: np.ndarray = field(init=False)  # (2, 3) least and greatest cell numbers
 
     def __post_init__(self) -> None:
-        self.bounds = _bounds(self.cells)
-
-    @property
-    def frames(self) -> int:
-        """Keyframes in which it was detected."""
-        return len({frame for _, frame, _ in self.sources})
+        self.frames, self.bounds = _frames(self.sources), _bounds(self.cells)
 
     def firm(self, share: float = 0.0) -> np.ndarray:
         """Its cells, sorted, that at least a share of its frames shows; once it has three frames, one is not enough."""
@@ -109,8 +109,17 @@ class Tracks:
     archive: dict[tuple[str, str, int], Detections] = field(default_factory=dict)  # by space, detector and frame id
     next_id: int = 0
     merged: list[tuple[int, int]] = field(default_factory=list)  # (gone, into) since they were last told
-    moved: bool = False  # a pose in the archive was corrected since the last association
+    moved: bool = False  # a pose in the archive was corrected since `renewal` began
+    renewal: "Renewal | None" = None
     changed: bool = False  # since they were last told
+
+
+@dataclass
+class Renewal:
+    """An association of all detections afresh, under way; until it is done the objects stay as they are."""
+
+    fresh: Tracks
+    waiting: deque[tuple[str, str, int]]  # keys of the archive
 
 
 def observe(tracks: Tracks, detections: Detections, cfg: TrackingConfig) -> bool:
@@ -121,25 +130,46 @@ def observe(tracks: Tracks, detections: Detections, cfg: TrackingConfig) -> bool
     tracks.archive[key] = kept = copied(detections)
     if len(tracks.archive) > cfg.archive_frames:
         del tracks.archive[next(iter(tracks.archive))]
-    if detections.space == tracks.space and not tracks.moved:
+    if tracks.renewal is not None and detections.space == tracks.renewal.fresh.space:
+        tracks.renewal.waiting.append(key)
+    elif detections.space == tracks.space and not tracks.moved:
         associate(tracks, kept, cfg)
     return True
 
 
-def move(tracks: Tracks, frame_id: int, world_from_camera: np.ndarray) -> None:
-    """Give a frame its corrected pose; `renew` then associates afresh."""
+def move(tracks: Tracks, poses: dict[int, np.ndarray]) -> None:
+    """Give frames their corrected poses, world_from_camera by frame id; `renew` then associates afresh."""
     for key, kept in tracks.archive.items():
-        if key[2] == frame_id:
-            tracks.archive[key] = msgspec.structs.replace(kept, world_from_camera=world_from_camera.copy())
+        if key[2] in poses:
+            tracks.archive[key] = msgspec.structs.replace(kept, world_from_camera=poses[key[2]].copy())
             tracks.moved = True
 
 
-def renew(tracks: Tracks, space: str, cfg: TrackingConfig) -> None:
-    """Associate all stored detections of a space afresh; ids last by the detections that objects share."""
-    fresh = Tracks(space=space, archive=tracks.archive)
-    for (kept_space, _, _), detections in tracks.archive.items():
-        if kept_space == space:
+def outdated(tracks: Tracks, space: str) -> bool:
+    """Whether `renew` has to be called, again, before the objects are those of a space and of the poses as they are."""
+    return tracks.moved or tracks.renewal is not None or tracks.space != space
+
+
+def renew(tracks: Tracks, space: str, frames: int, cfg: TrackingConfig) -> None:
+    """Associate stored detections of a space afresh, those of at most so many frames at a time, oldest first.
+
+    With the last of them the objects change over; ids last by the detections that objects share.
+    """
+    if tracks.renewal is None or tracks.moved or tracks.renewal.fresh.space != space:
+        keys = deque(key for key in tracks.archive if key[0] == space)
+        tracks.renewal, tracks.moved = Renewal(Tracks(space=space, archive=tracks.archive), keys), False
+    fresh, waiting = tracks.renewal.fresh, tracks.renewal.waiting
+    for _ in range(min(frames, len(waiting))):
+        detections = tracks.archive.get(waiting.popleft())
+        if detections is not None:  # it may have left the archive meanwhile
             associate(fresh, detections, cfg)
+    if not waiting:
+        tracks.renewal = None
+        _change_over(tracks, fresh)
+
+
+def _change_over(tracks: Tracks, fresh: Tracks) -> None:
+    """The fresh objects take the places of the former, under their ids."""
     heirs = _heirs(list(tracks.items.values()), list(fresh.items.values()))
     items = {}
     for track in fresh.items.values():
@@ -150,7 +180,7 @@ def renew(tracks: Tracks, space: str, cfg: TrackingConfig) -> None:
         tracks.merged += [(old, number) for old in former if old != best]
         track.id = number
         items[number] = track
-    tracks.space, tracks.items, tracks.moved, tracks.changed = space, dict(sorted(items.items())), False, True
+    tracks.space, tracks.items, tracks.changed = fresh.space, dict(sorted(items.items())), True
 
 
 def _heirs(before: list[Track], after: list[Track]) -> dict[int, int]:
@@ -188,8 +218,19 @@ def associate(tracks: Tracks, detections: Detections, cfg: TrackingConfig) -> No
 def _clouds(detections: Detections, cell_m: float) -> list[np.ndarray]:
     """The cells (cell,) that each detection's points fill in the world."""
     points_m = transform(detections.world_from_camera, detections.points_camera_m.astype(np.float64))
-    clouds = np.split(packed(np.floor(points_m / cell_m).astype(np.int64)), np.cumsum(detections.point_counts)[:-1])
+    clouds = np.split(_filled(points_m, cell_m), np.cumsum(detections.point_counts)[:-1])
     return [np.unique(cells) for cells in clouds[: len(detections.point_counts)]]
+
+
+def _cloud(detections: Detections, index: int, cell_m: float) -> np.ndarray:
+    """The cells (cell,) of one detection."""
+    end = int(detections.point_counts[: index + 1].sum())
+    points_m = detections.points_camera_m[end - int(detections.point_counts[index]) : end]
+    return np.unique(_filled(transform(detections.world_from_camera, points_m.astype(np.float64)), cell_m))
+
+
+def _filled(points_m: np.ndarray, cell_m: float) -> np.ndarray:
+    return packed(np.floor(points_m / cell_m).astype(np.int64))
 
 
 def _matches(tracks: Tracks, detections: Detections, seen: list[np.ndarray], cfg: TrackingConfig) -> dict[int, int]:
@@ -221,7 +262,9 @@ def _merge(tracks: Tracks, touched: list[int], cfg: TrackingConfig) -> None:
             if other.id == track.id:
                 continue
             others = other.firm()
-            if shared(cells, others) + shared(others, cells) >= 2 * cfg.merge_overlap:
+            least = 2 * cfg.merge_overlap - 1  # of one share, for their mean to be enough
+            share = shared(cells, others)
+            if share >= least and share + shared(others, cells) >= 2 * cfg.merge_overlap:
                 into, gone = (track, other) if track.id < other.id else (other, track)
                 _extend(into, gone, cfg)
                 del tracks.items[gone.id]
@@ -296,7 +339,7 @@ def _views(tracks: Tracks, track: Track, cfg: TrackingConfig) -> Iterator[tuple[
     for detector, frame_id, index in sorted(track.sources, key=lambda source: (source[1], source)):
         detections = tracks.archive.get((tracks.space, detector, frame_id))
         if detections is not None:
-            yield detections, index, _clouds(detections, cfg.cell_m)[index]
+            yield detections, index, _cloud(detections, index, cfg.cell_m)
 
 
 def _forget(tracks: Tracks, detections: Detections, touched: set[int], cfg: TrackingConfig) -> None:
@@ -330,6 +373,7 @@ def _extend(track: Track, more: Track, cfg: TrackingConfig) -> None:
     track.bounds = np.stack((np.minimum(track.bounds[0], more.bounds[0]), np.maximum(track.bounds[1], more.bounds[1])))
     track.embeddings = [*track.embeddings, *more.embeddings][-cfg.observations :]
     track.sources |= more.sources
+    track.frames = _frames(track.sources)
     for name, score in more.votes.items():
         track.votes[name] = track.votes.get(name, 0.0) + score
 
@@ -359,6 +403,10 @@ def descriptor(embeddings: list[np.ndarray]) -> np.ndarray:
 def shared(cells: np.ndarray, others: np.ndarray) -> float:
     """Share of the cells that are at most one cell from one of the others (both sorted)."""
     return count_near(cells, others, COLUMNS) / len(cells)
+
+
+def _frames(sources: set[tuple[str, int, int]]) -> int:
+    return len({frame_id for _, frame_id, _ in sources})
 
 
 def _bounds(cells: np.ndarray) -> np.ndarray:
