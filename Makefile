@@ -36,6 +36,7 @@ $(VENV)/installed: pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed; set PYTHON=...")'
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e .
+	find schemas services deploy -name '*.nb[ci]' -delete # loops compiled for another version may name what it lacks now
 	touch $@
 
 $(VENV)/installed-dev: $(VENV)/installed

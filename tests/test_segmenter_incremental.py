@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from services.segmenter import swap
-from services.segmenter.adjacency import adjacency
+from services.segmenter.arcs import arcs_of
 from services.segmenter.bound import lower_bound
 from services.segmenter.field import Field, energy
 from services.segmenter.incremental import Settings, Solver, changed_rows
@@ -113,7 +113,7 @@ def test_changed_rows_are_those_that_were_changed(kind):
     changes = Changes(seed=5)
     before = changes.field
     dirty, previous = getattr(changes, kind)()
-    graphs = [adjacency(len(field.unary), field.edges, field.weights) for field in (before, changes.field)]
+    graphs = [arcs_of(len(field.unary), field.edges, field.weights) for field in (before, changes.field)]
     origin = np.arange(len(before.unary)) if previous is None else previous
     found = changed_rows(graphs[0], before.unary, graphs[1], changes.field.unary, origin)
     assert sorted(found) == sorted(set(dirty.tolist()))

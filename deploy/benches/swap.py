@@ -13,7 +13,7 @@ import numpy as np
 
 from deploy.benches.fields import LABELS, place_field
 from services.segmenter import swap
-from services.segmenter.adjacency import Adjacency, adjacency
+from services.segmenter.arcs import Arcs, arcs_of
 from services.segmenter.bound import lower_bound
 from services.segmenter.field import Field
 from services.segmenter.incremental import Solver
@@ -107,7 +107,7 @@ def stream(places: int, changed: int, steps: int, against_cold: bool = True, rew
     `rewired`, the weights of their edges change too, so that the solver has to take up the whole graph again.
     """
     rng, field = np.random.default_rng([places, changed]), bench_field(places, 0)
-    graph, solver = adjacency(places, field.edges, field.weights), Solver()
+    graph, solver = arcs_of(places, field.edges, field.weights), Solver()
     solver.take(field, field.unary.argmin(axis=1))
     labels = solver.drain()
     update_s, cold_s, drain_s, gaps = [], [], [], []
@@ -141,7 +141,7 @@ def stream(places: int, changed: int, steps: int, against_cold: bool = True, rew
     return figures
 
 
-def around(center: int, count: int, graph: Adjacency) -> np.ndarray:
+def around(center: int, count: int, graph: Arcs) -> np.ndarray:
     """The `count` places that are fewest steps from `center`."""
     found, reached = [center], {center}
     for place in found:

@@ -6,7 +6,7 @@ precision. Costs linear in places and edges per pass; a thousand places take abo
 
 import numpy as np
 
-from services.segmenter.adjacency import adjacency
+from services.segmenter.arcs import arcs_of
 from services.segmenter.field import Field
 from services.segmenter.messages import empty_messages, run_pass, take_up
 
@@ -17,7 +17,7 @@ def lower_bound(field: Field, passes: int = 400, close_enough: float = 1e-9) -> 
     Ends after `passes` there and back, or when twenty more raise the bound by less than `close_enough` of itself.
     """
     places = len(field.unary)
-    graph, rows = adjacency(places, field.edges, field.weights), np.arange(places)
+    graph, rows = arcs_of(places, field.edges, field.weights), np.arange(places)
     messages = empty_messages(places, len(graph.neighbours), field.pairwise, np.float64)
     take_up(rows, graph, np.ascontiguousarray(field.unary, np.float64), np.zeros(places, np.int64), messages)
     best, before = -np.inf, -np.inf

@@ -29,7 +29,7 @@ import numpy as np
 from numba import njit
 
 from services.segmenter import moves
-from services.segmenter.adjacency import Adjacency, adjacency, ball
+from services.segmenter.arcs import Arcs, arcs_of, ball
 from services.segmenter.field import Field, least_gain
 from services.segmenter.maxflow import CUTS
 from services.segmenter.messages import empty_messages, lay_down, run_pass, take_up
@@ -71,7 +71,7 @@ class Solver:
         self.settings = settings or Settings()
         self.labels = np.zeros(0, np.int64)
         self._field: Field | None = None
-        self._graph: Adjacency = adjacency(0, np.zeros((0, 2)), np.zeros(0))
+        self._graph: Arcs = arcs_of(0, np.zeros((0, 2)), np.zeros(0))
         self._unary = np.zeros((0, 0))
         self._pairwise = np.zeros((0, 0))
         self._work = moves.empty_work(0, 0, 0)
@@ -135,7 +135,7 @@ class Solver:
         if before is not None and previous is None and len(before.unary) != count:
             raise ValueError("the number of places changed: `previous` must say which row each place had")
         same_edges = before is not None and previous is None and _same_edges(before, field)
-        graph = self._graph if same_edges else adjacency(count, field.edges, field.weights)
+        graph = self._graph if same_edges else arcs_of(count, field.edges, field.weights)
         unary = np.ascontiguousarray(field.unary, dtype=np.float64)
         pairwise = np.ascontiguousarray(field.pairwise, dtype=np.float64)
         everything = before is None or not np.array_equal(self._pairwise, pairwise)
@@ -160,7 +160,7 @@ class Solver:
         self._changes += len(dirty)
         self._least_gain = max(0.0 if before is None else self._least_gain, least_gain(unary[dirty]))
 
-    def _carry(self, before: Field | None, origin: np.ndarray, field: Field, graph: Adjacency) -> None:
+    def _carry(self, before: Field | None, origin: np.ndarray, field: Field, graph: Arcs) -> None:
         """Scratch space for new rows and arcs, with what was pending before on the rows where it is now."""
         old_work, old_unproposed = self._work, self._unproposed
         arcs, (count, label_count) = len(graph.neighbours), field.unary.shape
@@ -196,7 +196,9 @@ class Solver:
     def _propose_near(self, expired: Expired) -> None:
         """Proposals around the places that changed."""
         if len(self._unproposed):
-            rows = ball(self._unproposed, self.settings.reach, self._graph, self._messages.inside)
+            rows = ball(
+                self._unproposed, self.settings.reach, self._graph.starts, self._graph.neighbours, self._messages.inside
+            )
             if self._propose(rows, self.settings.round_trips, expired):
                 self._unproposed = self._unproposed[:0]
 

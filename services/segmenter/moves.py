@@ -22,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from services.segmenter.adjacency import Adjacency
+from services.segmenter.arcs import Arcs
 
 UNSEEN, LISTED, FREE, TAKES_ALPHA, TAKES_BETA = 0, 1, 2, 3, 4
 NOT_PENDING, NEAR, DEEP = 0, 1, 2  # a swap's flag; NEAR and DEEP less one are also the numbers of their queues
@@ -82,7 +82,7 @@ class Limits(NamedTuple):
 
 
 def run_swaps(  # noqa: PLR0917
-    graph: Adjacency,
+    graph: Arcs,
     unary: np.ndarray,
     pairwise: np.ndarray,
     labels: np.ndarray,
@@ -442,7 +442,7 @@ def push(source, starts, neighbours, twins, mark, lean, level, path, next_arc, c
 
 
 def core_in_hand(
-    graph: Adjacency, unary: np.ndarray, pairwise: np.ndarray, labels: np.ndarray, work: Work
+    graph: Arcs, unary: np.ndarray, pairwise: np.ndarray, labels: np.ndarray, work: Work
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """The free places' rows, then the arguments of `maxflow.binary_minimum` for them: 1 stands for beta."""
     place, beta = work.core[PLACE], work.core[BETA]

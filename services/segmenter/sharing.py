@@ -13,6 +13,7 @@ import msgspec
 import numpy as np
 from numba import njit
 
+from services.segmenter.arcs import ball
 from services.segmenter.graph import Adjacency
 
 
@@ -43,27 +44,7 @@ def shared(
 
 def reached(near: Adjacency, mask: np.ndarray, steps: int) -> np.ndarray:
     """Rows within `steps` edges of the places in `mask`, these included."""
-    return _ball(near.starts, near.neighbours, np.flatnonzero(mask), steps)
-
-
-@njit(cache=True, nogil=True)
-def _ball(starts, neighbours, rows, steps):  # noqa: ANN001, ANN202
-    """Rows within `steps` edges of `rows`, which come first; ascending."""
-    inside = np.zeros(len(starts) - 1, np.bool_)
-    found = np.empty(len(starts) - 1, np.int64)
-    inside[rows] = True
-    found[: len(rows)] = rows
-    first, last = 0, len(rows)
-    for _ in range(steps):
-        end = last
-        for index in range(first, last):
-            for at in range(starts[found[index]], starts[found[index] + 1]):
-                if not inside[neighbours[at]]:
-                    inside[neighbours[at]] = True
-                    found[end] = neighbours[at]
-                    end += 1
-        first, last = last, end
-    return np.sort(found[:last])
+    return ball(np.flatnonzero(mask), steps, near.starts, near.neighbours, np.zeros(len(mask), bool))
 
 
 @njit(cache=True, nogil=True)
@@ -72,20 +53,20 @@ def _shared(own, masses, starts, neighbours, weights, rows, steps, share):  # no
 
     Places at the rim of the ball lack neighbours, but their error needs as many steps as it is far from `rows`.
     """
-    ball = _ball(starts, neighbours, rows, steps)
+    around = ball(rows, steps, starts, neighbours, np.zeros(len(masses), np.bool_))
     index_of = np.full(len(masses), -1, np.int64)
-    index_of[ball] = np.arange(len(ball))
+    index_of[around] = np.arange(len(around))
     columns = own.shape[1]
-    sums = np.empty((len(ball), columns + 1))
-    for index in range(len(ball)):
-        sums[index, :columns] = masses[ball[index]] * own[ball[index]]
-        sums[index, columns] = masses[ball[index]]
+    sums = np.empty((len(around), columns + 1))
+    for index in range(len(around)):
+        sums[index, :columns] = masses[around[index]] * own[around[index]]
+        sums[index, columns] = masses[around[index]]
     for _ in range(steps):
         before = sums.copy()
-        for index in range(len(ball)):
+        for index in range(len(around)):
             total = 0.0
             mean = np.zeros(columns + 1)
-            for at in range(starts[ball[index]], starts[ball[index] + 1]):
+            for at in range(starts[around[index]], starts[around[index] + 1]):
                 other = index_of[neighbours[at]]
                 total += weights[at]
                 if other >= 0:

@@ -1,4 +1,4 @@
-"""Which places touch which, as compressed rows for the compiled solvers (pure)."""
+"""Which places touch which, as arcs with weights for the compiled solvers (pure)."""
 
 from typing import NamedTuple
 
@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 
 
-class Adjacency(NamedTuple):
+class Arcs(NamedTuple):
     """Every edge (u, v) as two arcs, u to v and v to u; the arcs of place p are starts[p] to starts[p + 1]."""
 
     starts: np.ndarray  # (place + 1,) int64
@@ -15,10 +15,10 @@ class Adjacency(NamedTuple):
     twins: np.ndarray  # (arc,) int32 number of the opposite arc
 
 
-def adjacency(places: int, edges: np.ndarray, weights: np.ndarray) -> Adjacency:
+def arcs_of(places: int, edges: np.ndarray, weights: np.ndarray) -> Arcs:
     """The arcs of `edges` (edge, 2) with their `weights` (edge,); linear in places and edges."""
     edges = np.ascontiguousarray(edges, dtype=np.int64).reshape(-1, 2)
-    return Adjacency(*_build(places, edges, np.ascontiguousarray(weights, dtype=np.float64)))
+    return Arcs(*_build(places, edges, np.ascontiguousarray(weights, dtype=np.float64)))
 
 
 @njit(cache=True, nogil=True)
@@ -50,7 +50,7 @@ def _build(places, edges, weights):  # noqa: ANN001, ANN202
 
 
 @njit(cache=True, nogil=True)
-def ball(centers, reach, graph, inside):  # noqa: ANN001, ANN201
+def ball(centers, reach, starts, neighbours, inside):  # noqa: ANN001, ANN201
     """Rows, ascending, within `reach` steps of `centers`; `inside` is scratch, all False before and after."""
     found = np.empty(len(inside), np.int64)
     count = 0
@@ -63,8 +63,8 @@ def ball(centers, reach, graph, inside):  # noqa: ANN001, ANN201
     for _ in range(reach):
         last = count
         for index in range(first, last):
-            for arc in range(graph.starts[found[index]], graph.starts[found[index] + 1]):
-                neighbour = graph.neighbours[arc]
+            for arc in range(starts[found[index]], starts[found[index] + 1]):
+                neighbour = neighbours[arc]
                 if not inside[neighbour]:
                     inside[neighbour] = True
                     found[count] = neighbour
