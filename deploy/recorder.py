@@ -1,5 +1,6 @@
 """Records every recorded topic of all robots into one log, and knows how far its readers are."""
 
+import math
 import queue
 import threading
 import time
@@ -16,7 +17,8 @@ from services.runtime.bus import Sample
 from services.runtime.record import LogError, LogWriter
 
 FLUSH_S = 1.0
-TICKING = {service.name for service in SERVICES if service.tick_s is not None}
+REST_S = 1.5  # without inputs, until the segmenter rests, adapts to the whole map, and settles
+TICKS_AFTER = {service.name: math.ceil(REST_S / service.tick_s) for service in SERVICES if service.tick_s is not None}
 Tap = Callable[[Sample, Message], None]
 
 
@@ -97,16 +99,16 @@ class Settling:
         ]
         self._published: dict[tuple[str, str, str], int] = {}  # newest by topic, key, writer
         self._consumed: dict[tuple[str, str, str], int] = {}  # newest by service, key, writer
-        self._due: dict[str, bool] = {}  # services that work on their ticks: whether one has yet to follow an input
+        self._due: dict[str, int] = {}  # of services that work on their ticks: how many have yet to follow an input
         self.changed_s = time.monotonic()
 
     def __call__(self, sample: Sample, message: Message) -> None:
         """See one recorded message."""
         match message:
             case Consumed(topic="Tick"):
-                self._due[message.service] = False
+                self._due[message.service] = max(self._due.get(message.service, 0) - 1, 0)
             case Consumed() if message.writer:
-                self._due[message.service] = message.service in TICKING
+                self._due[message.service] = TICKS_AFTER.get(message.service, 0)
                 name = (message.service, message.key, message.writer)
                 self._consumed[name] = max(message.sequence, self._consumed.get(name, -1))
             case _ if sample.topic.name in self._topics and sample.writer:
