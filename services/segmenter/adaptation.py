@@ -14,6 +14,9 @@ from dataclasses import dataclass, field
 import msgspec
 import numpy as np
 
+SAMPLE = 4096  # places that stand for all when directions are computed
+TINY = 1e-9
+
 
 class AdaptationConfig(msgspec.Struct, frozen=True, kw_only=True):
     """How far regions are recognised by what they look like in this map. Chosen on the development sequences."""
@@ -55,16 +58,18 @@ def adapted(
     most gets no direction.
     """
     count, labels = similarity.shape
-    center = masses @ descriptors / masses.sum()
-    offsets = descriptors - center
     scale = cfg.weight * count / (count + cfg.half_places) * _spread(similarity, masses)
-    directions = np.zeros((labels, len(center)))
+    center = (masses @ descriptors / masses.sum()).astype(descriptors.dtype)
+    offsets = descriptors - center
+    some = slice(None, None, max(count // SAMPLE, 1))
+    weights = (masses[some] / masses[some].sum()).astype(offsets.dtype)
+    directions = np.zeros((labels, len(center)), offsets.dtype)
     for _ in range(cfg.rounds):
         best = labels_of(similarity + offsets @ directions.T)
-        members = masses[:, None] * (best[:, None] == np.arange(labels))
-        means = members.T @ offsets / np.maximum(members.sum(axis=0), 1e-12)[:, None]
-        spreads = np.sqrt(masses @ (offsets @ means.T) ** 2 / masses.sum())
-        directions = scale * means / np.maximum(spreads, 1e-12)[:, None]
+        members = weights[:, None] * (best[some, None] == np.arange(labels))
+        means = members.T @ offsets[some] / np.maximum(members.sum(axis=0), TINY)[:, None]
+        spreads = np.sqrt(weights @ (offsets[some] @ means.T) ** 2)
+        directions = (scale * means / np.maximum(spreads, TINY)[:, None]).astype(offsets.dtype)
     return Adaptation(center, directions)
 
 

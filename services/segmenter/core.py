@@ -88,7 +88,7 @@ def follow_places(state: State, delta: PlaceDelta, cfg: Config) -> None:
         state.reformed.update(state.places.regions[step.removed].tolist())
         state.ledger.forget(state.places.slots[step.removed])
         state.compared += len(step.removed)
-        state.unadapted += len(step.removed) + int(step.touched.sum())
+        state.unadapted += len(step.removed) + bool(step.touched.any())  # at least one: the map is another
         state.evidence.remove(before.ids[step.removed].tolist())
         state.places = state.places.realigned(step)
         state.places.reshaped |= geometry.disturbed(before, step, cfg.geometry.neighbourhood_m)

@@ -68,17 +68,17 @@ def adapt(state: State, idle: bool, cfg: Config) -> None:
     state.unadapted = 0
     if not (cfg.adaptation.weight and len(seen)):
         return
-    found, trust = state.evidence.descriptors(places.slots), state.evidence.trust[places.slots]
+    found = state.evidence.descriptors(places.slots[seen]).astype(np.float32)
     similarity = standardised(found, alignment.text)
+    everywhere = np.zeros((len(places.slots), similarity.shape[1]))
 
     def labels_of(own: np.ndarray) -> np.ndarray:
-        everywhere = np.zeros_like(similarity)
         everywhere[seen] = own
         return _visual_labels(state, everywhere, seen, cfg)
 
-    masses = np.minimum(trust[seen], cfg.sharing.trust_limit)
-    now = adaptation.adapted(found[seen], similarity[seen], masses, labels_of, cfg.adaptation)
-    if adaptation.differs(now, state.adaptation, found[seen], similarity[seen], cfg.adaptation.tolerance):
+    masses = np.minimum(state.evidence.trust[places.slots[seen]], cfg.sharing.trust_limit)
+    now = adaptation.adapted(found, similarity, masses, labels_of, cfg.adaptation)
+    if adaptation.differs(now, state.adaptation, found, similarity, cfg.adaptation.tolerance):
         state.adaptation = now
         places.stale[seen] = True
 

@@ -116,7 +116,9 @@ class State:
     alignment: Alignment | None = None
     solver: Solver = field(default_factory=Solver)
     adaptation: Adaptation = field(default_factory=Adaptation)
-    unadapted: int = 0  # places whose evidence or edges changed, or that left, since that was looked at
+    unadapted: int = (
+        0  # places whose evidence changed, or that left, since that was looked at; at least one if any edge did
+    )
     bias: np.ndarray = field(default_factory=lambda: np.zeros(0))  # (label,) of the visual scores in this map
     compared: int = 0  # places whose similarity was computed, or that left, since the bias was
     next_region_id: int = 0
