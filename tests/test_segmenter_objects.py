@@ -362,10 +362,10 @@ class Run:
             self.objects[entry.id] = entry
 
 
-def started(**kwargs):
+def started(cfg=None, **kwargs):
     positions, edges = place_grid(1)
     frames = [sight(i, pose, [BED, OVEN], **kwargs) for i, pose in enumerate(walk())]
-    return Run().feed(place_delta(positions, edges), *frames, TICK)
+    return Run(cfg).feed(place_delta(positions, edges), *frames, TICK)
 
 
 def test_objects_are_told_once_and_named_when_a_prior_comes():
@@ -382,13 +382,17 @@ def test_objects_are_told_once_and_named_when_a_prior_comes():
 
 
 @pytest.mark.parametrize(("sought", "word"), [([], 0.0), (["bed", "oven"], 1.0), (["piano", "fish"], 0.0)])
-def test_only_objects_that_were_sought_by_the_priors_names_have_a_word(sought, word):
+def test_only_objects_that_were_sought_by_the_priors_names_answer_what_it_holds(sought, word):
     names = np.arange(len(sought), dtype=np.int16)
-    run = started(prompted=bool(sought), sought=sought, names=names).feed(task(), prior(["kitchen", "bedroom"]), TICK)
-    view = run.state.objects
+    fields = {"prompted": bool(sought), "sought": sought, "names": names}
+    view = started(**fields).feed(task(), prior(["kitchen", "bedroom"]), TICK).state.objects
     assert isinstance(view, ObjectView) and len(view.ids) == 2
     assert np.allclose(view.concepts.sum(axis=1), 1.0)
-    assert view.words == pytest.approx([word, word], abs=0.1) and (view.words > 0).all() == (word > 0)
+    assert (view.words > 0.9).all()
+    assert view.answers == pytest.approx([word, word], abs=0.1) and (view.answers > 0).all() == (word > 0)
+    silent = Config(tracking=objects.TrackingConfig(unprompted_weight=0.0))
+    view = started(silent, **fields).feed(task(), prior(["kitchen", "bedroom"]), TICK).state.objects
+    assert view.words == pytest.approx([word, word], abs=0.1)
 
 
 def test_the_detectors_name_outweighs_the_encoders():
@@ -401,7 +405,7 @@ def test_the_detectors_name_outweighs_the_encoders():
 
 
 def test_where_nothing_is_likely_enough_no_object_has_a_label_and_nothing_a_word():
-    cfg = Config(tracking=objects.TrackingConfig(label_least=1.0))
+    cfg = Config(tracking=objects.TrackingConfig(label_least=1.0, unprompted_weight=0.0))
     positions, edges = place_grid(1)
     frames = [sight(i, pose, [BED, OVEN]) for i, pose in enumerate(walk())]
     run = Run(cfg).feed(place_delta(positions, edges), *frames, TICK, task(), prior(["kitchen", "bedroom"]), TICK, TICK)

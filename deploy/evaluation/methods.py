@@ -144,9 +144,9 @@ def ablations(config: Config) -> list[Method]:
             Variant(msgspec.structs.replace(config, edge_clearance_m=0.0)),
             "narrow ways bind places as firmly as wide ones",
         ),
-        "all objects speak": (
-            but("tracking", unprompted_weight=1.0),
-            "also those of a detector that does not know the prior's",
+        "sought objects speak": (
+            but("tracking", unprompted_weight=0.0),
+            "not those of a detector that does not know the prior's",
         ),
         "no scale trust": (unscaled, "crops of any scale count alike"),
         "no occlusion test": (but("kernel", occlusion_tolerance_m=NEVER_M), "hidden places count as seen"),

@@ -23,6 +23,7 @@ class Named(NamedTuple):
     entry: SceneObject
     concepts: np.ndarray  # (concept,) sums to 1
     weight: float
+    sought: float  # share of the detectors' votes that name one of the prior's objects
 
 
 @dataclass
@@ -44,6 +45,7 @@ class ObjectLedger:
             positions_m=np.array([item.entry.position_m for item in named]),
             concepts=np.array([item.concepts for item in named]),
             weights=np.array([item.weight for item in named]),
+            sought=np.array([item.sought for item in named]),
         )
 
     def snapshot(self, robot: str, epoch: int) -> ObjectDelta:
@@ -115,7 +117,7 @@ def named(
     if not items:
         return {}
     if prior is None or text is None:
-        return {track.id: Named(_entry(track, "", 0.0, 0.0, cfg), np.zeros(0), 0.0) for track in items}
+        return {track.id: Named(_entry(track, "", 0.0, 0.0, cfg), np.zeros(0), 0.0, 0.0) for track in items}
     found = np.array([descriptor(track.embeddings) for track in items])
     boxes = sizes.measured(items, cfg, graph, size_cfg)
     fits = sizes.log_ratios(boxes, prior.objects, size_cfg)
@@ -127,7 +129,7 @@ def named(
         best = int(row.argmax())
         label = prior.objects[best].name if certain * row[best] >= cfg.label_least else ""
         weight = certain * (heard + (1.0 - heard) * cfg.unprompted_weight)
-        result[track.id] = Named(_entry(track, label, float(row[best]), certain, cfg), row, weight)
+        result[track.id] = Named(_entry(track, label, float(row[best]), certain, cfg), row, weight, heard)
     return result
 
 

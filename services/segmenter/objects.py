@@ -58,7 +58,7 @@ class TrackingConfig(msgspec.Struct, frozen=True, kw_only=True):
         0.5  # probability of being one of the prior's objects from which on an object carries its label
     )
     detector_trust: float = 0.8  # share of an object's belief that the names have for which detectors found it
-    unprompted_weight: float = 0.0  # of objects that none of the prior's names was sought for, in the object expert
+    unprompted_weight: float = 1.0  # in the object expert, of objects that none of the prior's names was sought for
 
     def __post_init__(self) -> None:
         counts = (self.min_frames, self.observations, self.archive_frames, self.renew_frames, self.renew_frames_at_rest)

@@ -1,8 +1,8 @@
 """What a map shows of its prior: how its regions share the places, which of them touch, and what they hold (beyond the
 paper; pure).
 
-Objects count once some object of the map has a say: that a region holds none of a kind says something only where one
-has looked for that kind.
+Objects count only as far as a detector looked for them by name, and once one did: that a region holds none of a kind
+says something only where one has looked for that kind.
 """
 
 import numpy as np
@@ -29,7 +29,7 @@ def evidence(state: State, cfg: Config) -> PriorEvidence | None:
     instances = np.bincount(labels, minlength=count).astype(np.float32)
     pairs = np.outer(instances, instances)
     np.fill_diagonal(pairs, instances * (instances - 1) / 2)
-    looked = bool((state.objects.words > 0).any())
+    looked = bool((state.objects.answers > 0).any())
     held = _held(state.objects, state.graph.positions_m, places.regions, ids)
     return PriorEvidence(
         robot=state.robot,
@@ -70,7 +70,7 @@ def _held(view: ObjectView, positions_m: np.ndarray, regions: np.ndarray, ids: n
         distances_m, nearest = cKDTree(positions_m).query(view.positions_m)
         region = regions[nearest]
         inside = np.flatnonzero((distances_m <= OBJECT_REACH_M) & np.isin(region, ids))
-        words = view.words[inside, None] * view.concepts[inside]
+        words = view.answers[inside, None] * view.concepts[inside]
         np.maximum.at(held, np.searchsorted(ids, region[inside]), words)
     return held
 

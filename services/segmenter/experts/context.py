@@ -17,11 +17,17 @@ class ObjectView:
     positions_m: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))  # (object, 3) world
     concepts: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))  # (object, concept) P(c | o), rows sum to 1
     weights: np.ndarray | None = None  # (object,) of its word, in [0, 1]; None = 1 each
+    sought: np.ndarray | None = None  # (object,) how far it was found by looking for the prior's objects; None = 1 each
 
     @property
     def words(self) -> np.ndarray:
         """Weight (object,) of each object's word."""
         return np.ones(len(self.ids)) if self.weights is None else self.weights
+
+    @property
+    def answers(self) -> np.ndarray:
+        """Weight (object,) of each object's word as an answer to whether the map holds what the prior names."""
+        return self.words if self.sought is None else self.words * self.sought
 
     def changed_m(self, before: "ObjectView") -> np.ndarray:
         """Where objects (n, 3) are new, gone or different against `before`; of moved ones both positions."""
