@@ -17,7 +17,7 @@ from services.feature_pyramid.core import Config
 from services.feature_pyramid.detect import Found, Grid
 from services.feature_pyramid.encoders import EncoderUnavailable
 from services.feature_pyramid.masks import load_masks
-from services.feature_pyramid.prompted import as_sentences, best_sentence
+from services.feature_pyramid.prompted import as_sentences, batches, best_sentence
 from services.runtime.service import Ask
 
 CAMERA = Intrinsics(640, 480, 500.0, 500.0, 320.0, 240.0)
@@ -305,6 +305,13 @@ def test_names_of_several_tokens_by_hand():
     assert as_sentences(("Office chair", "St. Bernard dog.")) == "office chair. st  bernard dog."
 
 
+def test_a_name_without_tokens_scores_nothing_and_long_lists_are_asked_in_parts():
+    scores = np.array([[0.0, 0.2, 0.1, 0.3, 0.1]])
+    assert best_sentence(scores, [101, 9, 7, 9, 102], stop=9).tolist() == [1]  # ". bed."
+    assert batches([3, 3, 3, 9, 1], 6) == [(0, 2), (2, 3), (3, 4), (4, 5)]
+    assert batches([3], 6) == [(0, 1)]
+
+
 def sam(folder):
     """A small SAM with random weights."""
     import transformers
@@ -435,3 +442,13 @@ def test_the_newest_task_and_the_newest_prior_for_it_count():
     vocabulary.hear(known, answers[1])  # told again: it is the newest
     assert vocabulary.objects(known, "ada") == ("lamp", "bed")
     assert list(vocabulary.questions(known, "ada")) == [] and vocabulary.objects(known, "bob") == ()
+
+
+def test_priors_that_answer_a_task_are_remembered_longest_and_asked_for_again():
+    known, home = vocabulary.Vocabulary(), prior(["kitchen"])
+    vocabulary.hear(known, task(robot="ada", environment=home.environment, task=home.task))
+    assert len(list(vocabulary.questions(known, "ada"))) == len(list(vocabulary.questions(known, "ada"))) == 1
+    vocabulary.hear(known, home)
+    for number in range(2 * vocabulary.REMEMBERED):
+        vocabulary.hear(known, msgspec.structs.replace(home, task=f"another {number}"))
+    assert len(known.priors) == vocabulary.REMEMBERED and vocabulary.objects(known, "ada") == ("oven", "bed")

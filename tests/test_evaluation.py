@@ -149,7 +149,9 @@ def test_scores_of_objects_stand_beside_the_others(case, capsys):
         runner.Dataset("a", Path("a"), full.truth, full.prior, full.objects),
         runner.Dataset("b", Path("b"), full.truth, full.prior),
     ]
-    found = runner.run(sequences, [method], lambda path, features: replace(full.perception, name=str(path)), quiet)
+    found = runner.run(
+        sequences, [method], lambda path, features, sought: replace(full.perception, name=str(path)), quiet
+    )
     table = found.table()
     assert list(table["sequences"]["a"]["ours"]) == [*runner.KEYS, *OBJECT_SCORES]
     assert list(table["sequences"]["b"]["ours"]) == list(runner.KEYS)
@@ -281,7 +283,7 @@ def results(case) -> runner.Results:
     chosen = [methods.ours(Config()), methods.baseline("argmax"), *methods.ablations(Config())[:2]]
     chosen += [methods.oracle(Config(), "prior"), *methods.sweep(Config(), "radius")]
     dataset = runner.Dataset("two rooms", Path("two rooms"), case.truth, case.prior)
-    return runner.run([dataset], chosen, lambda path, features: case.perception, lambda *_: None, priors=3)
+    return runner.run([dataset], chosen, lambda path, features, sought: case.perception, lambda *_: None, priors=3)
 
 
 def test_results_sum_up_over_priors(results):

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from schemas.codec import decode, encode
 from schemas.features import Pyramid, TextEmbeddings, TextRequest
 from schemas.frames import Intrinsics, Keyframe
-from schemas.topics import DETECTIONS, ENCODE, PYRAMID, TEXT
+from schemas.topics import DETECTIONS, ENCODE, PRIOR, PYRAMID, TASK, TEXT
 from services.feature_pyramid import core, service
 from services.feature_pyramid.core import Config
 from services.feature_pyramid.encoders import EncoderUnavailable, Options, load_encoder
@@ -354,7 +354,7 @@ def _frames_seeing(folder, label):
 def test_declaration():
     declared = service.SERVICE
     assert declared.name == "feature_pyramid" and declared.scope == "fleet"
-    assert declared.job is ENCODE and declared.writes == (PYRAMID, DETECTIONS)
+    assert declared.job is ENCODE and declared.writes == (PYRAMID, DETECTIONS) and declared.reads == (TASK, PRIOR)
     assert declared.key_fields(CFG) == {"space": SPACE} and declared.job_group(CFG) == SPACE
     assert TEXT.key_of(TextRequest(space=SPACE, concepts=[])) == f"psg/encoder/{SPACE}/text"
 

@@ -254,9 +254,7 @@ def test_a_renewal_in_slices_with_new_frames_between_equals_one_in_one_go():
     late = [sight(i, poses[i], [BED, OVEN]) for i in (6, 7)]
     whole, sliced = seen(frames), seen(frames)
     for tracks in (whole, sliced):
-        objects.move(tracks, {0: poses[0]})
-        objects.renew(tracks, SPACE, 2, CFG)
-        objects.move(tracks, dict(enumerate(poses[:6])))  # another correction: all over again
+        objects.move(tracks, dict(enumerate(poses[:6])))
     objects.renew(whole, SPACE, 99, CFG)
     for frame in late:
         objects.observe(whole, frame, CFG)
@@ -269,6 +267,41 @@ def test_a_renewal_in_slices_with_new_frames_between_equals_one_in_one_go():
     assert not objects.outdated(sliced, SPACE) and sliced.items.keys() == whole.items.keys() == before.keys()
     for number, track in whole.items.items():
         assert (sliced.items[number].cells == track.cells).all() and sliced.items[number].sources == track.sources
+
+
+def test_corrections_at_every_tick_do_not_keep_the_objects_as_they_were():
+    poses = walk(8)
+    tracks = seen([sight(i, pose, [BED, OVEN]) for i, pose in enumerate(poses)])
+    shift = np.eye(4)
+    for tick in range(12):
+        shift[1, 3] += 0.01
+        objects.move(tracks, {i: shift @ pose for i, pose in enumerate(poses)})
+        objects.observe(tracks, sight(100 + tick, shift @ poses[0], [BED, OVEN]), CFG)
+        objects.renew(tracks, SPACE, 8, CFG)
+    assert tracks.items[0].frames > 8 and tracks.items[1].frames > 8
+    while objects.outdated(tracks, SPACE):
+        objects.renew(tracks, SPACE, 8, CFG)
+    assert tracks.items[0].frames == tracks.items[1].frames == 8 + 12
+
+
+def test_what_is_too_old_for_the_archive_is_neither_split_nor_lost_when_poses_change():
+    cfg = objects.TrackingConfig(archive_frames=6)
+    poses = walk(8)
+    tracks = seen([sight(i, pose, [BED]) for i, pose in enumerate(poses[:4])], cfg)
+    for i in range(6):
+        objects.observe(tracks, sight(10 + i, poses[i], [OVEN]), cfg)
+    before = tracks.items[0].cells
+    assert objects._halves(tracks, tracks.items[0], before[:1], before[-1:], cfg) is None
+    objects.move(tracks, {10: poses[0]})
+    objects.renew(tracks, SPACE, 99, cfg)
+    assert sorted(tracks.items) == [0, 1] and (tracks.items[0].cells == before).all()
+
+
+def test_embeddings_of_another_width_are_refused():
+    tracks = seen([sight(0, walk()[0], [BED])])
+    other = sight(1, walk()[1], [BED])
+    wide = msgspec.structs.replace(other, embeddings=np.tile(other.embeddings, 2))
+    assert not objects.observe(tracks, wide, CFG) and len(tracks.archive) == 1
 
 
 def test_beliefs_by_hand():

@@ -22,6 +22,7 @@ from schemas.frames import Keyframe
 from schemas.objects import Detections
 from schemas.places import MapRequest, PlaceDelta, SnapshotRequest, VoxelMap
 from schemas.topics import DETECTIONS, KEYFRAME, PLACE_SNAPSHOT, PYRAMID, TEXT, VOXEL_MAP
+from services.feature_pyramid.detect import prompted
 from services.ingest.sources import Source, open_source
 from services.registry import BY_NAME
 from services.runtime.config import resolve
@@ -85,10 +86,17 @@ class Perceiver:
         self._workers: dict[Any, Any] = {}
         self._code = {name: code_digest(name, files) for name, files in CODE.items()}
 
-    def perceive(self, path: Path, features: Mapping[str, Any] | None = None) -> Perception:
-        """Places and pyramids of a sequence; `features` are settings of the feature pyramid that differ."""
+    def perceive(
+        self, path: Path, features: Mapping[str, Any] | None = None, sought: tuple[str, ...] = ()
+    ) -> Perception:
+        """Places, pyramids and detections of a sequence; `features` are settings of the feature pyramid that differ.
+
+        A prompted detector looks for what its settings name, else for `sought`, the prior's objects.
+        """
         source = open_source(path)
         cfg = self._config("feature_pyramid", features)
+        if not cfg.detector_prompts and prompted(cfg):
+            cfg = msgspec.structs.replace(cfg, detector_prompts=sought)
         seconds: dict[str, float] = {}
         snapshot, voxels = self._kept("places", path, None, lambda: self._places(source), seconds)
         features_made = self._kept("features", path, cfg, lambda: self._features(source, cfg), seconds)
@@ -168,7 +176,8 @@ class Perceiver:
 
     def _worker(self, cfg: Any) -> Any:
         """The encoder of these settings; weights are loaded when something is not on disk yet."""
-        key = (cfg.space, cfg.threads, cfg.batch_size, cfg.detector, cfg.detector_prompts)
+        detector = (cfg.detector, cfg.detector_masks, cfg.detector_threshold, cfg.segments)
+        key = (cfg.space, cfg.runtime, cfg.device, cfg.threads, cfg.batch_size, *detector)
         if key not in self._workers:
             self.report(f"loading {cfg.space}", 0, 0)
             self._workers[key] = BY_NAME["feature_pyramid"].init(cfg, Identity(ROBOT, "worker", 1))

@@ -23,7 +23,7 @@ from schemas.scene import Scene
 KEYS = (*SCORES, "seconds")
 NO_LABEL = "(none)"
 
-PerceiveOf = Callable[[Path, Mapping[str, Any]], Perception]
+PerceiveOf = Callable[[Path, Mapping[str, Any], tuple[str, ...]], Perception]  # the names a detector is to look for
 
 
 @dataclass(frozen=True)
@@ -121,11 +121,12 @@ def run(
     perceiving_s: dict[str, dict[str, float]] = {}
     for sequence in sequences:
         perceptions: dict[str, Perception] = {}
+        named = tuple(item.name for item in sequence.prior.objects)
         for done, method in enumerate(methods):
             report(f"{sequence.name}: {method.name}", done, len(methods))
             key = repr(sorted(method.features.items()))
             if key not in perceptions:
-                perceptions[key] = perceive(sequence.path, method.features)
+                perceptions[key] = perceive(sequence.path, method.features, named)
                 perceiving_s.setdefault(sequence.name, perceptions[key].seconds)
             for index, prior in enumerate(variations(sequence.prior, priors, strength)):
                 outcome, picture = judge(method, Case(perceptions[key], prior, sequence.truth, sequence.objects), index)

@@ -84,10 +84,15 @@ class Segments(Detector):
         return [Found(box_of(one.mask, self.cfg.cell_px, width_px, height_px), one.mask, one.score) for one in segments]
 
 
+def prompted(cfg: Config) -> bool:
+    """Whether the detector of a setting looks for objects by name."""
+    return cfg.detector.partition(":")[0] in PROMPTED
+
+
 def load_detector(cfg: Config) -> Detector:
     """The detector of a setting, weights loaded. Raises EncoderUnavailable."""
     kind, _, model = cfg.detector.partition(":")
-    if cfg.detector_masks != "depth" and kind not in PROMPTED:
+    if cfg.detector_masks != "depth" and not prompted(cfg):
         raise EncoderUnavailable(
             f"feature_pyramid.detector_masks cuts out the boxes of prompted detectors; {cfg.detector!r} has none."
         )
@@ -95,7 +100,7 @@ def load_detector(cfg: Config) -> Detector:
         return Segments(cfg)
     if cfg.detector == "none":
         return Detector()
-    if kind in PROMPTED and model:
+    if prompted(cfg) and model:
         from services.feature_pyramid.prompted import Prompted
 
         return Prompted(kind, model, cfg)

@@ -1,4 +1,4 @@
-"""Masks of boxes by a network of the SAM family (SAM, SAM 2, SAM-HQ, EdgeTAM), through transformers."""
+"""Masks of boxes by SAM, through transformers, which loads its successors by the same class."""
 
 from typing import Any
 

@@ -11,7 +11,7 @@ from services.feature_pyramid.detect import Detector, Found, Grid, mask_in_box, 
 from services.feature_pyramid.masks import load_masks
 
 MODELS = {"grounding_dino": "GroundingDinoForObjectDetection", "owlv2": "Owlv2ForObjectDetection"}
-AT_ONCE = 40  # names in one question to GroundingDINO, which reads 256 tokens
+MOST_TOKENS = 250  # of the names in one question to GroundingDINO, which reads 256, start and end among them
 
 
 class Prompted(Detector):
@@ -48,10 +48,9 @@ class Prompted(Detector):
 
     def boxes(self, color: np.ndarray, sought: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Every box the network proposes, pixels (n, 4), inside the image; its score (n,), and for which name (n,)."""
-        at_once = AT_ONCE if self.kind == "grounding_dino" else len(sought)
         parts = []
-        for first in range(0, len(sought), at_once):
-            boxes, scores, names = self._asked(color, sought[first : first + at_once])
+        for first, end in self._questions(sought):
+            boxes, scores, names = self._asked(color, sought[first:end])
             parts.append((boxes, scores, names + first))
         boxes, scores, names = (np.concatenate(values) for values in zip(*parts, strict=True))
         height_px, width_px = color.shape[:2]
@@ -63,13 +62,20 @@ class Prompted(Detector):
         seen = (boxes_px[:, 2:] - boxes_px[:, :2] >= 1).all(axis=1)
         return boxes_px[seen], scores[seen], names[seen]
 
+    def _questions(self, sought: tuple[str, ...]) -> list[tuple[int, int]]:
+        """First and end of the names that go into one question each: all at once, but for GroundingDINO."""
+        if self.kind != "grounding_dino":
+            return [(0, len(sought))]
+        tokens = [len(self.processor.tokenizer(as_sentences((name,)))["input_ids"]) - 2 for name in sought]
+        return batches(tokens, MOST_TOKENS)
+
     def _asked(self, color: np.ndarray, sought: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Boxes (n, 4) as middle and size, in shares of what the network sees; the score and best name of each."""
         dino = self.kind == "grounding_dino"
         text: Any = as_sentences(sought) if dino else [[f"a photo of a {name}" for name in sought]]
         padding = True if dino else "max_length"
         asked = self.processor(images=[color], text=text, padding=padding, truncation=True, return_tensors="pt")
-        with self.torch.inference_mode():
+        with pretrained.torch().inference_mode():
             outputs = self.model(**asked.to(self.device))
         logits, boxes = outputs.logits[0].float(), outputs.pred_boxes[0].float().cpu().numpy()
         scores = logits.sigmoid().cpu().numpy()
@@ -80,10 +86,6 @@ class Prompted(Detector):
             names = logits.argmax(dim=1).cpu().numpy()
         return boxes, scores.max(axis=1), names
 
-    @property
-    def torch(self) -> Any:
-        return pretrained.torch()
-
 
 def as_sentences(sought: tuple[str, ...]) -> str:
     """Names as GroundingDINO wants them: in lower case, each ending in the only full stop it has."""
@@ -93,9 +95,23 @@ def as_sentences(sought: tuple[str, ...]) -> str:
 def best_sentence(token_scores: np.ndarray, token_ids: list[int], stop: int) -> np.ndarray:
     """Which name (box,) scores best, on average over its tokens; names end with `stop`, the first follows a start mark.
 
-    `token_scores` (box, token) may have more columns than there are tokens. A name that was cut off does not count.
+    `token_scores` (box, token) may have more columns than there are tokens. A name without tokens scores nothing.
     """
     ends = [at for at, token in enumerate(token_ids) if token == stop]
     starts = [1, *(end + 1 for end in ends[:-1])]
-    means = [token_scores[:, start:end].mean(axis=1) for start, end in zip(starts, ends, strict=True)]
+    none = np.full(len(token_scores), -1.0)
+    pairs = zip(starts, ends, strict=True)
+    means = [token_scores[:, start:end].mean(axis=1) if end > start else none for start, end in pairs]
     return np.argmax(means, axis=0)
+
+
+def batches(sizes: list[int], most: int) -> list[tuple[int, int]]:
+    """First and end of runs of as many entries as together are no larger than `most`, each with one entry at least."""
+    runs: list[tuple[int, int]] = []
+    first, total = 0, 0
+    for index, size in enumerate(sizes):
+        if total + size > most and index > first:
+            runs.append((first, index))
+            first, total = index, 0
+        total += size
+    return [*runs, (first, len(sizes))]

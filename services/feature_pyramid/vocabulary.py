@@ -19,7 +19,6 @@ class Vocabulary:
 
     tasks: dict[str, Task | None] = field(default_factory=dict)  # None = asked for, no reply yet
     priors: dict[str, Prior] = field(default_factory=dict)
-    asked: set[tuple[str, str, tuple[str, ...]]] = field(default_factory=set)  # environment, task and regions
 
 
 def hear(vocabulary: Vocabulary, message: Message) -> None:
@@ -36,24 +35,19 @@ def hear(vocabulary: Vocabulary, message: Message) -> None:
             digest = message.digest()
             vocabulary.priors.pop(digest, None)
             vocabulary.priors[digest] = message
-            for old in list(vocabulary.priors)[:-REMEMBERED]:
-                del vocabulary.priors[old]
+            _forget(vocabulary)
         case PriorList():
             for prior in reversed(message.priors):
                 hear(vocabulary, prior)
 
 
 def questions(vocabulary: Vocabulary, robot: str) -> Iterator[TaskRequest | PriorRequest]:
-    """What has to be asked to know the objects for a robot, each question once."""
+    """What is to be asked to know the objects for a robot: its task once, a prior for it as long as none is known."""
     if robot not in vocabulary.tasks:
         vocabulary.tasks[robot] = None
         yield TaskRequest(robot=robot)
     task = vocabulary.tasks[robot]
-    if task is None or _prior(vocabulary, task) is not None:
-        return
-    asked = (task.environment, task.task, tuple(task.regions))
-    if asked not in vocabulary.asked:
-        vocabulary.asked.add(asked)
+    if task is not None and _prior(vocabulary, task) is None:
         yield PriorRequest(environment=task.environment, task=task.task, regions=task.regions)
 
 
@@ -62,6 +56,15 @@ def objects(vocabulary: Vocabulary, robot: str) -> tuple[str, ...]:
     task = vocabulary.tasks.get(robot)
     prior = None if task is None else _prior(vocabulary, task)
     return () if prior is None else tuple(item.name for item in prior.objects)
+
+
+def _forget(vocabulary: Vocabulary) -> None:
+    """Of too many priors, those go first that answer nobody's task, and of these the oldest."""
+    tasks = [task for task in vocabulary.tasks.values() if task is not None]
+    in_use = {digest for digest, prior in vocabulary.priors.items() if any(map(prior.answers, tasks))}
+    too_many = max(len(vocabulary.priors) - REMEMBERED, 0)
+    for old in sorted(vocabulary.priors, key=lambda digest: digest in in_use)[:too_many]:
+        del vocabulary.priors[old]
 
 
 def _prior(vocabulary: Vocabulary, task: Task) -> Prior | None:

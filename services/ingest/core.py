@@ -219,10 +219,10 @@ def backfill(state: State, wish: Backfill) -> Iterator[Written]:
     known = set(wish.frame_ids.tolist())
     oldest, newest = min(known, default=0), max(known, default=-1)
     later = [keyframe for keyframe in state.archive if oldest <= keyframe.frame_id <= newest]
-    on_the_way = set() if wish.settled else {keyframe.frame_id for keyframe in later[-ON_THE_WAY:]}
+    unwanted = known if wish.settled else known | {keyframe.frame_id for keyframe in later[-ON_THE_WAY:]}
     for keyframe in state.archive:
         wanted = wish.settled or keyframe.frame_id <= newest
-        if wanted and keyframe.frame_id not in known | on_the_way:
+        if wanted and keyframe.frame_id not in unwanted:
             yield ENCODE, msgspec.structs.replace(keyframe, space=wish.space)
 
 

@@ -5,7 +5,8 @@ So each label gets a direction in the embedding space, from the map's mean to th
 most, and a place's similarity is the text's plus its own along that direction, both scaled alike. That is done a few
 times, with the labels that follow from it: self-training of a nearest-mean classifier.
 
-It is a function of the evidence and the text, not of the labels in force: a restarted segmenter finds the same.
+It is a function of the evidence and the text, not of the labels in force: a restarted segmenter finds the same up to
+`tolerance`, below which an adaptation is left as it is.
 """
 
 from collections.abc import Callable

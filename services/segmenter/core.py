@@ -88,6 +88,7 @@ def follow_places(state: State, delta: PlaceDelta, cfg: Config) -> None:
         state.reformed.update(state.places.regions[step.removed].tolist())
         state.ledger.forget(state.places.slots[step.removed])
         state.compared += len(step.removed)
+        state.tracks.changed |= bool(step.touched.any())  # the floor, from which heights of objects count
         state.unadapted += len(step.removed) + bool(step.touched.any())  # at least one: the map is another
         state.evidence.remove(before.ids[step.removed].tolist())
         state.places = state.places.realigned(step)

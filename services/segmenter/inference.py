@@ -57,11 +57,13 @@ def votes(state: State, rows: np.ndarray, cfg: Config) -> dict[str, Vote]:
 
 
 def adapt(state: State, idle: bool, cfg: Config) -> None:
-    """What the labels look like in this map, after enough of it was seen anew or when it rests."""
+    """What the labels look like in this map, on a tick after enough of it was seen anew, or when it rests."""
     alignment, places = state.alignment, state.places
     assert alignment is not None
     state.unadapted += int(places.stale.sum())
-    seen = np.flatnonzero(state.evidence.frames[places.slots] > 0)
+    if not idle:
+        return
+    seen = np.flatnonzero(state.evidence.trust[places.slots] > 0)
     rests = idle and state.spaces.still_ticks >= RESTING_TICKS
     if not (rests and state.unadapted) and state.unadapted <= cfg.adaptation.patience * len(seen):
         return

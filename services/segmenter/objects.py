@@ -66,9 +66,9 @@ class TrackingConfig(msgspec.Struct, frozen=True, kw_only=True):
             raise ValueError("cell_m and numbers of frames and observations must be positive")
         if not (0 < self.match_overlap <= 1 and 0 <= self.match_part <= 1 and 0 < self.merge_overlap <= 1):
             raise ValueError("match_overlap, match_part and merge_overlap are shares")
-        shares = (self.label_least, self.detector_trust, self.unprompted_weight)
-        if not all(0 <= share <= 1 for share in shares):
-            raise ValueError("label_least, detector_trust and unprompted_weight lie in [0, 1]")
+        shares = (self.label_least, self.detector_trust, self.unprompted_weight, self.box_share, self.firm_share)
+        if not all(0 <= share <= 1 for share in (*shares, self.split_joint, self.part_share)):
+            raise ValueError("label_least, detector_trust, unprompted_weight and shares lie in [0, 1]")
 
 
 @dataclass
@@ -107,6 +107,7 @@ class Tracks:
     space: str = ""  # of the detections that the objects are made from
     items: dict[int, Track] = field(default_factory=dict)  # by id
     archive: dict[tuple[str, str, int], Detections] = field(default_factory=dict)  # by space, detector and frame id
+    widths: dict[str, int] = field(default_factory=dict)  # of the embeddings, by space
     next_id: int = 0
     merged: list[tuple[int, int]] = field(default_factory=list)  # (gone, into) since they were last told
     moved: bool = False  # a pose in the archive was corrected since `renewal` began
@@ -123,9 +124,11 @@ class Renewal:
 
 
 def observe(tracks: Tracks, detections: Detections, cfg: TrackingConfig) -> bool:
-    """Keep one frame's detections, and associate them if they are of the space in force; False for a repeat."""
+    """Keep one frame's detections, and associate them if they are of the space in force; False for a repeat, or for
+    embeddings of another width than the space's."""
     key = (detections.space, detections.detector, detections.frame_id)
-    if key in tracks.archive:
+    width = tracks.widths.setdefault(detections.space, detections.embeddings.shape[1])
+    if key in tracks.archive or detections.embeddings.shape[1] != width:
         return False
     tracks.archive[key] = kept = copied(detections)
     if len(tracks.archive) > cfg.archive_frames:
@@ -153,9 +156,10 @@ def outdated(tracks: Tracks, space: str) -> bool:
 def renew(tracks: Tracks, space: str, frames: int, cfg: TrackingConfig) -> None:
     """Associate stored detections of a space afresh, those of at most so many frames at a time, oldest first.
 
-    With the last of them the objects change over; ids last by the detections that objects share.
+    With the last of them the objects change over; ids last by the detections that objects share. Poses corrected
+    meanwhile begin another renewal afterwards, so that frequent corrections do not keep the objects from changing.
     """
-    if tracks.renewal is None or tracks.moved or tracks.renewal.fresh.space != space:
+    if tracks.renewal is None or tracks.renewal.fresh.space != space:
         keys = deque(key for key in tracks.archive if key[0] == space)
         tracks.renewal, tracks.moved = Renewal(Tracks(space=space, archive=tracks.archive), keys), False
     fresh, waiting = tracks.renewal.fresh, tracks.renewal.waiting
@@ -169,7 +173,8 @@ def renew(tracks: Tracks, space: str, frames: int, cfg: TrackingConfig) -> None:
 
 
 def _change_over(tracks: Tracks, fresh: Tracks) -> None:
-    """The fresh objects take the places of the former, under their ids."""
+    """The fresh objects take the places of the former, under their ids. A former one of which the archive holds nothing
+    any more stays where it was."""
     heirs = _heirs(list(tracks.items.values()), list(fresh.items.values()))
     items = {}
     for track in fresh.items.values():
@@ -180,7 +185,14 @@ def _change_over(tracks: Tracks, fresh: Tracks) -> None:
         tracks.merged += [(old, number) for old in former if old != best]
         track.id = number
         items[number] = track
+    if fresh.space == tracks.space:
+        items |= {number: track for number, track in tracks.items.items() if not _archived(tracks, track)}
     tracks.space, tracks.items, tracks.changed = fresh.space, dict(sorted(items.items())), True
+
+
+def _archived(tracks: Tracks, track: Track) -> bool:
+    """Whether any of its detections is in the archive."""
+    return any((tracks.space, detector, frame_id) in tracks.archive for detector, frame_id, _ in track.sources)
 
 
 def _heirs(before: list[Track], after: list[Track]) -> dict[int, int]:
@@ -309,7 +321,10 @@ def _halves(
     """
     tree = cKDTree(np.concatenate((unpacked(one), unpacked(other))))
     both, shown, halves = 0, [0, 0], (_blank(track), _blank(track))
-    for detections, index, cells in _views(tracks, track, cfg):
+    views = list(_views(tracks, track, cfg))
+    if len(views) < len(track.sources):  # too old for the archive: nobody can say to which part they belong
+        return None
+    for detections, index, cells in views:
         _, nearest = tree.query(unpacked(cells))
         sides = [cells[nearest < len(one)], cells[nearest >= len(one)]]
         main = int(len(sides[1]) > len(sides[0]))

@@ -43,6 +43,8 @@ class SizeConfig(msgspec.Struct, frozen=True, kw_only=True):
             raise ValueError("misfit must lie in [0, 1), skew be at least 1, weight and floor_steps at least 0")
         if not (0 < self.side_m[0] < self.side_m[1] and self.reach_m > 0 and self.bottom_spread_m > 0):
             raise ValueError("side_m must grow from above 0; reach_m and bottom_spread_m must be positive")
+        if not (self.hung_spread >= 0 and self.height_spread > 0):
+            raise ValueError("hung_spread must not be negative, and height_spread be positive")
 
 
 class Boxes(NamedTuple):
