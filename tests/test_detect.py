@@ -14,7 +14,7 @@ from schemas.objects import Detections
 from schemas.priors import ObjectPrior, PriorList, PriorRequest, TaskInForce, TaskRequest
 from services.feature_pyramid import detect, service, torchvision_parts, vocabulary
 from services.feature_pyramid.core import Config
-from services.feature_pyramid.detect import Found, Grid
+from services.feature_pyramid.detect import Found, Grid, Shot
 from services.feature_pyramid.encoders import EncoderUnavailable
 from services.feature_pyramid.masks import load_masks
 from services.feature_pyramid.prompted import as_sentences, batches, best_sentence
@@ -90,7 +90,7 @@ def worked(frame, cfg):
 
 def test_segments_are_the_furniture_and_the_picture_and_nothing_of_the_room():
     color, depth_m, shown = room()
-    found = detect.load_detector(Config()).detect(color, depth_m, CAMERA, POSE)
+    found = detect.load_detector(Config()).detect(Shot(color, depth_m, CAMERA, POSE))
     coarse = shown[2::4, 2::4]
     matched = [int(np.bincount(coarse[one.mask] + 1, minlength=4).argmax()) - 1 for one in found]
     assert sorted(matched) == [0, 1, 2]
@@ -109,7 +109,7 @@ def test_segments_do_not_depend_on_the_heading(turn):
     heading = np.eye(4)
     heading[:2, :2] = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
     detector = detect.load_detector(Config())
-    assert len(detector.detect(color, depth_m, CAMERA, heading @ POSE)) == 3
+    assert len(detector.detect(Shot(color, depth_m, CAMERA, heading @ POSE))) == 3
 
 
 def test_an_empty_room_has_no_objects():
@@ -118,7 +118,7 @@ def test_an_empty_room_has_no_objects():
     with np.errstate(divide="ignore"):
         depth_m = _slabs(rays, ROOM)[1].astype(np.float32)
     color = np.full((480, 640, 3), 190, np.uint8)
-    assert detect.load_detector(Config()).detect(color, depth_m, CAMERA, POSE) == []
+    assert detect.load_detector(Config()).detect(Shot(color, depth_m, CAMERA, POSE)) == []
 
 
 def test_lifting_by_hand():
@@ -292,10 +292,11 @@ def test_prompted_detectors_give_the_boxes_that_transformers_gives(network, tmp_
     assert names.tolist() == each[inside].argmax(axis=1).tolist() and len(set(names.tolist())) == 2
     alone = detector.boxes(color, ("bed",))
     assert set(alone[2].tolist()) == {0}
-    found = detector.detect(color, np.full((480, 640), 3.0, np.float32), CAMERA, POSE, ("stove", "bed"))
+    shot = Shot(color, np.full((480, 640), 3.0, np.float32), CAMERA, POSE)
+    found = detector.detect(shot, ("stove", "bed"))
     assert found and all(one.mask.any() for one in found)
     assert [one.score for one in found] == sorted((one.score for one in found), reverse=True)
-    assert detector.detect(color, np.full((480, 640), 3.0, np.float32), CAMERA, POSE) == []
+    assert detector.detect(shot) == []
 
 
 def test_names_of_several_tokens_by_hand():
@@ -359,7 +360,7 @@ class Named(detect.Detector):
 
     name, prompted = "named", True
 
-    def detect(self, color, depth_m, camera, world_from_camera, sought=()):
+    def detect(self, shot, sought=()):
         if not sought:
             return []
         mask = np.zeros((120, 160), bool)

@@ -42,24 +42,23 @@ class Found(msgspec.Struct, frozen=True, eq=False):
     name: int = 0  # index among the names that were sought; means nothing where none were
 
 
+class Shot(msgspec.Struct, frozen=True, eq=False):
+    """One posed image with depth."""
+
+    color: np.ndarray  # uint8 (h, w, 3) RGB
+    depth_m: np.ndarray  # (h, w), 0 = no measurement
+    camera: Intrinsics
+    world_from_camera: np.ndarray  # (4, 4), world z is up
+
+
 class Detector:
     """Finds objects in a colour image with depth. Subclasses say how; this one finds none."""
 
     name = "none"
     prompted = False  # whether it looks for objects by name; without names it finds none then
 
-    def detect(
-        self,
-        color: np.ndarray,
-        depth_m: np.ndarray,
-        camera: Intrinsics,
-        world_from_camera: np.ndarray,
-        sought: tuple[str, ...] = (),
-    ) -> list[Found]:
-        """Objects of one image: `color` uint8 (h, w, 3) RGB, `depth_m` (h, w), 0 = no measurement; world z is up.
-
-        `sought` are the names of what a prompted detector looks for.
-        """
+    def detect(self, shot: Shot, sought: tuple[str, ...] = ()) -> list[Found]:
+        """Objects of one image; `sought` are the names of what a prompted detector looks for."""
         return []
 
 
@@ -71,16 +70,9 @@ class Segments(Detector):
     def __init__(self, cfg: Config) -> None:
         self.cfg = cfg.segments
 
-    def detect(
-        self,
-        color: np.ndarray,
-        depth_m: np.ndarray,
-        camera: Intrinsics,
-        world_from_camera: np.ndarray,
-        sought: tuple[str, ...] = (),
-    ) -> list[Found]:
-        segments = find_segments(color, depth_m, camera, world_from_camera[:3, :3], self.cfg)
-        height_px, width_px = depth_m.shape
+    def detect(self, shot: Shot, sought: tuple[str, ...] = ()) -> list[Found]:
+        segments = find_segments(shot.color, shot.depth_m, shot.camera, shot.world_from_camera[:3, :3], self.cfg)
+        height_px, width_px = shot.depth_m.shape
         return [Found(box_of(one.mask, self.cfg.cell_px, width_px, height_px), one.mask, one.score) for one in segments]
 
 

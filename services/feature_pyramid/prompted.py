@@ -4,10 +4,9 @@ from typing import Any
 
 import numpy as np
 
-from schemas.frames import Intrinsics
 from services.feature_pyramid import pretrained
 from services.feature_pyramid.core import Config
-from services.feature_pyramid.detect import Detector, Found, Grid, mask_in_box, without_doubles
+from services.feature_pyramid.detect import Detector, Found, Grid, Shot, mask_in_box, without_doubles
 from services.feature_pyramid.masks import load_masks
 
 MODELS = {"grounding_dino": "GroundingDinoForObjectDetection", "owlv2": "Owlv2ForObjectDetection"}
@@ -25,24 +24,17 @@ class Prompted(Detector):
         self.processor, self.model, self.device = pretrained.load(what, MODELS[kind], model, cfg.device)
         self.masks = load_masks(cfg)
 
-    def detect(
-        self,
-        color: np.ndarray,
-        depth_m: np.ndarray,
-        camera: Intrinsics,
-        world_from_camera: np.ndarray,
-        sought: tuple[str, ...] = (),
-    ) -> list[Found]:
+    def detect(self, shot: Shot, sought: tuple[str, ...] = ()) -> list[Found]:
         if not sought:
             return []
-        boxes_px, scores, names = self.boxes(color, sought)
+        boxes_px, scores, names = self.boxes(shot.color, sought)
         keep = np.flatnonzero(scores >= self.cfg.detector_threshold)
         keep = keep[without_doubles(boxes_px[keep], scores[keep])][: self.cfg.segments.most]
-        grid = Grid.of(depth_m, self.cfg.segments.cell_px)
+        grid = Grid.of(shot.depth_m, self.cfg.segments.cell_px)
         if self.masks is None:
-            masks = [mask_in_box(box_px, grid, camera) for box_px in boxes_px[keep]]
+            masks = [mask_in_box(box_px, grid, shot.camera) for box_px in boxes_px[keep]]
         else:
-            masks = self.masks.of(color, boxes_px[keep], grid)
+            masks = self.masks.of(shot.color, boxes_px[keep], grid)
         found = [Found(boxes_px[i], mask, float(scores[i]), int(names[i])) for i, mask in zip(keep, masks, strict=True)]
         return [one for one in found if one.mask.any()]
 

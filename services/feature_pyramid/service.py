@@ -16,7 +16,7 @@ from schemas.priors import PriorRequest, TaskRequest
 from schemas.topics import DETECTIONS, ENCODE, PRIOR, PRIORS, PYRAMID, TASK, TASK_IN_FORCE, TEXT
 from services.feature_pyramid import vocabulary
 from services.feature_pyramid.core import Config, Selection, coarse_surface, select_crops
-from services.feature_pyramid.detect import Detector, Found, lift, load_detector, object_crops
+from services.feature_pyramid.detect import Detector, Found, Shot, lift, load_detector, object_crops
 from services.feature_pyramid.encoders import Encoder, Options, load_encoder, space_of
 from services.feature_pyramid.vocabulary import Vocabulary
 from services.runtime.service import Ask, Identity, Output, Service
@@ -109,7 +109,7 @@ def view(frame: Keyframe, detector: Detector, sought: tuple[str, ...], cfg: Conf
         broken = True
     camera = frame.intrinsics
     selection = select_crops(depth_m, camera, cfg)
-    found = [] if broken else detector.detect(color, depth_m, camera, frame.world_from_camera, sought)
+    found = [] if broken else detector.detect(Shot(color, depth_m, camera, frame.world_from_camera), sought)
     found, points_camera_m = lift(found, depth_m, camera, cfg)
     crops = selection.crops.cut(color) + object_crops(found, camera.width_px, camera.height_px).cut(color)
     return View(selection, sought, found, points_camera_m, crops, coarse_surface(depth_m, cfg.surface_cell_px), broken)
