@@ -20,7 +20,7 @@ test-llm: $(VENV)/installed-dev $(LLM)/installed
 	$(LLM)/bin/python -m llama_cpp.server --model $(LLM)/model.gguf --host 127.0.0.1 --port $(LLM_PORT) \
 		--n_ctx 4096 --n_threads 1 >$(LLM)/server.log 2>&1 & \
 	trap "kill $$!" EXIT; PSG_TEST_LLM_URL=http://127.0.0.1:$(LLM_PORT)/v1 \
-		$(BIN)/python -m pytest -v -s tests/test_prior_gateway_llm.py
+		$(BIN)/python -m pytest -v -s tests/services/prior_gateway/test_llm.py
 
 check: $(VENV)/installed-dev
 	$(BIN)/ruff check .

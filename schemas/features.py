@@ -4,8 +4,8 @@ from typing import Annotated
 
 import numpy as np
 
-from schemas.codec import Message, Shape
-from schemas.frames import Intrinsics, Pose, check_pose
+from prior_sg.schemas.codec import Message, Shape
+from prior_sg.schemas.frames import Intrinsics, Pose, check_pose
 
 
 class Pyramid(Message, frozen=True, kw_only=True):

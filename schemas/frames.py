@@ -9,7 +9,7 @@ from typing import Annotated
 import msgspec
 import numpy as np
 
-from schemas.codec import Message, Shape
+from prior_sg.schemas.codec import Message, Shape
 
 Pose = Annotated[np.ndarray, Shape("float64", 4, 4)]
 ROTATION_TOLERANCE = 1e-3

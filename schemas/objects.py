@@ -5,8 +5,8 @@ from typing import Annotated
 import msgspec
 import numpy as np
 
-from schemas.codec import Message, Shape
-from schemas.frames import Intrinsics, Pose, check_pose
+from prior_sg.schemas.codec import Message, Shape
+from prior_sg.schemas.frames import Intrinsics, Pose, check_pose
 
 _NO_NAMES = msgspec.field(default_factory=lambda: np.zeros(0, np.int16))
 _NO_MERGES = msgspec.field(default_factory=lambda: np.zeros((0, 2), np.int64))

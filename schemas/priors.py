@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import msgspec
 import numpy as np
 
-from schemas.codec import Message, Shape, encode
+from prior_sg.schemas.codec import Message, Shape, encode
 
 SUM_TOLERANCE = 1e-3
 # No prior that somebody means is larger; a message beyond is refused wherever it arrives.

@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 import msgspec
 import numpy as np
 
-from schemas.codec import Message, Shape
+from prior_sg.schemas.codec import Message, Shape
 
 _NO_IDS = msgspec.field(default_factory=lambda: np.zeros(0, np.int64))
 

@@ -5,9 +5,9 @@ from typing import Annotated
 import msgspec
 import numpy as np
 
-from schemas.codec import Message, Shape
-from schemas.objects import SceneObject
-from schemas.regions import Region
+from prior_sg.schemas.codec import Message, Shape
+from prior_sg.schemas.objects import SceneObject
+from prior_sg.schemas.regions import Region
 
 _NO_IDS = msgspec.field(default_factory=lambda: np.zeros(0, np.int64))
 _NO_LENGTHS = msgspec.field(default_factory=lambda: np.zeros(0, np.float32))

@@ -2,7 +2,7 @@
 
 import msgspec
 
-from schemas.codec import Message
+from prior_sg.schemas.codec import Message
 
 
 class Consumed(Message, frozen=True, kw_only=True):

@@ -11,12 +11,12 @@ Delivery is one word:
 from dataclasses import dataclass
 from typing import Literal
 
-from schemas.codec import Message
-from schemas.features import Backfill, Pyramid, TextEmbeddings, TextRequest
-from schemas.frames import ArchiveReply, ArchiveRequest, CameraState, IngestState, Keyframe, PoseUpdate
-from schemas.objects import Detections, ObjectDelta
-from schemas.places import MapRequest, PlaceDelta, SnapshotRequest, VoxelMap
-from schemas.priors import (
+from prior_sg.schemas.codec import Message
+from prior_sg.schemas.features import Backfill, Pyramid, TextEmbeddings, TextRequest
+from prior_sg.schemas.frames import ArchiveReply, ArchiveRequest, CameraState, IngestState, Keyframe, PoseUpdate
+from prior_sg.schemas.objects import Detections, ObjectDelta
+from prior_sg.schemas.places import MapRequest, PlaceDelta, SnapshotRequest, VoxelMap
+from prior_sg.schemas.priors import (
     Prior,
     PriorClaim,
     PriorEvidence,
@@ -27,9 +27,9 @@ from schemas.priors import (
     TaskInForce,
     TaskRequest,
 )
-from schemas.regions import PosteriorReply, PosteriorRequest, RegionDelta
-from schemas.scene import Scene, SceneRequest, SceneRevision
-from schemas.status import Consumed, ServiceStatus, StatusRequest
+from prior_sg.schemas.regions import PosteriorReply, PosteriorRequest, RegionDelta
+from prior_sg.schemas.scene import Scene, SceneRequest, SceneRevision
+from prior_sg.schemas.status import Consumed, ServiceStatus, StatusRequest
 
 ROOT = "psg"
 Delivery = Literal["latest", "every", "job"]

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from schemas.frames import Intrinsics
+from prior_sg.schemas.frames import Intrinsics
 
 
 def pose_from_quaternion(position_m: np.ndarray, quaternion_xyzw: np.ndarray) -> np.ndarray:

@@ -1,13 +1,13 @@
 """The only list of services."""
 
-from schemas.topics import POSE_UPDATE, PRIOR_REVISION, TASK, Topic
-from services.feature_pyramid.service import SERVICE as FEATURE_PYRAMID
-from services.ingest.service import SERVICE as INGEST
-from services.place_graph.service import SERVICE as PLACE_GRAPH
-from services.prior_gateway.service import SERVICE as PRIOR_GATEWAY
-from services.runtime.service import Service
-from services.scene_store.service import SERVICE as SCENE_STORE
-from services.segmenter.service import SERVICE as SEGMENTER
+from prior_sg.schemas.topics import POSE_UPDATE, PRIOR_REVISION, TASK, Topic
+from prior_sg.services.feature_pyramid.service import SERVICE as FEATURE_PYRAMID
+from prior_sg.services.ingest.service import SERVICE as INGEST
+from prior_sg.services.place_graph.service import SERVICE as PLACE_GRAPH
+from prior_sg.services.prior_gateway.service import SERVICE as PRIOR_GATEWAY
+from prior_sg.services.runtime.service import Service
+from prior_sg.services.scene_store.service import SERVICE as SCENE_STORE
+from prior_sg.services.segmenter.service import SERVICE as SEGMENTER
 
 SERVICES: tuple[Service, ...] = (INGEST, PLACE_GRAPH, FEATURE_PYRAMID, PRIOR_GATEWAY, SEGMENTER, SCENE_STORE)
 

@@ -1,5 +1,4 @@
 import os
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -7,7 +6,6 @@ import pytest
 os.environ.setdefault("HF_HUB_OFFLINE", "1")
 os.environ.setdefault("OMP_NUM_THREADS", "2")
 os.environ["PSG_PRIOR_GATEWAY__ARCHIVE"] = ""  # tests neither see nor touch the user's kept priors
-SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 
 @pytest.fixture
@@ -18,7 +16,7 @@ def rng():
 @pytest.fixture(scope="session")
 def endpoint():
     """A router of this test session, on loopback."""
-    from services.runtime.zenoh_bus import free_endpoint, open_router
+    from prior_sg.services.runtime.zenoh_bus import free_endpoint, open_router
 
     address = free_endpoint("tcp/127.0.0.1:0")
     stop = open_router(address)

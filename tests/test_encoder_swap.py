@@ -4,15 +4,15 @@ import signal
 import time
 
 import pytest
-from segmenter_world import Reader
-from test_pipeline import shortened
 
-from deploy.client import Client
-from deploy.supervisor import Supervisor
-from schemas.codec import decode
-from schemas.priors import Task
-from schemas.topics import INGEST_STATE, PYRAMID, REGION_DELTA, TASK
-from services.runtime.zenoh_bus import ZenohBus
+from prior_sg.deploy.running.supervisor import Supervisor
+from prior_sg.schemas.codec import decode
+from prior_sg.schemas.priors import Task
+from prior_sg.schemas.topics import INGEST_STATE, PYRAMID, REGION_DELTA, TASK
+from prior_sg.services.runtime.client import Client
+from prior_sg.services.runtime.zenoh_bus import ZenohBus
+from tests.help.world import Reader
+from tests.test_pipeline import shortened
 
 OLD, NEW = (f"conse/efficientnet-lite{size}/minilm-l6-v2" for size in (0, 1))
 FRAMES = 10

@@ -16,13 +16,12 @@ import spark_dsg
 import zenoh
 from rich.console import Console
 
-from deploy import report
-from deploy.cli import SAMPLE, main
-from deploy.client import Client
-from deploy.replay import compare, open_log
-from deploy.run import Job, run
-from schemas.codec import DecodeError, decode
-from schemas.topics import (
+from prior_sg.deploy.cli import report
+from prior_sg.deploy.cli.main import SAMPLE, main
+from prior_sg.deploy.inspecting.replay import compare, open_log
+from prior_sg.deploy.running.job import Job, run
+from prior_sg.schemas.codec import DecodeError, decode
+from prior_sg.schemas.topics import (
     BACKFILL,
     ENCODE,
     JOURNAL,
@@ -36,9 +35,10 @@ from schemas.topics import (
     TOPICS,
     worker_keys,
 )
-from services.runtime.jobs import CREDITS
-from services.runtime.record import LogWriter, read_log, summary
-from services.runtime.zenoh_bus import ZenohBus
+from prior_sg.services.runtime.client import Client
+from prior_sg.services.runtime.jobs.dispatcher import CREDITS
+from prior_sg.services.runtime.record import LogWriter, read_log, summary
+from prior_sg.services.runtime.zenoh_bus import ZenohBus
 
 FRAMES = 26
 # Recorded, but sent only when there is something to correct, missing, to agree on with other gateways or to learn.
@@ -112,7 +112,7 @@ class Trouble(threading.Thread):
                 client.bus.call(worker_keys(ENCODE, worker)[0], payload, 5.0, lambda answer: None)
 
     def command(self, *arguments):
-        command = [sys.executable, "-m", "deploy.cli", *arguments, "--connect", self.endpoint]
+        command = [sys.executable, "-m", "prior_sg.deploy.cli.main", *arguments, "--connect", self.endpoint]
         done = subprocess.run(command, capture_output=True, text=True, timeout=90, check=False)
         assert done.returncode == 0, done.stderr
         return done.stdout
@@ -220,9 +220,9 @@ def test_replay_notices_a_difference(disturbed, tmp_path):
     """The comparison itself can fail: a log in which one published radius was altered."""
     import msgspec
 
-    from schemas.codec import encode
-    from schemas.places import PlaceDelta
-    from schemas.topics import PLACE_DELTA
+    from prior_sg.schemas.codec import encode
+    from prior_sg.schemas.places import PlaceDelta
+    from prior_sg.schemas.topics import PLACE_DELTA
 
     altered = tmp_path / "altered.mcap"
     done = False
@@ -330,7 +330,17 @@ def test_errors_are_one_sentence(arguments, sentence, capsys):
 
 
 def test_an_unknown_environment_ends_the_run_with_the_reason(tmp_path):
-    command = [sys.executable, "-m", "deploy.cli", "run", str(SAMPLE), "--environment", "submarine", "--task", "dive"]
+    command = [
+        sys.executable,
+        "-m",
+        "prior_sg.deploy.cli.main",
+        "run",
+        str(SAMPLE),
+        "--environment",
+        "submarine",
+        "--task",
+        "dive",
+    ]
     command += ["--out", str(tmp_path / "out"), "--connect", "tcp/127.0.0.1:0"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 1 and "Traceback" not in done.stderr
@@ -341,7 +351,7 @@ def test_ctrl_c_leaves_results_and_no_processes(tmp_path):
     command = [
         sys.executable,
         "-m",
-        "deploy.cli",
+        "prior_sg.deploy.cli.main",
         "demo",
         "--out",
         str(tmp_path / "out"),

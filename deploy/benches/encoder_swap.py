@@ -9,18 +9,18 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from deploy.client import Client
-from deploy.supervisor import Supervisor
-from schemas.codec import decode
-from schemas.features import Pyramid
-from schemas.frames import IngestState, Keyframe
-from schemas.places import PlaceDelta
-from schemas.priors import Task
-from schemas.regions import RegionDelta
-from schemas.topics import INGEST_STATE, KEYFRAME, PLACE_DELTA, PYRAMID, REGION_DELTA
-from services.registry import SERVICES
-from services.runtime.bus import Sample
-from services.runtime.zenoh_bus import ZenohBus, free_endpoint, open_router
+from prior_sg.deploy.running.supervisor import Supervisor
+from prior_sg.schemas.codec import decode
+from prior_sg.schemas.features import Pyramid
+from prior_sg.schemas.frames import IngestState, Keyframe
+from prior_sg.schemas.places import PlaceDelta
+from prior_sg.schemas.priors import Task
+from prior_sg.schemas.regions import RegionDelta
+from prior_sg.schemas.topics import INGEST_STATE, KEYFRAME, PLACE_DELTA, PYRAMID, REGION_DELTA
+from prior_sg.services.registry import SERVICES
+from prior_sg.services.runtime.bus import Sample
+from prior_sg.services.runtime.client import Client
+from prior_sg.services.runtime.zenoh_bus import ZenohBus, free_endpoint, open_router
 
 ROBOT = "bench"
 OLD, NEW = (f"conse/efficientnet-lite{size}/minilm-l6-v2" for size in (2, 1))

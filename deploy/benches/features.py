@@ -18,20 +18,20 @@ from typing import Any, cast
 import msgspec
 import numpy as np
 
-from deploy.benches.graphics import on_card
-from deploy.supervisor import Supervisor
-from schemas.codec import decode, encode
-from schemas.features import Pyramid
-from schemas.frames import Keyframe
-from schemas.topics import ENCODE, PYRAMID
-from services.feature_pyramid import core
-from services.feature_pyramid.conse import classifier_file, resized
-from services.feature_pyramid.encoders import Options, load_encoder
-from services.feature_pyramid.onnx_files import Session
-from services.feature_pyramid.service import read_color, read_depth
-from services.runtime.bus import Sample
-from services.runtime.jobs import Ended, JobPool
-from services.runtime.zenoh_bus import ZenohBus, free_endpoint, open_router
+from prior_sg.deploy.benches.graphics import on_card
+from prior_sg.deploy.running.supervisor import Supervisor
+from prior_sg.schemas.codec import decode, encode
+from prior_sg.schemas.features import Pyramid
+from prior_sg.schemas.frames import Keyframe
+from prior_sg.schemas.topics import ENCODE, PYRAMID
+from prior_sg.services.feature_pyramid.core import crops as core
+from prior_sg.services.feature_pyramid.encoders.base import Options, load_encoder
+from prior_sg.services.feature_pyramid.encoders.conse import classifier_file, resized
+from prior_sg.services.feature_pyramid.encoders.onnx_session import Session
+from prior_sg.services.feature_pyramid.service import read_color, read_depth
+from prior_sg.services.runtime.bus import Sample
+from prior_sg.services.runtime.jobs.dispatcher import Ended, JobPool
+from prior_sg.services.runtime.zenoh_bus import ZenohBus, free_endpoint, open_router
 
 BATCHES = (1, 4, 16)
 ROUNDS = 3
@@ -242,7 +242,9 @@ def _send(pid: int, number: signal.Signals) -> None:
 def attacked(keyframes: list[Keyframe], seconds: float, rate_hz: float) -> tuple[dict, dict]:
     """A stream as fast as the pool takes it, while workers are killed, frozen, slowed and added at random."""
     seed = 5
-    logging.getLogger("services.runtime.jobs").setLevel(logging.ERROR)  # what it reports is what is counted here
+    logging.getLogger("prior_sg.services.runtime.jobs.dispatcher").setLevel(
+        logging.ERROR
+    )  # what it reports is what is counted here
     settings = [f"feature_pyramid.space={SMALL}", "feature_pyramid.layers=1", "feature_pyramid.smallest_crop_px=480"]
     with pool(3, settings) as running:
         frames, started_s = numbered(keyframes), time.monotonic()

@@ -9,7 +9,7 @@ rooms not observed.
 import numpy as np
 from scipy.spatial import cKDTree
 
-from services.segmenter.field import Field
+from prior_sg.services.segmenter.core.energy.mrf import Field
 
 LABELS = 12
 ROOM_M = 4.0

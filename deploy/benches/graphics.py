@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from services.feature_pyramid.open_clip_family import Towers, library
+from prior_sg.services.feature_pyramid.encoders.open_clip import Towers, library
 
 MODELS = ("ViT-H-14", "ViT-L-14")
 SIDES_PX = (224, 352, 480)  # of the crops of a 640 x 480 pyramid

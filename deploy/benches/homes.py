@@ -10,11 +10,11 @@ from dataclasses import dataclass
 import msgspec
 import numpy as np
 
-from schemas.features import Pyramid, TextEmbeddings, TextRequest
-from schemas.frames import Intrinsics
-from schemas.places import PlaceDelta
-from schemas.priors import Prior
-from services.segmenter.experts.context import ObjectView
+from prior_sg.schemas.features import Pyramid, TextEmbeddings, TextRequest
+from prior_sg.schemas.frames import Intrinsics
+from prior_sg.schemas.places import PlaceDelta
+from prior_sg.schemas.priors import Prior
+from prior_sg.services.segmenter.core.experts.context import ObjectView
 
 ROBOT = "bench"
 WIDTH = 3  # rooms

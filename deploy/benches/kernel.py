@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from deploy.supervisor import THREAD_VARIABLES
-from schemas.frames import Intrinsics
-from services.segmenter import descriptors
+from prior_sg.deploy.running.supervisor import THREAD_VARIABLES
+from prior_sg.schemas.frames import Intrinsics
+from prior_sg.services.segmenter.core.evidence import kernel as descriptors
 
 PLACES, CROPS, DIM = 2_000, 60, 1024
 QUERY_RADIUS_M = 0.75
@@ -41,7 +41,7 @@ def observation(rng: np.random.Generator) -> tuple[descriptors.Frame, np.ndarray
 def kernel() -> tuple[dict, dict]:
     """The measurement in a process of its own, with one numeric thread as the segmenter has it."""
     threads = dict.fromkeys(THREAD_VARIABLES, "1")
-    command = [sys.executable, "-m", "deploy.benches.kernel"]
+    command = [sys.executable, "-m", "prior_sg.deploy.benches.kernel"]
     done = subprocess.run(command, env=os.environ | threads, capture_output=True, text=True, check=True)
     metrics, settings = json.loads(done.stdout)
     return metrics, settings

@@ -11,17 +11,18 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from deploy.benches import homes
-from deploy.benches.homes import ROBOT, WIDTH, Home, Sight
-from deploy.evaluation.metrics import Overlap, scores_of
-from schemas.features import TextRequest
-from schemas.priors import Prior, PriorEvidence, Task
-from schemas.status import Tick
-from services.prior_gateway import core as gateway
-from services.prior_gateway import learning, library
-from services.segmenter import core, inference, observed
-from services.segmenter.regions import components
-from services.segmenter.state import Config, State, empty
+from prior_sg.deploy.benches import homes
+from prior_sg.deploy.benches.homes import ROBOT, WIDTH, Home, Sight
+from prior_sg.deploy.evaluation.metrics import Overlap, scores_of
+from prior_sg.schemas.features import TextRequest
+from prior_sg.schemas.priors import Prior, PriorEvidence, Task
+from prior_sg.schemas.status import Tick
+from prior_sg.services.prior_gateway.core import compose as gateway
+from prior_sg.services.prior_gateway.core import learning
+from prior_sg.services.prior_gateway.outside import library
+from prior_sg.services.segmenter.core import inference, prior_evidence, update
+from prior_sg.services.segmenter.core.regions.components import components
+from prior_sg.services.segmenter.core.state import Config, State, empty
 
 REGIONS = [
     *("kitchen", "dining room", "living room", "bedroom", "bathroom", "hallway"),
@@ -114,7 +115,7 @@ class World:
         for home in self.explored:
             state = explore(home)
             label(state, home, priors[-1])
-            counted = observed.evidence(state, CFG)
+            counted = prior_evidence.evidence(state, CFG)
             seen += [] if counted is None else [counted]
             totals = learning.totals(self.prior, seen)
             priors.append(learning.revised(self.prior, totals, strength, self.prior.provenance))
@@ -146,7 +147,7 @@ def explore(home: Home) -> State:
     """A segmenter that has seen all of a home, before any prior."""
     state = empty(CFG, ROBOT, 1)
     for message in (home.places, *home.pyramids):
-        list(core.update(state, message, CFG))
+        list(update.update(state, message, CFG))
     return state
 
 
@@ -154,12 +155,12 @@ def label(state: State, home: Home, prior: Prior) -> None:
     """Put a prior in force and let the segmenter come to rest."""
     task = Task(robot=ROBOT, stamp_ns=1, environment=prior.environment, task=prior.task, regions=prior.vocabulary)
     for message in (task, prior):
-        for output in list(core.update(state, message, CFG)):
+        for output in list(update.update(state, message, CFG)):
             if isinstance(output, TextRequest):
-                list(core.update(state, homes.text(output, prior), CFG))
+                list(update.update(state, homes.text(output, prior), CFG))
     assert state.alignment is not None and state.alignment.digest == prior.digest()
     inference.see_objects(state, home.objects, CFG)
-    list(core.update(state, Tick(stamp_ns=1), CFG))
+    list(update.update(state, Tick(stamp_ns=1), CFG))
 
 
 def f1_s(truth: np.ndarray, state: State) -> float:

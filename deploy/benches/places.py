@@ -10,9 +10,9 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from schemas.frames import Keyframe
-from services.registry import BY_NAME
-from services.runtime.service import Identity
+from prior_sg.schemas.frames import Keyframe
+from prior_sg.services.registry import BY_NAME
+from prior_sg.services.runtime.service import Identity
 
 PLACE_STAGES = {  # functions of the place graph whose time makes a stage
     "decode": ("images.depth_of",),

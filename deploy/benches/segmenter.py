@@ -6,13 +6,13 @@ from typing import Any
 
 import numpy as np
 
-from schemas.features import Pyramid, TextEmbeddings, TextRequest
-from schemas.frames import Intrinsics
-from schemas.places import PlaceDelta
-from schemas.priors import ObjectPrior, Prior, Provenance, RegionPrior, Task
-from schemas.status import Tick
-from services.registry import BY_NAME
-from services.runtime.service import Ask, Identity
+from prior_sg.schemas.features import Pyramid, TextEmbeddings, TextRequest
+from prior_sg.schemas.frames import Intrinsics
+from prior_sg.schemas.places import PlaceDelta
+from prior_sg.schemas.priors import ObjectPrior, Prior, Provenance, RegionPrior, Task
+from prior_sg.schemas.status import Tick
+from prior_sg.services.registry import BY_NAME
+from prior_sg.services.runtime.service import Ask, Identity
 
 ROBOT, LABELS, DIM = "bench", 12, 384
 STEP_M, ROOM_STEPS = 0.7, 8  # places stand this far apart; a room is a square of so many

@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from deploy.benches.fields import LABELS, place_field
-from services.segmenter import swap
-from services.segmenter.arcs import Arcs, arcs_of
-from services.segmenter.bound import lower_bound
-from services.segmenter.field import Field
-from services.segmenter.incremental import Solver
+from prior_sg.deploy.benches.fields import LABELS, place_field
+from prior_sg.services.segmenter.core.energy import swap
+from prior_sg.services.segmenter.core.energy.bound import lower_bound
+from prior_sg.services.segmenter.core.energy.mrf import Field
+from prior_sg.services.segmenter.core.energy.solver import Solver
+from prior_sg.services.segmenter.core.map.arcs import Arcs, arcs_of
 
 SIZES = (500, 2_000, 10_000, 50_000)
 MAIN_SIZE = 10_000  # the one whose figures carry no suffix

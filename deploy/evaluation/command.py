@@ -14,9 +14,9 @@ from rich.console import Console
 from rich.table import Table
 
 if TYPE_CHECKING:
-    from deploy.evaluation.methods import Method
-    from deploy.evaluation.perception import Layers, Report
-    from deploy.evaluation.runner import Dataset, Results
+    from prior_sg.deploy.evaluation.methods import Method
+    from prior_sg.deploy.evaluation.perception import Layers, Report
+    from prior_sg.deploy.evaluation.runner import Dataset, Results
 
 DEFAULT_TASK = "real-estate listing"
 TABLE_COLUMNS = 100  # narrower terminals wrap lines, which is better than cells cut short
@@ -67,8 +67,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace, console: Console) -> int:
     """Evaluate, print, and write eval.json (and report.html) to the output folder. Raises EvaluationError."""
-    from deploy.evaluation import runner
-    from deploy.evaluation.perception import Cache, EvaluationError, Perceiver
+    from prior_sg.deploy.evaluation import runner
+    from prior_sg.deploy.evaluation.perception import Cache, EvaluationError, Perceiver
 
     if arguments.priors < 1 or arguments.strength < 0:
         raise EvaluationError("--priors must be at least 1 and --strength at least 0")
@@ -95,8 +95,8 @@ def run(arguments: argparse.Namespace, console: Console) -> int:
 
 def settings_layers(config: str, settings: list[str]) -> "Layers":
     """Settings of all services: file, environment, command line. Raises ConfigError."""
-    from services.registry import BY_NAME
-    from services.runtime.config import check_sections, from_arguments, from_environment, merge, read_file
+    from prior_sg.services.registry import BY_NAME
+    from prior_sg.services.runtime.config import check_sections, from_arguments, from_environment, merge, read_file
 
     file, given = read_file(config), from_arguments(settings)
     check_sections(file, list(BY_NAME))
@@ -106,9 +106,9 @@ def settings_layers(config: str, settings: list[str]) -> "Layers":
 
 def chosen_methods(arguments: argparse.Namespace, layers: "Layers") -> "list[Method]":
     """In the order of the tables. Raises EvaluationError for a name that does not exist."""
-    from deploy.evaluation import methods
-    from services.registry import BY_NAME
-    from services.runtime.config import resolve
+    from prior_sg.deploy.evaluation import methods
+    from prior_sg.services.registry import BY_NAME
+    from prior_sg.services.runtime.config import resolve
 
     config: Any = resolve(BY_NAME["segmenter"].config, "segmenter", layers)
     chosen = []
@@ -124,10 +124,10 @@ def chosen_methods(arguments: argparse.Namespace, layers: "Layers") -> "list[Met
 
 def chosen_datasets(paths: Sequence[Path], environments: Sequence[str], task: str) -> "list[Dataset]":
     """Datasets with truth and prior; the vocabulary is the ground truth's. Raises EvaluationError or SourceError."""
-    from deploy.evaluation.oracles import read_objects
-    from deploy.evaluation.perception import EvaluationError, ground_truth, sequence_name
-    from deploy.evaluation.priors import library_prior
-    from deploy.evaluation.runner import Dataset
+    from prior_sg.deploy.evaluation.oracles import read_objects
+    from prior_sg.deploy.evaluation.perception import EvaluationError, ground_truth, sequence_name
+    from prior_sg.deploy.evaluation.priors import library_prior
+    from prior_sg.deploy.evaluation.runner import Dataset
 
     named = dict(text.split("=", 1) for text in environments if "=" in text)
     general = [text for text in environments if "=" not in text]
@@ -165,7 +165,7 @@ def print_tables(results: "Results", console: Console) -> None:
 
 def _objects(results: "Results", method: str, sequence: str) -> str:
     """The scores of the objects in one line; shares in percent, counts as means over the priors."""
-    from deploy.evaluation.object_metrics import OBJECT_COUNTS, OBJECT_SHARES
+    from prior_sg.deploy.evaluation.object_metrics import OBJECT_COUNTS, OBJECT_SHARES
 
     said = [f"{key.removeprefix('objects_')} {results.mean(method, key, sequence):.4g}" for key in OBJECT_COUNTS]
     for key in OBJECT_SHARES:
@@ -186,7 +186,7 @@ def progress(console: Console) -> "Iterator[Report]":
 
 
 def _write_page(results: "Results", arguments: argparse.Namespace) -> None:
-    from deploy.evaluation.page import page
+    from prior_sg.deploy.evaluation.page import page
 
     settings = {
         "datasets": ", ".join(dataset.name for dataset in results.sequences),
@@ -211,7 +211,7 @@ def _names(text: str) -> list[str]:
 
 
 def _known(text: str, kinds: Sequence[str], option: str) -> list[str]:
-    from deploy.evaluation.perception import EvaluationError
+    from prior_sg.deploy.evaluation.perception import EvaluationError
 
     unknown = [name for name in _names(text) if name not in kinds]
     if unknown:

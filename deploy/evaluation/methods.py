@@ -13,28 +13,28 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from deploy.evaluation import oracles, priors
-from deploy.evaluation.metrics import GroundTruth
-from deploy.evaluation.perception import ROBOT, EvaluationError, Perception
-from schemas.codec import Message
-from schemas.features import Pyramid, TextEmbeddings, TextRequest
-from schemas.objects import Detections, ObjectDelta
-from schemas.places import PlaceDelta
-from schemas.priors import Prior, Task
-from schemas.regions import RegionDelta
-from schemas.scene import Scene
-from schemas.status import Tick
-from services.registry import BY_NAME
-from services.runtime.service import Ask, Identity
-from services.scene_store import core as store
-from services.segmenter.core import region_concepts
-from services.segmenter.experts import REGISTRY
-from services.segmenter.inference import see_objects
-from services.segmenter.state import Config, State
+from prior_sg.deploy.evaluation import oracles, priors
+from prior_sg.deploy.evaluation.metrics import GroundTruth
+from prior_sg.deploy.evaluation.perception import ROBOT, EvaluationError, Perception
+from prior_sg.schemas.codec import Message
+from prior_sg.schemas.features import Pyramid, TextEmbeddings, TextRequest
+from prior_sg.schemas.objects import Detections, ObjectDelta
+from prior_sg.schemas.places import PlaceDelta
+from prior_sg.schemas.priors import Prior, Task
+from prior_sg.schemas.regions import RegionDelta
+from prior_sg.schemas.scene import Scene
+from prior_sg.schemas.status import Tick
+from prior_sg.services.registry import BY_NAME
+from prior_sg.services.runtime.service import Ask, Identity
+from prior_sg.services.scene_store.core import graph as store
+from prior_sg.services.segmenter.core.experts import REGISTRY
+from prior_sg.services.segmenter.core.inference import see_objects
+from prior_sg.services.segmenter.core.state import Config, State
+from prior_sg.services.segmenter.core.update import region_concepts
 
 OURS = "ours"
 BASELINES = ("clio", "hovsg", "hydra", "argmax")
-BASELINE_FOLDER = Path(__file__).parent.parent.parent / "tests" / "baselines"
+BASELINE_FOLDER = Path(__file__).parent / "baselines"
 BASELINE_PACKAGE = "prior_sg_baselines"
 NEVER_M, ANY_SCALE = 1e6, 1e9
 SWEEPS: dict[str, tuple[Any, ...]] = {

@@ -21,9 +21,9 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
 
-from schemas.places import VoxelMap
-from schemas.scene import Scene
-from services.geometry import inside_polygon
+from prior_sg.schemas.places import VoxelMap
+from prior_sg.schemas.scene import Scene
+from prior_sg.services.geometry import inside_polygon
 
 NO_REGION = -1
 BOUNDARY_TOLERANCE_M = 0.5  # about half a doorway

@@ -18,9 +18,9 @@ from collections.abc import Collection, Sequence
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from deploy.evaluation.oracles import TrueObject, in_view
-from schemas.objects import SceneObject
-from schemas.places import VoxelMap
+from prior_sg.deploy.evaluation.oracles import TrueObject, in_view
+from prior_sg.schemas.objects import SceneObject
+from prior_sg.schemas.places import VoxelMap
 
 TOLERANCE_M = 0.5
 NO_DETECTOR = "none"  # with it no objects are looked for, and there is nothing to judge

@@ -9,12 +9,12 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from deploy.evaluation.metrics import GroundTruth
-from schemas.features import Pyramid
-from schemas.places import VoxelMap
-from schemas.priors import Prior
-from services.geometry import transform
-from services.segmenter.experts.context import ObjectView
+from prior_sg.deploy.evaluation.metrics import GroundTruth
+from prior_sg.schemas.features import Pyramid
+from prior_sg.schemas.places import VoxelMap
+from prior_sg.schemas.priors import Prior
+from prior_sg.services.geometry import transform
+from prior_sg.services.segmenter.core.experts.context import ObjectView
 
 NOISE = 0.5  # length of the noise added to the unit embedding of a region
 

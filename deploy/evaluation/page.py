@@ -9,16 +9,16 @@ import cv2
 import msgspec
 import numpy as np
 
-from deploy.evaluation.methods import SWEEPS, Method
-from deploy.evaluation.metrics import NO_REGION, GroundTruth, Reliability
-from deploy.evaluation.object_metrics import OBJECT_COUNTS, OBJECT_SCORES, TOLERANCE_M
-from deploy.evaluation.plots import Point, line_plot
-from deploy.evaluation.runner import KEYS, NO_LABEL, Dataset, Picture, Results
-from deploy.map_image import draw_map
-from schemas.places import VoxelMap
-from schemas.regions import Region
-from schemas.scene import Scene
-from services.segmenter.regions import footprint_m2
+from prior_sg.deploy.evaluation.methods import SWEEPS, Method
+from prior_sg.deploy.evaluation.metrics import NO_REGION, GroundTruth, Reliability
+from prior_sg.deploy.evaluation.object_metrics import OBJECT_COUNTS, OBJECT_SCORES, TOLERANCE_M
+from prior_sg.deploy.evaluation.plots import Point, line_plot
+from prior_sg.deploy.evaluation.runner import KEYS, NO_LABEL, Dataset, Picture, Results
+from prior_sg.deploy.showing.map import draw_map
+from prior_sg.schemas.places import VoxelMap
+from prior_sg.schemas.regions import Region
+from prior_sg.schemas.scene import Scene
+from prior_sg.services.segmenter.core.regions.components import footprint_m2
 
 PICTURE_WIDTH_PX = 900
 FOOTPRINT_CELL_M = 0.1

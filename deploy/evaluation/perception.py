@@ -15,18 +15,18 @@ from typing import Any
 
 import msgspec
 
-from deploy.evaluation.metrics import GroundTruth
-from schemas.codec import Message, decode, encode
-from schemas.features import Pyramid, TextEmbeddings, TextRequest
-from schemas.frames import Keyframe
-from schemas.objects import Detections
-from schemas.places import MapRequest, PlaceDelta, SnapshotRequest, VoxelMap
-from schemas.topics import DETECTIONS, KEYFRAME, PLACE_SNAPSHOT, PYRAMID, TEXT, VOXEL_MAP
-from services.feature_pyramid.detect import prompted
-from services.ingest.sources import Source, open_source
-from services.registry import BY_NAME
-from services.runtime.config import resolve
-from services.runtime.service import Identity
+from prior_sg.deploy.evaluation.metrics import GroundTruth
+from prior_sg.schemas.codec import Message, decode, encode
+from prior_sg.schemas.features import Pyramid, TextEmbeddings, TextRequest
+from prior_sg.schemas.frames import Keyframe
+from prior_sg.schemas.objects import Detections
+from prior_sg.schemas.places import MapRequest, PlaceDelta, SnapshotRequest, VoxelMap
+from prior_sg.schemas.topics import DETECTIONS, KEYFRAME, PLACE_SNAPSHOT, PYRAMID, TEXT, VOXEL_MAP
+from prior_sg.services.feature_pyramid.detectors.base import prompted
+from prior_sg.services.ingest.sources import Source, open_source
+from prior_sg.services.registry import BY_NAME
+from prior_sg.services.runtime.config import resolve
+from prior_sg.services.runtime.service import Identity
 
 ROBOT = "eval"
 CODE = {"ingest": "core.py", "place_graph": "*.py", "feature_pyramid": "*.py"}  # what makes a perception

@@ -6,13 +6,13 @@ from collections.abc import Sequence
 import msgspec
 import numpy as np
 
-from deploy.evaluation.metrics import GroundTruth
-from deploy.evaluation.perception import EvaluationError
-from schemas.places import PlaceDelta
-from schemas.priors import Prior, PriorList, PriorRequest, RegionPrior
-from schemas.topics import PRIORS
-from services.registry import BY_NAME
-from services.runtime.service import Identity
+from prior_sg.deploy.evaluation.metrics import GroundTruth
+from prior_sg.deploy.evaluation.perception import EvaluationError
+from prior_sg.schemas.places import PlaceDelta
+from prior_sg.schemas.priors import Prior, PriorList, PriorRequest, RegionPrior
+from prior_sg.schemas.topics import PRIORS
+from prior_sg.services.registry import BY_NAME
+from prior_sg.services.runtime.service import Identity
 
 LEAST, MOST = 1e-3, 1 - 1e-3  # probabilities stay inside, so that their logits exist
 PSEUDO_COUNT = 0.1  # of pairs of regions that touch, and of those that do not

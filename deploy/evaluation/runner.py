@@ -9,16 +9,16 @@ from typing import Any
 
 import numpy as np
 
-from deploy.evaluation.methods import OURS, Case, Method
-from deploy.evaluation.metrics import SCORES, GroundTruth, Reliability, assign, evaluate, reliability
-from deploy.evaluation.object_metrics import NO_DETECTOR, OBJECT_SCORES, object_scores
-from deploy.evaluation.oracles import TrueObject
-from deploy.evaluation.perception import Perception, Report
-from deploy.evaluation.priors import variations
-from schemas.features import TextEmbeddings
-from schemas.places import VoxelMap
-from schemas.priors import Prior
-from schemas.scene import Scene
+from prior_sg.deploy.evaluation.methods import OURS, Case, Method
+from prior_sg.deploy.evaluation.metrics import SCORES, GroundTruth, Reliability, assign, evaluate, reliability
+from prior_sg.deploy.evaluation.object_metrics import NO_DETECTOR, OBJECT_SCORES, object_scores
+from prior_sg.deploy.evaluation.oracles import TrueObject
+from prior_sg.deploy.evaluation.perception import Perception, Report
+from prior_sg.deploy.evaluation.priors import variations
+from prior_sg.schemas.features import TextEmbeddings
+from prior_sg.schemas.places import VoxelMap
+from prior_sg.schemas.priors import Prior
+from prior_sg.schemas.scene import Scene
 
 KEYS = (*SCORES, "seconds")
 NO_LABEL = "(none)"

@@ -2,8 +2,8 @@
 
 from typing import Any
 
-from services.feature_pyramid import torchvision_parts
-from services.feature_pyramid.encoders import EncoderUnavailable, package
+from prior_sg.services.feature_pyramid.encoders import torchvision_parts
+from prior_sg.services.feature_pyramid.encoders.base import EncoderUnavailable, package
 
 
 def torch() -> Any:

@@ -8,18 +8,18 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from schemas.codec import Message
-from schemas.features import Pyramid, TextEmbeddings, TextRequest
-from schemas.frames import Keyframe
-from schemas.objects import Detections
-from schemas.priors import PriorRequest, TaskRequest
-from schemas.topics import DETECTIONS, ENCODE, PRIOR, PRIORS, PYRAMID, TASK, TASK_IN_FORCE, TEXT
-from services.feature_pyramid import vocabulary
-from services.feature_pyramid.core import Config, Selection, coarse_surface, select_crops
-from services.feature_pyramid.detect import Detector, Found, Shot, lift, load_detector, object_crops
-from services.feature_pyramid.encoders import Encoder, Options, load_encoder, space_of
-from services.feature_pyramid.vocabulary import Vocabulary
-from services.runtime.service import Ask, Identity, Output, Service
+from prior_sg.schemas.codec import Message
+from prior_sg.schemas.features import Pyramid, TextEmbeddings, TextRequest
+from prior_sg.schemas.frames import Keyframe
+from prior_sg.schemas.objects import Detections
+from prior_sg.schemas.priors import PriorRequest, TaskRequest
+from prior_sg.schemas.topics import DETECTIONS, ENCODE, PRIOR, PRIORS, PYRAMID, TASK, TASK_IN_FORCE, TEXT
+from prior_sg.services import intent
+from prior_sg.services.feature_pyramid.core.crops import Config, Selection, coarse_surface, select_crops
+from prior_sg.services.feature_pyramid.detectors.base import Detector, Found, Shot, lift, load_detector, object_crops
+from prior_sg.services.feature_pyramid.encoders.base import Encoder, Options, load_encoder, space_of
+from prior_sg.services.intent import Vocabulary
+from prior_sg.services.runtime.service import Ask, Identity, Output, Service
 
 QUESTIONS = {TaskRequest: TASK_IN_FORCE, PriorRequest: PRIORS}
 
@@ -74,10 +74,10 @@ def step(state: Worker, message: Message, cfg: Config) -> Iterator[Output]:
     A detector that is not yet told what to look for has not looked: its keyframes have no detections.
     """
     if not isinstance(message, Keyframe):
-        vocabulary.hear(state.vocabulary, message)
+        intent.hear(state.vocabulary, message)
         return
     if state.detector.prompted and not cfg.detector_prompts:
-        for question in vocabulary.questions(state.vocabulary, message.robot):
+        for question in intent.questions(state.vocabulary, message.robot):
             yield Ask(QUESTIONS[type(question)], question)
     key, sought = _key(message), look_for(state, message.robot, cfg)
     waiting = state.views.pop(key, None)
@@ -97,7 +97,7 @@ def look_for(state: Worker, robot: str, cfg: Config) -> tuple[str, ...]:
     """Names of the objects that the detector is asked for: those of the settings, else of the robot's prior."""
     if not state.detector.prompted:
         return ()
-    return cfg.detector_prompts or vocabulary.objects(state.vocabulary, robot)
+    return cfg.detector_prompts or intent.objects(state.vocabulary, robot)
 
 
 def view(frame: Keyframe, detector: Detector, sought: tuple[str, ...], cfg: Config) -> View:

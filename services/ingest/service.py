@@ -5,14 +5,14 @@ import logging
 from collections.abc import Awaitable, Iterator
 from typing import Protocol
 
-from schemas.codec import Message
-from schemas.features import Backfill
-from schemas.frames import PoseUpdate
-from schemas.status import JobDone, Tick
-from schemas.topics import ARCHIVE, BACKFILL, CAMERA_STATE, ENCODE, INGEST_STATE, KEYFRAME, POSE_UPDATE
-from services.ingest import core
-from services.ingest.sources import Source, SourceError, open_source
-from services.runtime.service import Identity, Output, Service
+from prior_sg.schemas.codec import Message
+from prior_sg.schemas.features import Backfill
+from prior_sg.schemas.frames import PoseUpdate
+from prior_sg.schemas.status import JobDone, Tick
+from prior_sg.schemas.topics import ARCHIVE, BACKFILL, CAMERA_STATE, ENCODE, INGEST_STATE, KEYFRAME, POSE_UPDATE
+from prior_sg.services.ingest.core import selection
+from prior_sg.services.ingest.sources import Source, SourceError, open_source
+from prior_sg.services.runtime.service import Identity, Output, Service
 
 log = logging.getLogger(__name__)
 PROGRESS_S = 1.0
@@ -30,39 +30,39 @@ class Port(Protocol):
         """Return when fewer than `window` keyframes are under way at every reader."""
 
 
-def init(cfg: core.Config, identity: Identity) -> core.State:
+def init(cfg: selection.Config, identity: Identity) -> selection.State:
     """An empty state."""
-    return core.State(robot=identity.robot, epoch=identity.epoch)
+    return selection.State(robot=identity.robot, epoch=identity.epoch)
 
 
-def step(state: core.State, message: Message, cfg: core.Config) -> Iterator[Output]:
+def step(state: selection.State, message: Message, cfg: selection.Config) -> Iterator[Output]:
     """Take one frame, one finished job, corrected poses, or the end of the source."""
     match message:
-        case core.RawFrame():
-            reason = core.refusal(state, message, cfg)
+        case selection.RawFrame():
+            reason = selection.refusal(state, message, cfg)
             if reason is None:
-                yield from core.accept(state, message, cfg)
+                yield from selection.accept(state, message, cfg)
             else:
                 log.warning("frame refused", extra={"frame": message.frame_id, "reason": reason})
-                yield from core.refuse(state, message)
-        case core.BadFrame():
+                yield from selection.refuse(state, message)
+        case selection.BadFrame():
             log.warning("frame unreadable", extra={"frame": message.frame_id, "reason": message.reason})
-            yield from core.lose(state, message)
+            yield from selection.lose(state, message)
         case JobDone():
-            yield from core.encoded(state, message)
-        case core.Correction():
-            yield from core.announce(state, message)
+            yield from selection.encoded(state, message)
+        case selection.Correction():
+            yield from selection.announce(state, message)
         case Backfill():
-            yield from core.backfill(state, message)
+            yield from selection.backfill(state, message)
         case PoseUpdate():
-            core.correct(state, message)
-        case core.EndOfSource():
-            yield from core.end(state)
+            selection.correct(state, message)
+        case selection.EndOfSource():
+            yield from selection.end(state)
         case Tick():  # the topic keeps no history: whoever comes late, or missed the last word, hears it again
-            yield core.progress(state)
+            yield selection.progress(state)
 
 
-async def drive(port: Port, cfg: core.Config) -> None:
+async def drive(port: Port, cfg: selection.Config) -> None:
     """Feed the source's frames, paced by their stamps, by the pipeline's room, or by both. Raises SourceError."""
     if not cfg.source:
         log.info("no source is configured: set ingest.source to a dataset folder or an MCAP log")
@@ -78,7 +78,7 @@ async def drive(port: Port, cfg: core.Config) -> None:
         if slows_down and await _stopped_while(port, port.room(cfg.window)):
             return
         await port.consume(event)
-    await port.consume(core.EndOfSource())
+    await port.consume(selection.EndOfSource())
 
 
 class Pace:
@@ -88,9 +88,9 @@ class Pace:
         self.speed = speed
         self._origin: tuple[float, int] | None = None  # loop time in seconds, stamp in nanoseconds
 
-    async def until_due(self, frame: core.RawFrame | core.BadFrame | core.Correction) -> None:
+    async def until_due(self, frame: selection.RawFrame | selection.BadFrame | selection.Correction) -> None:
         """Return when the frame is due; all else, and frames that come late, are due at once."""
-        if not isinstance(frame, core.RawFrame):
+        if not isinstance(frame, selection.RawFrame):
             return
         now_s = asyncio.get_running_loop().time()
         if self._origin is None:
@@ -99,7 +99,7 @@ class Pace:
         await asyncio.sleep(max(0.0, due_s - now_s))
 
 
-def _open(cfg: core.Config) -> Source:
+def _open(cfg: selection.Config) -> Source:
     source = open_source(cfg.source, world_up=cfg.world_up, floor_m=cfg.floor_m, robot=cfg.source_robot)
     if source.total == 0:
         raise SourceError(f"{cfg.source} holds no frames")
@@ -124,12 +124,12 @@ SERVICE = Service(
     name="ingest",
     purpose="reads a posed RGB-D source and selects keyframes",
     scope="robot",
-    config=core.Config,
+    config=selection.Config,
     init=init,
     step=step,
     reads=(POSE_UPDATE, BACKFILL),
     writes=(KEYFRAME, POSE_UPDATE, CAMERA_STATE, INGEST_STATE, ENCODE),
-    answers={ARCHIVE: core.archived},
+    answers={ARCHIVE: selection.archived},
     drive=drive,
     job_limit=lambda cfg: cfg.window if cfg.when_behind == "skip" and cfg.speed > 0 else 0,
     tick_s=PROGRESS_S,

@@ -3,22 +3,22 @@
 import logging
 from collections.abc import Iterator
 
-from schemas.codec import Message
-from schemas.frames import ArchiveReply, ArchiveRequest, Keyframe, PoseUpdate
-from schemas.places import MapRequest, PlaceDelta, SnapshotRequest, VoxelMap
-from schemas.topics import ARCHIVE, KEYFRAME, PLACE_DELTA, PLACE_SNAPSHOT, POSE_UPDATE, VOXEL_MAP
-from services.place_graph import core
-from services.runtime.service import Ask, Identity, Output, Service
+from prior_sg.schemas.codec import Message
+from prior_sg.schemas.frames import ArchiveReply, ArchiveRequest, Keyframe, PoseUpdate
+from prior_sg.schemas.places import MapRequest, PlaceDelta, SnapshotRequest, VoxelMap
+from prior_sg.schemas.topics import ARCHIVE, KEYFRAME, PLACE_DELTA, PLACE_SNAPSHOT, POSE_UPDATE, VOXEL_MAP
+from prior_sg.services.place_graph.core import update
+from prior_sg.services.runtime.service import Ask, Identity, Output, Service
 
 log = logging.getLogger(__name__)
 
 
-def init(cfg: core.Config, identity: Identity) -> core.State:
+def init(cfg: update.Config, identity: Identity) -> update.State:
     """An empty map."""
-    return core.empty(identity.robot, identity.epoch, cfg)
+    return update.empty(identity.robot, identity.epoch, cfg)
 
 
-def step(state: core.State, message: Message, cfg: core.Config) -> Iterator[Output]:
+def step(state: update.State, message: Message, cfg: update.Config) -> Iterator[Output]:
     """One keyframe gives one delta, with or without changes; a repeated keyframe gives nothing. A process that joins in
     mid-stream fetches what it has missed from the archive, page by page."""
     match message:
@@ -28,7 +28,7 @@ def step(state: core.State, message: Message, cfg: core.Config) -> Iterator[Outp
                 yield _ask_archive(state.robot, 0, message.frame_id)
             yield from _map(state, message, cfg)
         case PoseUpdate():
-            yield from _told(core.correct(state, message, cfg))
+            yield from _told(update.correct(state, message, cfg))
         case ArchiveReply():
             for keyframe in message.keyframes:
                 yield from _map(state, keyframe, cfg)
@@ -40,9 +40,9 @@ def _ask_archive(robot: str, first_frame_id: int, end_frame_id: int) -> Ask:
     return Ask(ARCHIVE, ArchiveRequest(robot=robot, first_frame_id=first_frame_id, end_frame_id=end_frame_id))
 
 
-def _map(state: core.State, keyframe: Keyframe, cfg: core.Config) -> Iterator[Output]:
+def _map(state: update.State, keyframe: Keyframe, cfg: update.Config) -> Iterator[Output]:
     if keyframe.frame_id not in state.seen:
-        yield from _told(core.integrate(state, keyframe, cfg))
+        yield from _told(update.integrate(state, keyframe, cfg))
 
 
 def _told(delta: PlaceDelta | None) -> Iterator[Output]:
@@ -53,19 +53,19 @@ def _told(delta: PlaceDelta | None) -> Iterator[Output]:
         yield PLACE_DELTA, delta
 
 
-def _snapshot(state: core.State, request: SnapshotRequest, cfg: core.Config) -> PlaceDelta:
-    return core.snapshot(state, cfg)
+def _snapshot(state: update.State, request: SnapshotRequest, cfg: update.Config) -> PlaceDelta:
+    return update.snapshot(state, cfg)
 
 
-def _voxel_map(state: core.State, request: MapRequest, cfg: core.Config) -> VoxelMap:
-    return core.voxel_map(state, cfg)
+def _voxel_map(state: update.State, request: MapRequest, cfg: update.Config) -> VoxelMap:
+    return update.voxel_map(state, cfg)
 
 
 SERVICE = Service(
     "place_graph",
     purpose=__doc__ or "",
     scope="robot",
-    config=core.Config,
+    config=update.Config,
     init=init,
     step=step,
     reads=(KEYFRAME, POSE_UPDATE),

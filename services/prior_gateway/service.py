@@ -12,8 +12,8 @@ from typing import Any, Literal
 
 import msgspec
 
-from schemas.codec import Message, copied
-from schemas.priors import (
+from prior_sg.schemas.codec import Message, copied
+from prior_sg.schemas.priors import (
     Keep,
     Kept,
     ModelReply,
@@ -29,12 +29,13 @@ from schemas.priors import (
     Recalled,
     Task,
 )
-from schemas.status import Tick
-from schemas.topics import PRIOR, PRIOR_CLAIM, PRIOR_EVIDENCE, PRIOR_REVISION, PRIORS, TASK
-from services.prior_gateway import archive, core, endpoint, ensemble, learning, library, prompts, synthesis
-from services.prior_gateway.matching import match_environment, same_region
-from services.prior_gateway.sharing import Claims
-from services.runtime.service import Ask, Errand, Identity, Output, Service
+from prior_sg.schemas.status import Tick
+from prior_sg.schemas.topics import PRIOR, PRIOR_CLAIM, PRIOR_EVIDENCE, PRIOR_REVISION, PRIORS, TASK
+from prior_sg.services.prior_gateway.core import compose, ensemble, learning, turns
+from prior_sg.services.prior_gateway.core.claims import Claims
+from prior_sg.services.prior_gateway.core.matching import match_environment, same_region
+from prior_sg.services.prior_gateway.outside import archive, endpoint, library, prompts
+from prior_sg.services.runtime.service import Ask, Errand, Identity, Output, Service
 
 TICK_S = 0.5
 ASK_MODEL = Errand("ASK_MODEL", ModelRequest, ModelReply, endpoint.open_endpoint)
@@ -48,7 +49,7 @@ Asked = tuple[str, str, tuple[str, ...]]  # environment, task, fixed regions
 class Talk:
     """One conversation under way; it is at this turn."""
 
-    dialogue: Generator[synthesis.Turn, str, Any]
+    dialogue: Generator[turns.Turn, str, Any]
     turn: int = 0
 
 
@@ -73,8 +74,8 @@ class State:
     """What is known, what is being made, and what the others say."""
 
     instance: str
-    library: core.Library
-    prompts: synthesis.Prompts
+    library: compose.Library
+    prompts: turns.Prompts
     priors: dict[str, Prior] = field(default_factory=dict)  # by digest, oldest first
     answers: dict[Asked, str] = field(default_factory=dict)  # digest of the prior that answers a task
     refused: dict[Asked, str] = field(default_factory=dict)
@@ -85,16 +86,16 @@ class State:
     begun: int = 0  # rounds of conversations so far, for their names
 
 
-def init(cfg: core.Config, identity: Identity) -> State:
+def init(cfg: compose.Config, identity: Identity) -> State:
     """Load library and prompts. Raises ServiceError."""
     return State(identity.instance, library.load(), prompts.load(cfg.prompts))
 
 
-def step(state: State, message: Message, cfg: core.Config) -> Iterator[Output]:
+def step(state: State, message: Message, cfg: compose.Config) -> Iterator[Output]:
     """One input. The same task gives the same prior again, for robots that come late."""
     match message:
         case Task():
-            yield from _begin(state, Making(message, core.question_of(message, cfg, state.prompts.version)))
+            yield from _begin(state, Making(message, compose.question_of(message, cfg, state.prompts.version)))
         case PriorRevision():
             yield from _begin_revision(state, message)
         case Recalled():
@@ -113,7 +114,7 @@ def step(state: State, message: Message, cfg: core.Config) -> Iterator[Output]:
             yield from _learn(state, message, cfg)
 
 
-def answer(state: State, request: PriorRequest, cfg: core.Config) -> PriorList:
+def answer(state: State, request: PriorRequest, cfg: compose.Config) -> PriorList:
     """The prior of a digest, else of a task; of a task that nobody has given yet, what the library would say."""
     if request.digest:
         if prior := state.priors.get(request.digest):
@@ -131,7 +132,7 @@ def answer(state: State, request: PriorRequest, cfg: core.Config) -> PriorList:
         return PriorList(priors=[], reason="A prior is made when a robot is given the task.", pending=True)
     try:
         return PriorList(priors=[state.library.answer(_task(*asked), cfg)])
-    except core.NoPrior as reason:
+    except compose.NoPrior as reason:
         return PriorList(priors=[], reason=str(reason), pending=True)
 
 
@@ -165,7 +166,7 @@ def _begin_revision(state: State, revision: PriorRevision) -> Iterator[Output]:
     yield from _begin(state, Making(_task(*asked), question, revision))
 
 
-def _recalled(state: State, recalled: Recalled, cfg: core.Config) -> Iterator[Output]:
+def _recalled(state: State, recalled: Recalled, cfg: compose.Config) -> Iterator[Output]:
     """What the archive knows decides how to go on."""
     making = state.making.get(recalled.question)
     if making is None:
@@ -193,7 +194,7 @@ def _of_question(state: State, question: str) -> Prior | None:
     return next((prior for prior in state.priors.values() if prior.provenance.question == question), None)
 
 
-def _answer(state: State, making: Making, prior: Prior, cfg: core.Config) -> Iterator[Output]:
+def _answer(state: State, making: Making, prior: Prior, cfg: compose.Config) -> Iterator[Output]:
     """The task has its prior."""
     state.making.pop(making.question, None)
     asked = _asked(making.task)
@@ -203,10 +204,12 @@ def _answer(state: State, making: Making, prior: Prior, cfg: core.Config) -> Ite
     yield PRIOR, prior
 
 
-def _answer_by_library(state: State, making: Making, cfg: core.Config, remark: str = "") -> Iterator[Output]:
+def _answer_by_library(state: State, making: Making, cfg: compose.Config, remark: str = "") -> Iterator[Output]:
     try:
-        prior = core.noted(state.library.answer(making.task, cfg), f"{remark}: this is the library's" if remark else "")
-    except core.NoPrior as reason:
+        prior = compose.noted(
+            state.library.answer(making.task, cfg), f"{remark}: this is the library's" if remark else ""
+        )
+    except compose.NoPrior as reason:
         state.making.pop(making.question, None)
         _put(state.refused, _asked(making.task), ". ".join(filter(None, (remark, str(reason)))), cfg.remembered_priors)
         return
@@ -227,7 +230,7 @@ def _hear(state: State, claim: PriorClaim) -> Iterator[Output]:
         yield PRIOR, prior
 
 
-def _tick(state: State, cfg: core.Config) -> Iterator[Output]:
+def _tick(state: State, cfg: compose.Config) -> Iterator[Output]:
     """Claims are renewed, and whoever's turn it is begins."""
     state.claims.tick(max(1, round(cfg.lease_s / TICK_S)))
     for making in list(state.making.values()):
@@ -242,26 +245,26 @@ def _tick(state: State, cfg: core.Config) -> Iterator[Output]:
             yield _claim(state, making)
 
 
-def _work(state: State, making: Making, cfg: core.Config) -> Iterator[Output]:
+def _work(state: State, making: Making, cfg: compose.Config) -> Iterator[Output]:
     """Begin the conversations, or count."""
     state.begun += 1
     if making.revision is not None:
         yield from _revise(state, making, cfg)
         return
     for sample in range(cfg.synthesis.samples):
-        dialogue = synthesis.synthesise(making.task, state.prompts, cfg.synthesis)
+        dialogue = turns.synthesise(making.task, state.prompts, cfg.synthesis)
         yield from _start(state, making, dialogue, sample, cfg)
 
 
 def _start(
-    state: State, making: Making, dialogue: Generator[synthesis.Turn, str, Any], sample: int, cfg: core.Config
+    state: State, making: Making, dialogue: Generator[turns.Turn, str, Any], sample: int, cfg: compose.Config
 ) -> Iterator[Output]:
     name = f"{making.question[:12]}/{state.begun}/{sample}"
     making.talks[name] = Talk(dialogue)
     yield _say(name, making.talks[name], next(dialogue), cfg)
 
 
-def _say(name: str, talk: Talk, turn: synthesis.Turn, cfg: core.Config) -> Ask:
+def _say(name: str, talk: Talk, turn: turns.Turn, cfg: compose.Config) -> Ask:
     request = ModelRequest(
         conversation=name,
         turn=talk.turn,
@@ -273,7 +276,7 @@ def _say(name: str, talk: Talk, turn: synthesis.Turn, cfg: core.Config) -> Ask:
     return Ask(ASK_MODEL, request)
 
 
-def _replied(state: State, reply: ModelReply, cfg: core.Config) -> Iterator[Output]:
+def _replied(state: State, reply: ModelReply, cfg: compose.Config) -> Iterator[Output]:
     """The next turn of a conversation, or its end; after the last one, the prior."""
     making = next((making for making in state.making.values() if reply.conversation in making.talks), None)
     if making is None or making.talks[reply.conversation].turn != reply.turn:
@@ -281,21 +284,21 @@ def _replied(state: State, reply: ModelReply, cfg: core.Config) -> Iterator[Outp
     talk = making.talks[reply.conversation]
     try:
         if reply.failure:
-            raise synthesis.Unusable(reply.reason)
+            raise turns.Unusable(reply.reason)
         turn = talk.dialogue.send(reply.text)
         talk.turn += 1
         yield _say(reply.conversation, talk, turn, cfg)
         return
     except StopIteration as end:
         making.drafts[reply.conversation] = end.value
-    except synthesis.Unusable as why:
+    except turns.Unusable as why:
         making.failures.append(str(why))
     del making.talks[reply.conversation]
     if not making.talks:
         yield from _conclude(state, making, cfg)
 
 
-def _conclude(state: State, making: Making, cfg: core.Config) -> Iterator[Output]:
+def _conclude(state: State, making: Making, cfg: compose.Config) -> Iterator[Output]:
     """All conversations have ended: the mean of what they brought, or what there is instead."""
     drafts = [making.drafts[name] for name in sorted(making.drafts)]
     if not drafts:
@@ -314,7 +317,7 @@ def _conclude(state: State, making: Making, cfg: core.Config) -> Iterator[Output
         yield from _give_up(state, making, f"its prior cannot be used: {error}", cfg)
 
 
-def _combined(state: State, making: Making, drafts: list[synthesis.Draft], cfg: core.Config) -> Prior:
+def _combined(state: State, making: Making, drafts: list[turns.Draft], cfg: compose.Config) -> Prior:
     own = match_environment(making.task.environment, state.library.environments)
     known = [*([own] if own else []), *(e for e in state.library.environments if e is not own)]
     note = f"mean of {len(drafts)} generations"
@@ -325,12 +328,12 @@ def _combined(state: State, making: Making, drafts: list[synthesis.Draft], cfg: 
         making.task,
         drafts,
         lambda one, other: same_region(one, other, known),
-        lambda name: core.phrases_of(name, cfg),
+        lambda name: compose.phrases_of(name, cfg),
         made,
     )
 
 
-def _provenance(state: State, making: Making, cfg: core.Config, **fields: Any) -> Provenance:
+def _provenance(state: State, making: Making, cfg: compose.Config, **fields: Any) -> Provenance:
     """Who makes this prior from what; `fields` say the rest."""
     asked = {"source": cfg.maker, "detail": f"{cfg.provider} {cfg.base_url}".strip(), "prompts": state.prompts.version}
     return Provenance(**(asked | {"question": making.question} | fields))
@@ -343,7 +346,7 @@ def _keep(making: Making, prior: Prior, state: State) -> Ask:
     return Ask(KEEP, Keep(prior=prior, question=making.question, own=True, preferred=revised, root=root))
 
 
-def _kept(state: State, kept: Kept, cfg: core.Config) -> Iterator[Output]:
+def _kept(state: State, kept: Kept, cfg: compose.Config) -> Iterator[Output]:
     """An own prior is published; another's answers the task it was waited for, or replaces its parent."""
     if (prior := kept.prior) is None:
         return
@@ -366,7 +369,7 @@ def _received(state: State, prior: Prior) -> Iterator[Output]:
         yield Ask(KEEP, Keep(prior=copied(prior), question=prior.provenance.question))
 
 
-def _give_up(state: State, making: Making, reason: str, cfg: core.Config) -> Iterator[Output]:
+def _give_up(state: State, making: Making, reason: str, cfg: compose.Config) -> Iterator[Output]:
     """Say so to the others, and take the newest kept prior or the library's, which then says why."""
     yield _claim(state, making, gave_up=True)
     if making.revision is not None:
@@ -377,12 +380,12 @@ def _give_up(state: State, making: Making, reason: str, cfg: core.Config) -> Ite
     if newest is None:
         yield from _answer_by_library(state, making, cfg, remark)
         return
-    prior = core.noted(copied(newest), f"{remark}: this is the newest one kept, of {newest.provenance.source}")
+    prior = compose.noted(copied(newest), f"{remark}: this is the newest one kept, of {newest.provenance.source}")
     bare = msgspec.structs.replace(prior.provenance, question="", signer="", signature="")
     yield from _answer(state, making, msgspec.structs.replace(prior, provenance=bare), cfg)
 
 
-def _learn(state: State, seen: PriorEvidence, cfg: core.Config) -> Iterator[Output]:
+def _learn(state: State, seen: PriorEvidence, cfg: compose.Config) -> Iterator[Output]:
     """Keep what a map has shown; only where the settings allow it, that alone revises the prior."""
     asked = _asked_of(seen)
     known = state.evidence.setdefault(asked, {})
@@ -399,7 +402,7 @@ def _learn(state: State, seen: PriorEvidence, cfg: core.Config) -> Iterator[Outp
         yield from _begin_revision(state, PriorRevision(environment=environment, task=task, regions=list(regions)))
 
 
-def _current(state: State, making: Making, cfg: core.Config) -> tuple[Prior, Prior]:
+def _current(state: State, making: Making, cfg: compose.Config) -> tuple[Prior, Prior]:
     """The prior before any revision, and the one in force. Raises NoPrior."""
     asked, recalled = _asked(making.task), making.recalled
     current = state.priors.get(state.answers.get(asked, ""))
@@ -411,12 +414,12 @@ def _current(state: State, making: Making, cfg: core.Config) -> tuple[Prior, Pri
     return root, current
 
 
-def _revise(state: State, making: Making, cfg: core.Config) -> Iterator[Output]:
+def _revise(state: State, making: Making, cfg: compose.Config) -> Iterator[Output]:
     """Count, or ask the model about the largest disagreements."""
     assert making.revision is not None
     try:
         root, current = _current(state, making, cfg)
-    except core.NoPrior:
+    except compose.NoPrior:
         yield from _give_up(state, making, "there is no prior to revise", cfg)
         return
     seen = learning.totals(root, state.evidence.get(_asked(making.task), {}).values())
@@ -437,11 +440,11 @@ def _revise(state: State, making: Making, cfg: core.Config) -> Iterator[Output]:
     if cfg.provider == "library" or not form:
         yield from _give_up(state, making, "there is no model, or nothing to disagree about", cfg)
         return
-    talk = synthesis.Talk(state.prompts, cfg.synthesis)
-    yield from _start(state, making, synthesis.revise(current, lines, form, talk), 0, cfg)
+    talk = turns.Talk(state.prompts, cfg.synthesis)
+    yield from _start(state, making, turns.revise(current, lines, form, talk), 0, cfg)
 
 
-def _remember(state: State, prior: Prior, cfg: core.Config) -> None:
+def _remember(state: State, prior: Prior, cfg: compose.Config) -> None:
     """Priors that answer a task stay; of the others the oldest are forgotten."""
     digest = prior.digest()
     state.priors.pop(digest, None)
@@ -465,7 +468,7 @@ SERVICE = Service(
     "prior_gateway",
     purpose="Answers a task with a prior graph: expected regions, objects and how they lie.",
     scope="fleet",
-    config=core.Config,
+    config=compose.Config,
     init=init,
     step=step,
     reads=(TASK, PRIOR, PRIOR_CLAIM, PRIOR_EVIDENCE, PRIOR_REVISION),

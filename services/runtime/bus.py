@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 from typing import Protocol
 
-from schemas.topics import Topic
+from prior_sg.schemas.topics import Topic
 
 HEADER = struct.Struct("<Qq")
 WRITER = re.compile(r"[\w.:-]+(/[\w.:-]+)*")

@@ -30,8 +30,8 @@ from mcap.stream_reader import breakup_chunk
 from mcap.summary import Summary
 from mcap.writer import MCAP0_MAGIC, Writer
 
-from schemas.codec import schema_name
-from schemas.topics import TOPICS, Topic
+from prior_sg.schemas.codec import schema_name
+from prior_sg.schemas.topics import TOPICS, Topic
 
 CHUNK_BYTES = 1 << 20
 FLUSH_NS = 1_000_000_000  # of received time: what a killed process can lose

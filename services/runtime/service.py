@@ -6,8 +6,8 @@ from typing import Any, Literal
 
 import msgspec
 
-from schemas.codec import Message
-from schemas.topics import Query, Topic
+from prior_sg.schemas.codec import Message
+from prior_sg.schemas.topics import Query, Topic
 
 
 class ServiceError(RuntimeError):
@@ -57,7 +57,7 @@ class Service:
     `step(state, message, cfg)` takes one input and yields outputs; it may change `state` and does nothing else.
     Inputs are messages of `reads`, of `job`, replies to its questions and errands, and `Tick` every `tick_s` seconds.
     `answers` maps a query to `f(state, request, cfg) -> reply`, which must not change the state.
-    `drive`, for sources only, is a coroutine that feeds inputs from outside (see `services.runtime.host.Port`).
+    `drive`, for sources only, is a coroutine that feeds inputs from outside (see `Port` in the host).
     """
 
     name: str

@@ -19,9 +19,9 @@ import zenoh
 from zenoh import CongestionControl, ConsolidationMode, Priority, QueryTarget, SampleKind
 from zenoh import ext as zx
 
-from schemas.codec import schema_name
-from schemas.topics import Topic
-from services.runtime.bus import (
+from prior_sg.schemas.codec import schema_name
+from prior_sg.schemas.topics import Topic
+from prior_sg.services.runtime.bus import (
     Answer,
     BusError,
     OnAlive,

@@ -13,12 +13,12 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
-from schemas.codec import encode
-from schemas.objects import SceneObject
-from schemas.priors import Prior, Task
-from schemas.regions import Region
-from services.runtime.service import ServiceError
-from services.scene_store import core
+from prior_sg.schemas.codec import encode
+from prior_sg.schemas.objects import SceneObject
+from prior_sg.schemas.priors import Prior, Task
+from prior_sg.schemas.regions import Region
+from prior_sg.services.runtime.service import ServiceError
+from prior_sg.services.scene_store.core import graph as core
 
 APPLICATION_ID = 0x70736753  # "psgS", in the header of the file
 LAYOUT_VERSION = 4

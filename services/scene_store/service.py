@@ -5,14 +5,14 @@ from dataclasses import dataclass
 
 import msgspec
 
-from schemas.codec import Message
-from schemas.objects import ObjectDelta
-from schemas.places import PlaceDelta, SnapshotRequest
-from schemas.priors import Prior, Task, TaskInForce, TaskRequest
-from schemas.regions import RegionDelta
-from schemas.scene import Scene, SceneRequest
-from schemas.status import Tick
-from schemas.topics import (
+from prior_sg.schemas.codec import Message
+from prior_sg.schemas.objects import ObjectDelta
+from prior_sg.schemas.places import PlaceDelta, SnapshotRequest
+from prior_sg.schemas.priors import Prior, Task, TaskInForce, TaskRequest
+from prior_sg.schemas.regions import RegionDelta
+from prior_sg.schemas.scene import Scene, SceneRequest
+from prior_sg.schemas.status import Tick
+from prior_sg.schemas.topics import (
     OBJECT_DELTA,
     OBJECT_SNAPSHOT,
     PLACE_DELTA,
@@ -25,10 +25,10 @@ from schemas.topics import (
     TASK,
     TASK_IN_FORCE,
 )
-from services.deltas import Follower
-from services.runtime.service import Ask, Identity, Output, Service
-from services.scene_store import core
-from services.scene_store.database import Database
+from prior_sg.services.deltas import Follower
+from prior_sg.services.runtime.service import Ask, Identity, Output, Service
+from prior_sg.services.scene_store.core import graph as core
+from prior_sg.services.scene_store.database import Database
 
 CHECKPOINT_S = 1.0  # the write-ahead log is folded into the file between deltas, not within a commit
 

@@ -2,13 +2,13 @@
 
 from collections.abc import Iterator
 
-from schemas.codec import Message
-from schemas.features import Backfill, TextRequest
-from schemas.objects import ObjectDelta
-from schemas.places import SnapshotRequest
-from schemas.priors import PriorEvidence, PriorRequest, TaskRequest
-from schemas.regions import PosteriorReply, PosteriorRequest, RegionDelta
-from schemas.topics import (
+from prior_sg.schemas.codec import Message
+from prior_sg.schemas.features import Backfill, TextRequest
+from prior_sg.schemas.objects import ObjectDelta
+from prior_sg.schemas.places import SnapshotRequest
+from prior_sg.schemas.priors import PriorEvidence, PriorRequest, TaskRequest
+from prior_sg.schemas.regions import PosteriorReply, PosteriorRequest, RegionDelta
+from prior_sg.schemas.topics import (
     BACKFILL,
     DETECTIONS,
     OBJECT_DELTA,
@@ -27,9 +27,9 @@ from schemas.topics import (
     TASK_IN_FORCE,
     TEXT,
 )
-from services.runtime.service import Ask, Identity, Output, Service
-from services.segmenter import core, report
-from services.segmenter.state import Config, State, empty
+from prior_sg.services.runtime.service import Ask, Identity, Output, Service
+from prior_sg.services.segmenter.core import report, update
+from prior_sg.services.segmenter.core.state import Config, State, empty
 
 QUESTIONS = {
     SnapshotRequest: PLACE_SNAPSHOT,
@@ -52,7 +52,7 @@ def init(cfg: Config, identity: Identity) -> State:
 
 def step(state: State, message: Message, cfg: Config) -> Iterator[Output]:
     """One input; regions go to their topic, requests become questions."""
-    for output in core.update(state, message, cfg):
+    for output in update.update(state, message, cfg):
         topic = PUBLISHED.get(type(output))
         yield (topic, output) if topic is not None else Ask(QUESTIONS[type(output)], output)
 

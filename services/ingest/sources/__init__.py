@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from services.ingest.sources import (
+from prior_sg.services.ingest.sources import (
     coda,
     dataset,
     hm3d,
@@ -15,7 +15,7 @@ from services.ingest.sources import (
     tartanground,
     tum,
 )
-from services.ingest.sources.base import Source, SourceError
+from prior_sg.services.ingest.sources.base import Source, SourceError
 
 __all__ = ["Source", "SourceError", "open_source"]
 

@@ -12,10 +12,10 @@ from typing import Any
 import cv2
 import numpy as np
 
-from schemas.frames import Intrinsics
-from services.geometry import pose_from_quaternion
-from services.ingest.core import BadFrame, Correction, RawFrame
-from services.ingest.sources.images import ImageError, image_size
+from prior_sg.schemas.frames import Intrinsics
+from prior_sg.services.geometry import pose_from_quaternion
+from prior_sg.services.ingest.core.selection import BadFrame, Correction, RawFrame
+from prior_sg.services.ingest.sources.images import ImageError, image_size
 
 UP = (0.0, 0.0, 1.0)
 CAMERA, REGIONS = "camera.json", "regions.json"

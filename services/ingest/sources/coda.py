@@ -31,9 +31,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from schemas.frames import Intrinsics
-from services.geometry import inverse, transform
-from services.ingest.sources.base import (
+from prior_sg.schemas.frames import Intrinsics
+from prior_sg.services.geometry import inverse, transform
+from prior_sg.services.ingest.sources.base import (
     MILLIMETRE,
     UP,
     Entry,
@@ -52,7 +52,7 @@ from services.ingest.sources.base import (
     stamp_ns,
     table,
 )
-from services.ingest.sources.lidar import depth_image
+from prior_sg.services.ingest.sources.lidar import depth_image
 
 RAW, RECTIFIED, SCANS = "2d_raw", "2d_rect", "3d_comp/os1"
 LOOKS = f"{RECTIFIED}/cam0/SEQUENCE or {RAW}/cam0/SEQUENCE beside {SCANS} (CODa)"

@@ -16,8 +16,8 @@ from pathlib import Path
 
 import numpy as np
 
-from services.ingest.core import BadFrame, Correction, RawFrame
-from services.ingest.sources.base import (
+from prior_sg.services.ingest.core.selection import BadFrame, Correction, RawFrame
+from prior_sg.services.ingest.sources.base import (
     CAMERA,
     REGIONS,
     UP,

@@ -19,8 +19,8 @@ from pathlib import Path
 
 import numpy as np
 
-from schemas.frames import Intrinsics
-from services.ingest.sources.base import (
+from prior_sg.schemas.frames import Intrinsics
+from prior_sg.services.ingest.sources.base import (
     UP,
     Entry,
     FrameError,

@@ -3,8 +3,8 @@
 import numpy as np
 from numba import njit
 
-from schemas.frames import Intrinsics
-from services.geometry import project
+from prior_sg.schemas.frames import Intrinsics
+from prior_sg.services.geometry import project
 
 NEAR_M = 0.2  # nothing nearer to the camera is drawn
 MAX_STEP = 0.1  # neighbours whose depths differ by more than this share lie on two surfaces

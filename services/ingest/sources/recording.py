@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from schemas.codec import DecodeError, decode
-from schemas.frames import Keyframe, PoseUpdate
-from schemas.topics import KEYFRAME, POSE_UPDATE
-from services.ingest.core import BadFrame, Correction, RawFrame
-from services.ingest.sources.base import UP, FrameError, Rig, Source, SourceError, levelling
-from services.runtime.record import Content, LogError, attachments, contents, read_log
+from prior_sg.schemas.codec import DecodeError, decode
+from prior_sg.schemas.frames import Keyframe, PoseUpdate
+from prior_sg.schemas.topics import KEYFRAME, POSE_UPDATE
+from prior_sg.services.ingest.core.selection import BadFrame, Correction, RawFrame
+from prior_sg.services.ingest.sources.base import UP, FrameError, Rig, Source, SourceError, levelling
+from prior_sg.services.runtime.record import Content, LogError, attachments, contents, read_log
 
 REGIONS = "regions.json"
 log = logging.getLogger(__name__)

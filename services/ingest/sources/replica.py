@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from services.ingest.sources.base import (
+from prior_sg.services.ingest.sources.base import (
     UP,
     Entry,
     FrameError,

@@ -13,10 +13,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from schemas.frames import Intrinsics
-from services.ingest.core import BadFrame, RawFrame
-from services.ingest.sources.base import FrameError, Rig, Source, SourceError, levelling, read_bytes
-from services.ingest.sources.images import ImageError, image_size
+from prior_sg.schemas.frames import Intrinsics
+from prior_sg.services.ingest.core.selection import BadFrame, RawFrame
+from prior_sg.services.ingest.sources.base import FrameError, Rig, Source, SourceError, levelling, read_bytes
+from prior_sg.services.ingest.sources.images import ImageError, image_size
 
 POSES, SEQUENCES = "frame-*.pose.txt", "seq-*"
 LOOKS = f"{POSES} or {SEQUENCES}/{POSES} (7-Scenes folder)"

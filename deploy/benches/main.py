@@ -1,0 +1,134 @@
+"""Measurements: `prior-sg bench NAME --json`. Keys are fixed; docs/performance.md keeps figures with their commands."""
+
+import os
+import platform
+import statistics
+import time
+from collections.abc import Callable
+from typing import Any
+
+from prior_sg.deploy.benches import features as bench_features
+from prior_sg.deploy.benches import segmenter
+from prior_sg.deploy.benches.bus import bus_bench
+from prior_sg.deploy.benches.encoder_swap import encoder_swap
+from prior_sg.deploy.benches.kernel import kernel
+from prior_sg.deploy.benches.learning import learning_bench
+from prior_sg.deploy.benches.places import place_bench
+from prior_sg.deploy.benches.swap import swap_bench
+from prior_sg.deploy.sample import SAMPLE
+from prior_sg.schemas.frames import Keyframe
+from prior_sg.schemas.priors import PriorRequest, Task
+from prior_sg.schemas.topics import PRIORS, TEXT, Query
+from prior_sg.services.ingest.sources import open_source
+from prior_sg.services.registry import BY_NAME
+from prior_sg.services.runtime.service import Ask, Identity
+
+
+def machine() -> dict[str, Any]:
+    """Where a figure was measured."""
+    return {"cores": os.cpu_count(), "processor": platform.machine(), "system": platform.system()}
+
+
+def _sample_keyframes() -> list[Keyframe]:
+    """Every frame of the sample as a keyframe."""
+    keyframes = []
+    for frame in open_source(SAMPLE):
+        fields = {name: getattr(frame, name) for name in Keyframe.__struct_fields__ if hasattr(frame, name)}
+        keyframes.append(Keyframe(robot="bench", **fields))
+    return keyframes
+
+
+def _percentiles(milliseconds: list[float]) -> dict[str, float]:
+    ordered = sorted(milliseconds)
+    return {"ms_p50": statistics.median(ordered), "ms_p99": ordered[min(len(ordered) - 1, int(0.99 * len(ordered)))]}
+
+
+def places() -> tuple[dict, dict]:
+    """The place graph per keyframe of the sample; see `prior_sg.deploy.benches.places`."""
+    return place_bench(_sample_keyframes())
+
+
+def features() -> tuple[dict, dict]:
+    """The pool of feature workers against the bare model."""
+    return bench_features.features(_sample_keyframes())
+
+
+def attacked_pool(seconds: float) -> tuple[dict, dict]:
+    """A pool whose workers are killed, frozen, slowed and added at random."""
+    return bench_features.attacked(_sample_keyframes(), seconds, rate_hz=40.0)
+
+
+def exchanged_encoder() -> tuple[dict, dict]:
+    """A worker of another embedding space joins in mid-run; see `prior_sg.deploy.benches.encoder_swap`."""
+    return encoder_swap(SAMPLE)
+
+
+def bus() -> tuple[dict, dict]:
+    """The typed bus against bare Zenoh."""
+    return bus_bench(_sample_keyframes()[0])
+
+
+class Pipeline:
+    """Mapping, encoding and segmenting in one thread, for timing what lies between a keyframe and its regions."""
+
+    def __init__(self) -> None:
+        names = ("place_graph", "feature_pyramid", "segmenter", "prior_gateway")
+        self.services = {name: BY_NAME[name] for name in names}
+        self.configs: dict[str, Any] = {name: service.config() for name, service in self.services.items()}
+        self.states = {
+            name: service.init(self.configs[name], Identity("bench", "b", 1)) for name, service in self.services.items()
+        }
+
+    def step(self, name: str, message: Any) -> list[Any]:
+        """What one step publishes; questions of the segmenter to the encoder are answered on the spot."""
+        published: list[Any] = []
+        for output in list(self.services[name].step(self.states[name], message, self.configs[name])):
+            if not isinstance(output, Ask):
+                published.append(output[1])
+            elif output.query is TEXT:
+                self.step(name, self.answer("feature_pyramid", TEXT, output.request))
+        return published
+
+    def answer(self, name: str, query: Query, request: Any) -> Any:
+        """One service's answer."""
+        return self.services[name].answers[query](self.states[name], request, self.configs[name])
+
+
+def e2e() -> tuple[dict, dict]:
+    """Keyframe in hand → region delta that follows from it, encoder time excluded, without transport."""
+    pipeline, keyframes = Pipeline(), _sample_keyframes()
+    request = PriorRequest(environment="residential home", task="real-estate listing")
+    prior = pipeline.answer("prior_gateway", PRIORS, request).priors[0]
+    pipeline.step("segmenter", Task(robot="bench", stamp_ns=0, environment=request.environment, task=request.task))
+    pipeline.step("segmenter", prior)
+    spent = []
+    for keyframe in keyframes:
+        pyramids = pipeline.step("feature_pyramid", keyframe)
+        started_s = time.perf_counter()
+        for message in pipeline.step("place_graph", keyframe) + pyramids:
+            pipeline.step("segmenter", message)
+        spent.append(1e3 * (time.perf_counter() - started_s))
+    return _percentiles(spent[3:]), {"keyframes": len(keyframes), "transport": "none (see bench bus)"}
+
+
+BENCHES: dict[str, Callable[[], tuple[dict, dict]]] = {
+    "bus": bus,
+    "places": places,
+    "features": features,
+    "kernel": kernel,
+    "swap": swap_bench,
+    "segmenter": segmenter.updates,
+    "task": segmenter.switch,
+    "learning": learning_bench,
+    "encoder_swap": exchanged_encoder,
+    "e2e": e2e,
+}
+
+
+POOL = "pool"  # lasts as long as it is told to, so it is no part of `all`
+
+
+def run(name: str, seconds: float) -> dict[str, Any]:
+    """One measurement as the object that `--json` prints; `seconds` are those of the attacked pool."""
+    metrics, settings = attacked_pool(seconds) if name == POOL else BENCHES[name]()
+    return {"bench": name, "metrics": metrics, "machine": machine(), "settings": settings}

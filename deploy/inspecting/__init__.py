@@ -1,0 +1,1 @@
+"""Looking at logs, places and topics."""

@@ -1,0 +1,218 @@
+"""Feeds a recorded log to one service again, in the order it consumed its inputs, and compares what comes out."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from prior_sg.schemas.codec import Message, copied, decode, encode
+from prior_sg.schemas.frames import Keyframe
+from prior_sg.schemas.status import Consumed, Started, Tick
+from prior_sg.schemas.topics import JOURNAL, KEYFRAME, QUERIES, TOPICS, Topic
+from prior_sg.services.registry import BY_NAME
+from prior_sg.services.runtime.record import LogError, Logged, read_log
+from prior_sg.services.runtime.service import Ask, Identity, Service
+
+TOPIC_BY_NAME = {topic.name: topic for topic in TOPICS}
+QUERY_BY_NAME = {query.name: query for query in QUERIES}
+
+
+@dataclass
+class Life:
+    """One instance of a service, from its start to its end, as its journal tells."""
+
+    service: str
+    instance: str
+    started: Started
+    inputs: list[Consumed] = field(default_factory=list)
+    ended_cleanly: bool = False
+
+
+@dataclass
+class Comparison:
+    """Replayed outputs of one life against the recorded ones."""
+
+    instance: str
+    inputs: int
+    outputs: int
+    recorded: int
+    differences: list[str]
+
+
+def lives(journal: list[Consumed], service: str) -> list[Life]:
+    """The lives of one service's instances in a journal, in order of start."""
+    found: dict[str, Life] = {}
+    for entry in sorted((e for e in journal if e.service == service), key=lambda e: (e.instance, e.order)):
+        if entry.topic == "START":
+            found[entry.instance] = Life(service, entry.instance, decode(Started, entry.inline))
+        elif entry.instance not in found:  # its start was not recorded: it cannot be replayed
+            continue
+        elif entry.topic == "STOP":
+            found[entry.instance].ended_cleanly = True
+        else:
+            found[entry.instance].inputs.append(entry)
+    return sorted(found.values(), key=lambda life: life.started.epoch)
+
+
+class Log:
+    """A log in memory, indexed for replay of one service."""
+
+    def __init__(self, path: Path, service: Service) -> None:
+        wanted = {*service.reads, *service.writes, JOURNAL} | ({KEYFRAME} if service.job else set())
+        self.service = service
+        self.messages: dict[tuple[str, str, int], Logged] = {}
+        self.order: list[Logged] = []
+        self.frames: dict[int, Logged] = {}
+        journal: list[Consumed] = []
+        for logged in read_log(path, wanted):
+            if logged.topic is JOURNAL:
+                journal.append(decode(Consumed, logged.payload))
+                continue
+            self.messages[logged.key, logged.writer, logged.sequence] = logged
+            self.order.append(logged)
+            if logged.topic is KEYFRAME:
+                self.frames[decode(Keyframe, logged.payload).frame_id] = logged
+        self.lives = lives(journal, service.name)
+
+    def input(self, entry: Consumed) -> Message:
+        """The message a journal entry means. Raises LogError when the log does not hold it."""
+        if entry.topic == "Tick":
+            return decode(Tick, entry.inline)
+        errands = {errand.name: errand for errand in self.service.errands}
+        if question := QUERY_BY_NAME.get(entry.topic) or errands.get(entry.topic):
+            return decode(question.reply, entry.inline)
+        topic = TOPIC_BY_NAME[entry.topic]
+        if topic.delivery == "job":
+            logged = self.frames.get(entry.frame_id)
+        elif not entry.writer:
+            return decode(topic.type, entry.inline)
+        else:
+            logged = self.messages.get((entry.key, entry.writer, entry.sequence))
+        if logged is None:
+            raise LogError(f"the log lacks {entry.topic} {entry.sequence} of {entry.writer}, which was consumed")
+        return decode(topic.type, logged.payload)
+
+    def recorded(self, life: Life) -> dict[str, list[Message]]:
+        """What this life published, by topic, in order."""
+        writer = f"{life.service}/{life.instance}/{life.started.epoch}"
+        outputs: dict[str, list[Message]] = {}
+        for logged in self.order:
+            if logged.writer == writer:
+                outputs.setdefault(logged.topic.name, []).append(decode(logged.topic.type, logged.payload))
+        return outputs
+
+
+def replay_life(log: Log, life: Life) -> Iterator[tuple[Topic, Message]]:
+    """The outputs of one life, made again from its recorded inputs and config."""
+    service = log.service
+    cfg = service.replay_config(msgspec.json.decode(life.started.config, type=service.config))
+    state = service.init(cfg, Identity(life.started.robot, life.instance, life.started.epoch))
+    try:
+        for entry in life.inputs:
+            for output in service.step(state, log.input(entry), cfg):
+                if not isinstance(output, Ask):
+                    yield output[0], copied(output[1])
+    finally:
+        service.close(state)
+
+
+def final_state(log: Log, life: Life) -> tuple[Any, Any]:
+    """State and config of one life after its recorded inputs; the caller closes the state."""
+    service = log.service
+    cfg = service.replay_config(msgspec.json.decode(life.started.config, type=service.config))
+    state = service.init(cfg, Identity(life.started.robot, life.instance, life.started.epoch))
+    for entry in life.inputs:
+        for _ in service.step(state, log.input(entry), cfg):
+            pass
+    return state, cfg
+
+
+def compare(log: Log, life: Life) -> Comparison:
+    """Replay one life and compare, message by message and field by field."""
+    replayed: dict[str, list[Message]] = {}
+    for topic, message in replay_life(log, life):
+        if topic.recorded:
+            replayed.setdefault(topic.name, []).append(message)
+    recorded = log.recorded(life)
+    differences: list[str] = []
+    tolerance = log.service.replay_tolerance
+    for name in sorted(replayed.keys() | recorded.keys()):
+        new, old = replayed.get(name, []), recorded.get(name, [])
+        # A process killed in mid-step may have published outputs of an input that never reached its journal.
+        if len(new) != len(old) and (life.ended_cleanly or len(new) > len(old)):
+            differences.append(f"{name}: {len(old)} recorded, {len(new)} replayed")
+        for index, (before, after) in enumerate(zip(old, new, strict=False)):
+            differences += [f"{name}[{index}].{text}" for text in message_differences(before, after, tolerance)]
+    return Comparison(
+        life.instance,
+        len(life.inputs),
+        sum(map(len, replayed.values())),
+        sum(map(len, recorded.values())),
+        differences,
+    )
+
+
+def message_differences(before: Message, after: Message, tolerance: float = 0.0) -> list[str]:
+    """Fields in which two messages differ, floats beyond the tolerance."""
+    if encode(before) == encode(after):
+        return []
+    return list(_differences("", before, after, tolerance))
+
+
+def _differences(path: str, before: Any, after: Any, tolerance: float) -> Iterator[str]:
+    if isinstance(before, msgspec.Struct) and type(before) is type(after):
+        for name in before.__struct_fields__:
+            yield from _differences(
+                f"{path}.{name}" if path else name, getattr(before, name), getattr(after, name), tolerance
+            )
+    elif isinstance(before, np.ndarray):
+        if before.shape != after.shape:
+            yield f"{path}: shape {before.shape} became {after.shape}"
+        elif before.dtype != after.dtype:
+            yield f"{path}: {before.dtype} became {after.dtype}"
+        elif before.dtype.kind != "f":
+            if not np.array_equal(before, after):
+                yield f"{path}: {np.count_nonzero(before != after)} entries differ"
+        elif not np.allclose(before, after, rtol=tolerance, atol=tolerance):
+            worst = np.abs(np.asarray(before, float) - np.asarray(after, float)).max()
+            yield f"{path}: differs by up to {worst:.3g}"
+    elif isinstance(before, (list, tuple)):
+        if len(before) != len(after):
+            yield f"{path}: {len(before)} items became {len(after)}"
+            return
+        for index, (one, other) in enumerate(zip(before, after, strict=True)):
+            yield from _differences(f"{path}[{index}]", one, other, tolerance)
+    elif isinstance(before, float) and isinstance(after, float):
+        if not math.isclose(before, after, rel_tol=tolerance, abs_tol=tolerance):
+            yield f"{path}: {before!r} became {after!r}"
+    elif before != after:
+        yield f"{path}: {before!r} became {after!r}"
+
+
+def undisturbed(log: Log) -> Any:
+    """A fresh state of the service that has read everything recorded on its topics, in the order of the log.
+
+    The caller closes it. What a service that was never interrupted would hold.
+    """
+    service = log.service
+    cfg = service.replay_config(service.config())
+    state = service.init(cfg, Identity("*", "undisturbed", 0))
+    for logged in log.order:
+        if logged.topic in service.reads:
+            for _ in service.step(state, decode(logged.topic.type, logged.payload), cfg):
+                pass
+    return state
+
+
+def open_log(path: Path, service: str) -> Log:
+    """Read what a replay of the service needs. Raises LogError when the log holds nothing of it."""
+    if BY_NAME[service].drive is not None:
+        raise LogError(f"{service} reads its source, not the bus: there is nothing to replay")
+    log = Log(path, BY_NAME[service])
+    if not log.lives:
+        raise LogError(f"{path} holds no journal of {service}; was it running while the log was recorded?")
+    return log

@@ -1,0 +1,69 @@
+"""All services in this process on the local bus: for debuggers and profilers. Same hosts, same messages."""
+
+import asyncio
+import os
+import threading
+import time
+from concurrent.futures import Future
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from prior_sg.deploy.running.serve import resolved_config
+from prior_sg.deploy.running.supervisor import ChildFailed
+from prior_sg.services.registry import BY_NAME
+from prior_sg.services.runtime.bus import Hub, LocalBus
+from prior_sg.services.runtime.host.host import Host
+from prior_sg.services.runtime.service import Identity
+
+STOP_TIMEOUT_S = 10.0
+
+
+@dataclass
+class InProcess:
+    """What `Supervisor` does with processes, done with hosts on one event loop in a thread."""
+
+    robot: str
+    log_folder: Path
+    settings: list[str] = field(default_factory=list)
+    config: str = ""
+    connect: str = "this process"
+
+    def __post_init__(self) -> None:
+        self.hub = Hub()
+        self._loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self._loop.run_forever, name="services", daemon=True)
+        self._thread.start()
+        self._running: dict[str, tuple[Host, Future]] = {}
+
+    def start(self, service: str, copies: int = 1) -> None:
+        """Start one service, or several workers of it."""
+        for number in range(copies):
+            instance = f"{service}-{number + 1}"
+            host = asyncio.run_coroutine_threadsafe(self._host(service, instance), self._loop).result()
+            self._running[instance] = host, asyncio.run_coroutine_threadsafe(host.run(), self._loop)
+
+    async def _host(self, name: str, instance: str) -> Host:
+        service = BY_NAME[name]
+        cfg = resolved_config(service, self.config, self.settings)
+        robot = self.robot if service.scope == "robot" else "*"
+        return Host(service, LocalBus(self.hub), cfg, Identity(robot, instance, time.time_ns()))
+
+    def pids(self) -> dict[str, int]:
+        """This process, for every instance."""
+        return dict.fromkeys(self._running, os.getpid())
+
+    def check(self) -> list[str]:
+        """Nothing is restarted here: a service that fails ends the run. Raises ChildFailed."""
+        for instance, (_, running) in self._running.items():
+            if running.done() and (error := running.exception()) is not None:
+                raise ChildFailed(f"{instance} failed: {error!r}") from error
+        return []
+
+    def stop(self) -> None:
+        """Ask every service to end, and wait."""
+        for host, _ in self._running.values():
+            self._loop.call_soon_threadsafe(host.stop)
+        for _, running in self._running.values():
+            running.exception(STOP_TIMEOUT_S)
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join(STOP_TIMEOUT_S)

@@ -1,0 +1,295 @@
+"""The main job: start everything, stream a source, wait until all is settled, write the results."""
+
+import contextlib
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TaskID, TextColumn, TimeElapsedColumn
+
+from prior_sg.deploy.running.inprocess import InProcess
+from prior_sg.deploy.running.recorder import Recorder, Settling
+from prior_sg.deploy.running.serve import resolved_config
+from prior_sg.deploy.running.supervisor import Supervisor
+from prior_sg.schemas.codec import DecodeError, Message, decode, encode
+from prior_sg.schemas.features import Pyramid
+from prior_sg.schemas.frames import IngestState, Keyframe
+from prior_sg.schemas.objects import Detections
+from prior_sg.schemas.places import MapRequest, VoxelMap
+from prior_sg.schemas.priors import Prior, Task
+from prior_sg.schemas.regions import RegionDelta
+from prior_sg.schemas.scene import Scene, SceneRequest
+from prior_sg.schemas.topics import INGEST_STATE, KEYFRAME, PLACE_DELTA, PYRAMID, REGION_DELTA, SCENE, VOXEL_MAP
+from prior_sg.services.registry import SERVICES
+from prior_sg.services.runtime.bus import Bus, LocalBus, Sample
+from prior_sg.services.runtime.client import Client, NoPriorError
+from prior_sg.services.runtime.zenoh_bus import ZenohBus, free_endpoint, open_router
+
+QUIET_S = 1.5
+START_TIMEOUT_S = 180.0
+PRIOR_TIMEOUT_S = 900.0  # a model may need minutes
+POLL_S = 0.1
+STALL_AFTER_S = 120.0
+
+
+class RunError(Exception):
+    """The run cannot go on; the message says what to do."""
+
+
+@dataclass
+class Job:
+    """What to run."""
+
+    source: str
+    out: Path
+    environment: str
+    task: str
+    regions: list[str] = field(default_factory=list)
+    robot: str = "robot1"
+    connect: str = "tcp/127.0.0.1:7447"
+    workers: int = 1
+    speed: float = 0.0  # 0 = as fast as the pipeline drains
+    settings: list[str] = field(default_factory=list)
+    config: str = ""
+    in_process: bool = False  # all services in this process on the local bus
+    on_started: Callable[[str, dict[str, int]], None] = lambda endpoint, pids: None
+
+
+@dataclass
+class Result:
+    """What came out."""
+
+    scene: Scene
+    voxels: VoxelMap
+    log_path: Path
+    counts: "Counts"
+    seconds: float
+    prior: Prior  # that the task got when it was given
+
+
+@dataclass
+class Counts:
+    """A tap on the recorded samples: what was made, by frame."""
+
+    keyframes: set[int] = field(default_factory=set)
+    pyramids: dict[int, int] = field(default_factory=dict)
+    crops: int = 0
+    crops_total: int = 0
+    ingest: IngestState | None = None
+    regions: RegionDelta | None = None
+    detectors: set[str] = field(default_factory=set)
+
+    def __call__(self, sample: Sample, message: Message) -> None:
+        """See one message."""
+        match message:
+            case Keyframe():
+                self.keyframes.add(message.frame_id)
+            case Pyramid():
+                self.pyramids[message.frame_id] = self.pyramids.get(message.frame_id, 0) + 1
+                self.crops += len(message.embeddings)
+                self.crops_total += message.crops_total
+            case Detections():
+                self.detectors.add(message.detector)
+            case RegionDelta():
+                self.regions = message
+
+    def encoded_summary(self) -> str:
+        """One line about exactly-once encoding."""
+        repeated = sum(count - 1 for count in self.pyramids.values())
+        missing = len(self.keyframes - set(self.pyramids))
+        return f"{len(self.keyframes)} keyframes, {len(self.pyramids)} encoded, {repeated} repeated, {missing} missing"
+
+
+def make_folder(path: Path) -> None:
+    """Create the output folder. Raises RunError."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RunError(f"cannot write to {path} ({error.strerror}); choose another folder with --out") from error
+
+
+def check_settings(config: str, settings: list[str]) -> None:
+    """Resolve the config of every service now, so that a wrong setting is told before anything starts."""
+    for service in SERVICES:
+        resolved_config(service, config, settings)
+
+
+def run(job: Job, console: Console) -> Result:
+    """Run one source to its end. Raises RunError, BusError, ChildFailed; KeyboardInterrupt ends it early, cleanly."""
+    make_folder(job.out)
+    database = job.out / "scene.sqlite"
+    for leftover in job.out.glob("scene.sqlite*"):
+        leftover.unlink()
+    settings = [
+        f"scene_store.path={database}",
+        f"ingest.source={job.source}",
+        f"ingest.speed={job.speed}",
+        *job.settings,
+    ]
+    check_settings(job.config, settings)
+    logs = job.out / "logs"
+    if job.in_process:
+        services = InProcess(job.robot, logs, settings, job.config)
+        return _run_on(LocalBus(services.hub), services, job, console)
+    endpoint = free_endpoint(job.connect)
+    if endpoint != job.connect:
+        console.print(f"{job.connect} is in use; this run's router listens on {endpoint} (--connect {endpoint})")
+    stop_router = open_router(endpoint)
+    try:
+        supervisor = Supervisor(endpoint, job.robot, logs, settings, job.config)
+        return _run_on(ZenohBus(endpoint), supervisor, job, console)
+    finally:
+        stop_router()
+
+
+def _run_on(bus: Bus, supervisor: "Supervisor | InProcess", job: Job, console: Console) -> Result:
+    started_s = time.monotonic()
+    with Client(bus) as client:
+        recorder = Recorder(client, job.out / "log.mcap")
+        try:
+            return Run(job, console, client, recorder, supervisor).stream(started_s)
+        finally:
+            supervisor.stop()
+            recorder.close()
+
+
+class Run:
+    """One run under way: its services, its bus, and what it has seen."""
+
+    def __init__(
+        self,
+        job: Job,
+        console: Console,
+        client: Client,
+        recorder: Recorder,
+        supervisor: "Supervisor | InProcess",
+    ) -> None:
+        self.job, self.console, self.client, self.recorder, self.supervisor = job, console, client, recorder, supervisor
+        self.counts = Counts()
+        self.settling = Settling((KEYFRAME, PLACE_DELTA, PYRAMID, REGION_DELTA))
+        self.interrupted = threading.Event()
+        recorder.taps += [self.counts, self.settling]
+        client.listen(INGEST_STATE, job.robot, self._saw_ingest)
+
+    def _saw_ingest(self, sample: Sample) -> None:
+        with contextlib.suppress(DecodeError):
+            self.counts.ingest = decode(IngestState, sample.payload)
+
+    def stream(self, started_s: float) -> Result:
+        """Start everything, follow the stream to its end, read the result."""
+        with _progress(self.console) as progress, _interrupt_sets(self.interrupted):
+            bar = progress.add_task("starting services", total=None)
+            names = [service.name for service in SERVICES if service.name != "ingest"]
+            self._start(names)
+            progress.update(bar, description="asking for the prior")
+            prior = self._task(lambda reason: progress.update(bar, description=reason or "asking for the prior"))
+            progress.console.print(f"prior: {prior.provenance.source}, {prior.provenance.note}")
+            self._start(["ingest"])  # last: the stream must not begin before its readers stand
+            self.job.on_started(self.supervisor.connect, self.supervisor.pids())
+            self._follow(progress, bar)
+            progress.update(bar, description="reading the scene")
+            scene = self.client.ask(SCENE, SceneRequest(robot=self.job.robot), 30.0)
+            voxels = self.client.ask(VOXEL_MAP, MapRequest(robot=self.job.robot), 30.0)
+        self.recorder.attachments["scene.msgpack"] = ("application/msgpack", encode(scene))
+        self.recorder.attachments["voxels.msgpack"] = ("application/msgpack", encode(voxels))
+        return Result(scene, voxels, self.job.out / "log.mcap", self.counts, time.monotonic() - started_s, prior)
+
+    def _start(self, names: list[str]) -> None:
+        """Start services and wait until they are seen."""
+        wanted = {name: self.job.workers if name == "feature_pyramid" else 1 for name in names}
+        for name, copies in wanted.items():
+            self.supervisor.start(name, copies)
+        deadline_s = time.monotonic() + START_TIMEOUT_S
+        while True:
+            alive = list(self.client.alive().values())
+            missing = [name for name, copies in wanted.items() if alive.count(name) < copies]
+            if not missing:
+                return
+            if self.interrupted.is_set():
+                raise KeyboardInterrupt
+            self.supervisor.check()
+            if time.monotonic() > deadline_s:
+                where = self.supervisor.log_folder
+                raise RunError(f"not started within {START_TIMEOUT_S:.0f} s: {', '.join(missing)}; see {where}")
+            time.sleep(POLL_S)
+
+    def _task(self, say: Callable[[str], None]) -> Prior:
+        """Give the task; returns the prior it gets. Raises RunError with the gateway's reason when there is none."""
+        job = self.job
+        task = Task(
+            robot=job.robot,
+            stamp_ns=time.time_ns(),
+            environment=job.environment,
+            task=job.task,
+            regions=job.regions,
+        )
+        try:
+            return self.client.give_task(task, PRIOR_TIMEOUT_S, say)
+        except NoPriorError as error:
+            raise RunError(str(error)) from error
+
+    def _follow(self, progress: Progress, bar: TaskID) -> None:
+        """Show progress until the source has ended and everything has settled, or the user interrupts."""
+        finished, moved_s, last = False, time.monotonic(), (0, 0)
+        while not (finished and self.settling.settled(QUIET_S)):
+            for event in self.supervisor.check():
+                progress.console.print(event)
+            if (state := self.counts.ingest) is not None:
+                finished = state.finished
+                progress.update(bar, total=state.frames_total or None, completed=state.frames_read)
+                if (state.frames_read, state.encoded) != last:
+                    last, moved_s = (state.frames_read, state.encoded), time.monotonic()
+            progress.update(bar, description=_description(self.counts, finished))
+            if self.interrupted.is_set():
+                progress.console.print("interrupted: writing what there is")
+                return
+            if time.monotonic() - max(moved_s, self.settling.changed_s) > STALL_AFTER_S:
+                said = f"nothing has moved for {STALL_AFTER_S:.0f} s; see the logs in {self.supervisor.log_folder}"
+                if not finished:
+                    raise RunError(said)
+                progress.console.print(f"{said}; writing what there is")
+                return
+            self.recorder.check()
+            time.sleep(POLL_S)
+
+
+def _description(counts: Counts, finished: bool) -> str:
+    encoded = f"{len(counts.pyramids)}/{len(counts.keyframes)} keyframes encoded"
+    regions = f", {len(counts.regions.labels)} labels" if counts.regions is not None else ""
+    return ("settling: " if finished else "streaming: ") + encoded + regions
+
+
+def _progress(console: Console) -> Progress:
+    return Progress(
+        SpinnerColumn(),
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        console=console,
+    )
+
+
+@contextmanager
+def _interrupt_sets(event: threading.Event) -> Iterator[None]:
+    """Ctrl-C or SIGTERM sets the event the first time and raises KeyboardInterrupt the second."""
+
+    def handle(number: int, frame: object) -> None:
+        if event.is_set():
+            raise KeyboardInterrupt
+        event.set()
+
+    if threading.current_thread() is not threading.main_thread():  # only the main thread may handle signals
+        yield
+        return
+    previous = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)

@@ -1,0 +1,110 @@
+"""Runs one service in this process: `python -m prior_sg.deploy.running.serve segmenter --robot robot1`."""
+
+import argparse
+import asyncio
+import contextlib
+import logging
+import os
+import signal
+import sys
+import time
+import uuid
+from typing import Any
+
+from prior_sg.services.ingest.sources import SourceError
+from prior_sg.services.registry import BY_NAME
+from prior_sg.services.runtime.bus import BusError
+from prior_sg.services.runtime.config import (
+    ConfigError,
+    check_sections,
+    from_arguments,
+    from_environment,
+    merge,
+    read_file,
+    resolve,
+)
+from prior_sg.services.runtime.host.host import Host
+from prior_sg.services.runtime.logs import start_logging
+from prior_sg.services.runtime.record import LogError
+from prior_sg.services.runtime.service import Identity, Service, ServiceError
+from prior_sg.services.runtime.zenoh_bus import ZenohBus
+
+log = logging.getLogger(__name__)
+PARENT_CHECK_S = 1.0
+HOPELESS = (ConfigError, BusError, ServiceError, SourceError, LogError)  # their messages say what to do
+EXIT_HOPELESS = 2  # starting again would fail again
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """What a service process can be told."""
+    parser.add_argument("service", choices=sorted(BY_NAME), help="which service to run")
+    parser.add_argument("--robot", default="robot1", help="name of the robot whose streams it serves")
+    parser.add_argument("--connect", default=os.environ.get("PSG_CONNECT", "tcp/127.0.0.1:7447"), help="Zenoh router")
+    parser.add_argument("--instance", default="", help="name of this process; default: a random one")
+    parser.add_argument("--config", default="", help="TOML file with a section per service")
+    parser.add_argument("--set", action="append", default=[], metavar="SERVICE.FIELD=VALUE", help="one setting")
+    parser.add_argument("--log-level", default="info", choices=("debug", "info", "warning", "error"))
+    parser.add_argument("--parent", type=int, default=0, help="end when this process is gone")
+
+
+def resolved_config(service: Service, config_path: str, settings: list[str]) -> Any:
+    """The service's config from all layers. Raises ConfigError."""
+    file, given = read_file(config_path), from_arguments(settings)
+    check_sections(file, list(BY_NAME))
+    check_sections(given, list(BY_NAME))
+    return resolve(service.config, service.name, merge(file, from_environment(os.environ), given))
+
+
+async def serve(arguments: argparse.Namespace, instance: str) -> None:
+    """Run until a signal, or until the parent is gone."""
+    service = BY_NAME[arguments.service]
+    cfg = resolved_config(service, arguments.config, arguments.set)
+    bus = await asyncio.to_thread(ZenohBus, arguments.connect)
+    robot = arguments.robot if service.scope == "robot" else "*"
+    host = Host(service, bus, cfg, Identity(robot, instance, time.time_ns()))
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, host.stop)
+    watcher = asyncio.create_task(_stop_with_parent(host, arguments.parent))
+    try:
+        await host.run()
+    finally:
+        watcher.cancel()
+        bus.close()  # also when the service never got so far as to leave by itself
+
+
+async def _stop_with_parent(host: Host, parent: int) -> None:
+    while not parent or os.getppid() == parent:
+        await asyncio.sleep(PARENT_CHECK_S)
+    host.stop()
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Exit status of one service process."""
+    instance = arguments.instance or f"{arguments.service}-{uuid.uuid4().hex[:8]}"
+    start_logging(arguments.service, instance, arguments.log_level)
+    try:
+        with contextlib.suppress(ImportError):
+            import uvloop
+
+            asyncio.set_event_loop_policy(uvloop.EventLoopPolicy())
+        asyncio.run(serve(arguments, instance))
+    except HOPELESS as error:
+        log.error(str(error))
+        return EXIT_HOPELESS
+    except Exception:
+        log.exception("the service failed")
+        return 1
+    log.info("stopped")
+    return 0
+
+
+def main() -> int:
+    """Entry point of `python -m prior_sg.deploy.running.serve`."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    add_arguments(parser)
+    return run(parser.parse_args())
+
+
+if __name__ == "__main__":
+    sys.exit(main())

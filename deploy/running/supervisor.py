@@ -1,0 +1,150 @@
+"""Child processes: one per service instance, restarted when they die, stopped in order."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+import uuid
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from prior_sg.deploy.running.serve import EXIT_HOPELESS
+from prior_sg.services.registry import BY_NAME
+
+RESTART_DELAY_S = 0.5
+MAX_RESTART_DELAY_S = 10.0
+STABLE_AFTER_S = 20.0
+GIVE_UP_AFTER = 5
+STOP_TIMEOUT_S = 10.0
+THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
+
+class ChildFailed(Exception):
+    """A service keeps dying; the message says where its log is."""
+
+
+@dataclass
+class Child:
+    """One service process and its history."""
+
+    service: str
+    instance: str
+    arguments: list[str]
+    log_path: Path
+    threads: int
+    process: subprocess.Popen | None = None
+    started_s: float = 0.0
+    deaths: int = 0
+    restarts: int = 0
+    restart_at_s: float = 0.0
+
+    def start(self) -> None:
+        """Start the process; its log is appended to."""
+        command = [
+            sys.executable,
+            "-m",
+            "prior_sg.deploy.running.serve",
+            self.service,
+            "--parent",
+            str(os.getpid()),
+            *self.arguments,
+        ]
+        # Unique on the bus: another robot, host or run may have a process of the same short name.
+        instance = f"{self.instance}-{uuid.uuid4().hex[:6]}"
+        environment = os.environ | {name: str(self.threads) for name in THREAD_VARIABLES}
+        with self.log_path.open("ab") as log:
+            self.process = subprocess.Popen(
+                [*command, "--instance", instance],
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+                start_new_session=True,
+                env=environment | {"OMP_WAIT_POLICY": "PASSIVE"},
+            )
+        self.started_s = time.monotonic()
+
+    def last_words(self) -> str:
+        """The end of its log, for an error message."""
+        lines = self.log_path.read_text(errors="replace").strip().splitlines() or ["(empty log)"]
+        try:
+            entry = json.loads(lines[-1])
+        except ValueError:
+            return lines[-1][-400:]
+        return entry.get("error", entry["event"]).splitlines()[-1]
+
+
+@dataclass
+class Supervisor:
+    """Starts services in the order given and stops them in the same order."""
+
+    connect: str
+    robot: str
+    log_folder: Path
+    settings: list[str] = field(default_factory=list)
+    config: str = ""
+    children: list[Child] = field(default_factory=list)
+
+    def start(self, service: str, copies: int = 1) -> None:
+        """Start one service, or several workers of it."""
+        self.log_folder.mkdir(parents=True, exist_ok=True)
+        # Workers share the cores; the others do much with little and would only get in each other's way.
+        threads = max(1, (os.cpu_count() or 1) // copies) if BY_NAME[service].job is not None else 1
+        for number in range(copies):
+            instance = f"{service}-{number + 1}"
+            arguments = ["--robot", self.robot, "--connect", self.connect]
+            arguments += ["--config", self.config] if self.config else []
+            for setting in self.settings:
+                arguments += ["--set", setting]
+            log_path = self.log_folder / f"{instance}.log"
+            log_path.unlink(missing_ok=True)
+            child = Child(service, instance, arguments, log_path, threads)
+            child.start()
+            self.children.append(child)
+
+    def pids(self) -> dict[str, int]:
+        """Process id of each running instance."""
+        return {
+            child.instance: child.process.pid
+            for child in self.children
+            if child.process is not None and child.process.poll() is None
+        }
+
+    def check(self) -> list[str]:
+        """Restart what has died; returns what happened, for the user. Raises ChildFailed when it keeps dying."""
+        events = []
+        now_s = time.monotonic()
+        for child in self.children:
+            if child.process is None:
+                if now_s >= child.restart_at_s:
+                    child.restarts += 1
+                    child.start()
+                    events.append(f"{child.instance} restarted")
+            elif (code := child.process.poll()) is not None:
+                child.deaths = 1 if now_s - child.started_s > STABLE_AFTER_S else child.deaths + 1
+                if code == EXIT_HOPELESS or child.deaths >= GIVE_UP_AFTER:
+                    raise ChildFailed(f"{child.instance} does not run: {child.last_words()} (log: {child.log_path})")
+                delay_s = min(RESTART_DELAY_S * 2 ** (child.deaths - 1), MAX_RESTART_DELAY_S)
+                child.process, child.restart_at_s = None, now_s + delay_s
+                why = f": {child.last_words()}" if code > 0 else ""
+                events.append(f"{child.instance} ended ({_reason(code)}){why}; restarting")
+        return events
+
+    def stop(self) -> None:
+        """Ask every process to end, in order; kill what does not."""
+        for child in self.children:
+            if child.process is not None and child.process.poll() is None:
+                child.process.send_signal(signal.SIGTERM)
+        deadline_s = time.monotonic() + STOP_TIMEOUT_S
+        for child in self.children:
+            if child.process is not None:
+                try:
+                    child.process.wait(max(0.1, deadline_s - time.monotonic()))
+                except subprocess.TimeoutExpired:
+                    child.process.kill()
+                    child.process.wait()
+
+
+def _reason(code: int) -> str:
+    return f"signal {signal.Signals(-code).name}" if code < 0 else f"exit status {code}"

@@ -1,0 +1,131 @@
+"""Packs a dataset folder into a sample: one MCAP log of keyframes with its ground truth and where it comes from.
+
+python -m prior_sg.deploy.sample.make DATASET OUT --provenance SENTENCE
+"""
+
+import argparse
+import json
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from prior_sg.schemas.codec import encode
+from prior_sg.schemas.frames import Keyframe
+from prior_sg.schemas.topics import KEYFRAME
+from prior_sg.services.ingest.core.selection import RawFrame
+from prior_sg.services.ingest.sources import Source, SourceError, open_source
+from prior_sg.services.ingest.sources.images import jpeg_segments
+from prior_sg.services.runtime.record import LogError, LogWriter
+
+ROBOT = "sample"
+QUALITIES = (None, 92, 85, 75)  # of the JPEG; None = as it is
+PNG_EFFORT = (cv2.IMWRITE_PNG_COMPRESSION, 9)
+JPEG_KEPT = frozenset({0xE0, 0xEE}) | frozenset(range(0xC0, 0xE0))  # JFIF and Adobe headers, and what decoding needs
+
+
+class PackError(RuntimeError):
+    """The folder cannot be packed; the text is one sentence."""
+
+
+def pack(dataset: str | Path, path: str | Path, max_mb: float = 12, provenance: str = "") -> int:
+    """Write all frames of a dataset folder to an MCAP log of at most `max_mb` and return how many there are.
+
+    Depth stays exact. Colour is compressed again only when the log is too large otherwise. Equal folders give equal
+    logs. `provenance` is a sentence that travels in the log. Raises PackError, SourceError or LogError.
+    """
+    source, path = open_source(dataset), Path(path)
+    partial = path.with_name(f"{path.name}.partial")
+    try:
+        for quality in QUALITIES:
+            _write(source, partial, quality, provenance)
+            if partial.stat().st_size <= max_mb * 1e6:
+                partial.replace(path)
+                return source.total
+    finally:
+        partial.unlink(missing_ok=True)
+    raise PackError(f"{dataset} does not fit into {max_mb:g} MB: pack fewer frames or allow more")
+
+
+def _write(source: Source, path: Path, quality: int | None, provenance: str) -> None:
+    with LogWriter(path) as log:
+        log.metadata("source", {"provenance": provenance})
+        if source.ground_truth is not None:
+            log.attach("regions.json", "application/json", json.dumps(source.ground_truth).encode())
+        for sequence, keyframe in enumerate(_keyframes(source, quality)):
+            log.add(
+                KEYFRAME,
+                KEYFRAME.key_of(keyframe),
+                encode(keyframe),
+                writer=ROBOT,
+                sequence=sequence,
+                sent_ns=keyframe.stamp_ns,
+                received_ns=keyframe.stamp_ns,
+            )
+
+
+def _keyframes(source: Source, quality: int | None) -> Iterator[Keyframe]:
+    for frame in source:
+        if not isinstance(frame, RawFrame):
+            raise PackError(f"frame {frame.frame_id} of {source.path} cannot be packed: {frame.reason}")
+        yield Keyframe(
+            robot=ROBOT,
+            frame_id=frame.frame_id,
+            stamp_ns=frame.stamp_ns,
+            intrinsics=frame.intrinsics,
+            world_from_camera=frame.world_from_camera,
+            color=bare_jpeg(frame.color) if quality is None else _recompressed(frame.color, quality),
+            depth=smallest_png(frame.depth),
+            depth_scale_m=frame.depth_scale_m,
+        )
+
+
+def bare_jpeg(jpeg: bytes) -> bytes:
+    """The same picture without comments, camera data and thumbnails; other formats pass unchanged."""
+    if not jpeg.startswith(b"\xff\xd8"):
+        return jpeg
+    return jpeg[:2] + b"".join(jpeg[start:end] for marker, start, end in jpeg_segments(jpeg) if marker in JPEG_KEPT)
+
+
+def smallest_png(png: bytes) -> bytes:
+    """The same 16-bit image, compressed as far as it goes and without comments."""
+    image = _decoded(png, cv2.IMREAD_UNCHANGED)
+    return cv2.imencode(".png", image, PNG_EFFORT)[1].tobytes()
+
+
+def _recompressed(color: bytes, quality: int) -> bytes:
+    image = _decoded(color, cv2.IMREAD_COLOR)
+    return cv2.imencode(".jpg", image, (cv2.IMWRITE_JPEG_QUALITY, quality))[1].tobytes()
+
+
+def _decoded(data: bytes, mode: int) -> np.ndarray:
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), mode)
+    if image is None:
+        raise PackError("an image of the folder cannot be decoded")
+    return image
+
+
+def main() -> int:
+    """Run from the command line."""
+    parser = argparse.ArgumentParser(
+        prog="python -m prior_sg.deploy.sample.make",
+        description="Pack a dataset folder into a sample log.",
+        epilog="example: python -m prior_sg.deploy.sample.make recordings/home deploy/sample/home.mcap",
+    )
+    parser.add_argument("dataset", metavar="DATASET", help="folder with camera.json and trajectory.csv")
+    parser.add_argument("out", metavar="OUT", help="MCAP file to write")
+    parser.add_argument("--max-mb", type=float, default=12, help="largest size of the log (default 12)")
+    parser.add_argument("--provenance", default="", help="sentence that says where the data comes from")
+    arguments = parser.parse_args()
+    try:
+        frames = pack(arguments.dataset, arguments.out, arguments.max_mb, arguments.provenance)
+    except (PackError, SourceError, LogError) as error:
+        sys.exit(str(error))
+    print(f"{frames} frames, {Path(arguments.out).stat().st_size / 1e6:.1f} MB in {arguments.out}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

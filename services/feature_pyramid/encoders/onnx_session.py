@@ -1,0 +1,87 @@
+"""ONNX Runtime: sessions, and a folder in the user's cache where exported networks are kept."""
+
+import hashlib
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from prior_sg.services.feature_pyramid.encoders.base import EncoderUnavailable
+
+
+class Session:
+    """One network, ready to run: arrays by input name to the first output."""
+
+    def __init__(self, path: Path, threads: int, device: str = "cpu") -> None:
+        runtime = _runtime()
+        options = runtime.SessionOptions()
+        options.log_severity_level = 3
+        options.intra_op_num_threads = threads_of(threads)
+        options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # idle threads leave others the cores
+        try:
+            self._session = runtime.InferenceSession(str(path), options, providers=_providers(runtime, device))
+        except Exception as error:  # the runtime raises exceptions of its own, without a common base
+            raise EncoderUnavailable(f"{path} is not a network that ONNX Runtime can load: {error}") from error
+        self.inputs = [entry.name for entry in self._session.get_inputs()]
+
+    def __call__(self, *arrays: np.ndarray) -> np.ndarray:
+        """The first output; inputs in the network's own order."""
+        return self._session.run(None, dict(zip(self.inputs, arrays, strict=True)))[0]
+
+
+def threads_of(threads: int) -> int:
+    """How many threads to use when so many are set; 0 = OMP_NUM_THREADS, or one a core."""
+    return threads or int(os.environ.get("OMP_NUM_THREADS", "0")) or os.cpu_count() or 1
+
+
+def cached(name: str, made_of: list[str], export: Callable[[Path], None], suffix: str = ".onnx") -> Path:
+    """The exported network `name`, or another file that takes long to make, made at first use.
+
+    `made_of` is everything that determines it (versions, weights): whatever changes gets a file of its own. Several
+    processes may export at once; a half-written file is never seen.
+    """
+    digest = hashlib.blake2b("\n".join(made_of).encode(), digest_size=8).hexdigest()
+    path = cache_folder() / f"{name}-{digest}{suffix}"
+    if not path.exists():
+        partial = path.with_name(f".{path.name}.{os.getpid()}")
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            export(partial)
+            partial.replace(path)
+        except OSError as error:
+            raise EncoderUnavailable(
+                f"cannot write to {path.parent} ({error.strerror}); set XDG_CACHE_HOME to a folder that can be "
+                "written, or feature_pyramid.runtime=torch"
+            ) from error
+        finally:
+            partial.unlink(missing_ok=True)
+    return path
+
+
+def cache_folder() -> Path:
+    """Where exports are kept: below XDG_CACHE_HOME, or the user's .cache."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "prior-sg" / "onnx"
+
+
+def _runtime() -> Any:
+    try:
+        import onnxruntime
+    except ImportError as error:
+        raise EncoderUnavailable(
+            "the package onnxruntime is not installed; run `pip install onnxruntime`, or set "
+            "feature_pyramid.runtime=torch"
+        ) from error
+    return onnxruntime
+
+
+def _providers(runtime: Any, device: str) -> list[str]:
+    if device == "cpu":
+        return ["CPUExecutionProvider"]
+    if "CUDAExecutionProvider" not in runtime.get_available_providers():
+        raise EncoderUnavailable(
+            "this build of ONNX Runtime has no CUDA; run `pip install onnxruntime-gpu`, or set "
+            "feature_pyramid.device=cpu"
+        )
+    return ["CUDAExecutionProvider", "CPUExecutionProvider"]

@@ -1,0 +1,120 @@
+"""What readers of the place graph know, and the delta that brings them up to date (pure)."""
+
+from typing import Any
+
+import numpy as np
+
+from prior_sg.services.place_graph.core.skeleton.graph import Changes, Place, PlaceGraph
+
+Pair = tuple[int, int]
+
+
+class Published:
+    """The graph as published: without components that are too small, and without changes that are too small."""
+
+    def __init__(self) -> None:
+        self.places: dict[int, Place] = {}
+        self.edges: dict[int, dict[int, int]] = {}  # id -> neighbour -> squared clearance (voxels)
+
+    def update(
+        self, graph: PlaceGraph, changes: Changes, voxel_m: float, min_component_size: int, min_change_m: float
+    ) -> dict[str, Any]:
+        """Array fields of the PlaceDelta that follows from `changes`; what it says is remembered as published."""
+        affected = _within_hops(graph, changes.touched, min_component_size)
+        shown = {i for i in affected if i in graph.places and _component_reaches(graph, i, min_component_size)}
+        gone = [i for i in affected if i in self.places and i not in shown]
+        changed_edges, lost_edges = self._edge_changes(graph, affected, shown, voxel_m, min_change_m)
+        upserts = [i for i in sorted(shown) if _differs(self.places.get(i), graph.places[i], voxel_m, min_change_m)]
+        for place_id in gone:
+            del self.places[place_id]
+        for place_id in upserts:
+            self.places[place_id] = graph.places[place_id]
+        merged = [(i, changes.merged[i]) for i in gone if changes.merged.get(i) in self.places]
+        removed = sorted(set(gone) - {i for i, _ in merged})
+        self._forget(lost_edges)
+        for (a, b), clearance in changed_edges:
+            self.edges.setdefault(a, {})[b] = self.edges.setdefault(b, {})[a] = clearance
+        implied = set(removed)
+        explicit = [pair for pair in lost_edges if not implied.intersection(pair)]
+        return _place_fields([(i, self.places[i]) for i in upserts], voxel_m) | {
+            "removed_ids": np.array(removed, np.int64),
+            "merged_ids": np.array(merged, np.int64).reshape(-1, 2),
+            "removed_edges": np.array(explicit, np.int64).reshape(-1, 2),
+            **_edge_fields(changed_edges, voxel_m),
+        }
+
+    def snapshot(self, voxel_m: float) -> dict[str, Any]:
+        """Array fields of the PlaceDelta that tells everything."""
+        edges = sorted(((a, b), c) for a, links in self.edges.items() for b, c in links.items() if a < b)
+        return _place_fields(sorted(self.places.items()), voxel_m) | {
+            "removed_ids": np.empty(0, np.int64),
+            "merged_ids": np.empty((0, 2), np.int64),
+            "removed_edges": np.empty((0, 2), np.int64),
+            **_edge_fields(edges, voxel_m),
+        }
+
+    def _edge_changes(
+        self, graph: PlaceGraph, affected: list[int], shown: set[int], voxel_m: float, min_change_m: float
+    ) -> tuple[list[tuple[Pair, int]], list[Pair]]:
+        """Edges to upsert and edges that are gone, each with its smaller id first, sorted."""
+        upserts: dict[Pair, int] = {}
+        lost: set[Pair] = set()
+        for a in affected:
+            links = graph.edges.get(a, {}) if a in shown else {}
+            for b, clearance in links.items():
+                # Neighbours of a shown place are in its component, hence shown too.
+                known = self.edges.get(a, {}).get(b)
+                if known is None or abs(known**0.5 - clearance**0.5) * voxel_m > min_change_m:
+                    upserts[min(a, b), max(a, b)] = clearance
+            lost.update((min(a, b), max(a, b)) for b in self.edges.get(a, {}) if b not in links)
+        return sorted(upserts.items()), sorted(lost)
+
+    def _forget(self, pairs: list[Pair]) -> None:
+        for a, b in pairs:
+            for one, two in ((a, b), (b, a)):
+                del self.edges[one][two]
+                if not self.edges[one]:
+                    del self.edges[one]
+
+
+def _within_hops(graph: PlaceGraph, ids: set[int], hops: int) -> list[int]:
+    """Ids and all places at most `hops` edges away, ascending: whose component size may have crossed the limit."""
+    found, front = set(ids), set(ids)
+    for _ in range(hops):
+        front = {b for a in front for b in graph.edges.get(a, ())} - found
+        found |= front
+    return sorted(found)
+
+
+def _component_reaches(graph: PlaceGraph, start: int, size: int) -> bool:
+    found, stack = {start}, [start]
+    while stack and len(found) < size:
+        fresh = set(graph.edges.get(stack.pop(), ())) - found
+        found |= fresh
+        stack.extend(fresh)
+    return len(found) >= size
+
+
+def _differs(known: Place | None, place: Place, voxel_m: float, min_change_m: float) -> bool:
+    """Whether readers must hear of a place: it is new, or moved or resized by more than the smallest change."""
+    if known is None or known.basis != place.basis:
+        return True
+    moved = max(abs(a - b) for a, b in zip(known.voxel, place.voxel, strict=True)) * voxel_m
+    return moved > min_change_m or abs(known.d2**0.5 - place.d2**0.5) * voxel_m > min_change_m
+
+
+def _place_fields(places: list[tuple[int, Place]], voxel_m: float) -> dict[str, Any]:
+    voxels = np.array([p.voxel for _, p in places], np.float64).reshape(-1, 3)
+    return {
+        "place_ids": np.array([i for i, _ in places], np.int64),
+        "positions_m": ((voxels + 0.5) * voxel_m).astype(np.float32),
+        "radii_m": (np.sqrt([float(p.d2) for _, p in places]) * voxel_m).astype(np.float32),
+        "basis_points": np.array([p.basis for _, p in places], np.int16),
+    }
+
+
+def _edge_fields(edges: list[tuple[Pair, int]], voxel_m: float) -> dict[str, Any]:
+    return {
+        "edges": np.array([pair for pair, _ in edges], np.int64).reshape(-1, 2),
+        "clearances_m": (np.sqrt([float(c) for _, c in edges]) * voxel_m).astype(np.float32),
+    }

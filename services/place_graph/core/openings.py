@@ -1,0 +1,113 @@
+"""Frontiers: where the free space of a place ends at space that was not observed (pure).
+
+A face between a free voxel and an unobserved one is open. It belongs to the nearest place whose sphere holds it. The
+outward normals of a place's open faces, each weighed by its area, add up to its opening: holes in the depth are closed
+surfaces, whose normals cancel, and a doorway not yet passed adds up to its width times its height.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+from prior_sg.services.place_graph.core.skeleton.graph import PlaceGraph
+from prior_sg.services.place_graph.core.volume.grid import FREE, UNOBSERVED, Box, VoxelGrid
+
+BESIDE = 1.0  # voxels: a sphere ends on the voxel before an obstacle, and its faces one beside that
+TOLD_AREA, TOLD_COSINE = 0.2, 0.966  # a change of a fifth of the area, or of 15 degrees, is told
+
+
+@dataclass
+class Openings:
+    """The opening of each place as a sum of outward normals, in faces of voxels, and what readers were told of it."""
+
+    reach: int  # voxels from a place's centre to the farthest face that can belong to it
+    normals: dict[int, np.ndarray] = field(default_factory=dict)
+    told: dict[int, np.ndarray] = field(default_factory=dict)
+
+    def renew(self, grid: VoxelGrid, graph: PlaceGraph, changed: Box) -> set[int]:
+        """Recompute what labels or places changed inside `changed` may concern; returns the ids looked at."""
+        near = graph.within(changed.grown(self.reach))
+        rivals = graph.within(changed.grown(2 * self.reach))
+        if near:
+            voxels = np.array([graph.places[i].voxel for i in rivals], np.int64)
+            radii = np.sqrt([float(graph.places[i].d2) for i in rivals]) + BESIDE
+            window = changed.grown(2 * self.reach + 1).clipped(grid.bounds.grown(1))
+            label = grid.gather("label", window)
+            found = summed_normals(label, voxels - window.low, np.minimum(radii, self.reach))
+            wanted = set(near) - graph.frozen
+            self.normals |= {i: normal for i, normal in zip(rivals, found, strict=True) if i in wanted}
+        return set(near)
+
+    def tell(self, ids: Iterable[int], shown: Iterable[int], voxel_m: float, min_area_m2: float) -> dict[str, Any]:
+        """Array fields of the PlaceDelta that says what is new of the places `ids`; only those `shown` are told."""
+        news: dict[int, np.ndarray] = {}
+        for place_id in sorted(ids):
+            normal = self.normals.get(place_id, np.zeros(3, np.int64)) if place_id in shown else np.zeros(3, np.int64)
+            if np.linalg.norm(normal) * voxel_m**2 < min_area_m2:
+                normal = np.zeros(3, np.int64)
+            if _differs(self.told.get(place_id, np.zeros(3, np.int64)), normal):
+                news[place_id] = normal
+        for place_id, normal in news.items():
+            self.told[place_id] = normal
+            if not normal.any():
+                del self.told[place_id]
+        return _fields({i: normal for i, normal in news.items() if i in shown}, voxel_m)
+
+    def forget(self, ids: Iterable[int]) -> None:
+        """Places that are no more."""
+        for place_id in ids:
+            self.normals.pop(place_id, None)
+            self.told.pop(place_id, None)
+
+    def all(self, voxel_m: float) -> dict[str, Any]:
+        """Array fields of a snapshot."""
+        return _fields(dict(sorted(self.told.items())), voxel_m)
+
+
+@njit(cache=True, nogil=True)
+def summed_normals(label, voxels, reaches):  # noqa: ANN001, ANN201
+    """Sum (place, 3) of the outward normals of the open faces nearest to each place (n, 3), within its reach."""
+    nx, ny, nz = label.shape
+    found = np.zeros((len(voxels), 3), np.int64)
+    for i in range(1, nx - 1):
+        for j in range(1, ny - 1):
+            for k in range(1, nz - 1):
+                if label[i, j, k] != FREE:
+                    continue
+                x = int(label[i + 1, j, k] == UNOBSERVED) - int(label[i - 1, j, k] == UNOBSERVED)
+                y = int(label[i, j + 1, k] == UNOBSERVED) - int(label[i, j - 1, k] == UNOBSERVED)
+                z = int(label[i, j, k + 1] == UNOBSERVED) - int(label[i, j, k - 1] == UNOBSERVED)
+                if x == 0 and y == 0 and z == 0:
+                    continue
+                owner, nearest = -1, 1 << 30
+                for n in range(len(voxels)):
+                    dx, dy, dz = i - voxels[n, 0], j - voxels[n, 1], k - voxels[n, 2]
+                    apart = dx * dx + dy * dy + dz * dz
+                    if apart < nearest and apart <= reaches[n] * reaches[n]:
+                        owner, nearest = n, apart
+                if owner >= 0:
+                    found[owner, 0] += x
+                    found[owner, 1] += y
+                    found[owner, 2] += z
+    return found
+
+
+def _differs(told: np.ndarray, now: np.ndarray) -> bool:
+    before, after = float(np.linalg.norm(told)), float(np.linalg.norm(now))
+    if not before or not after:
+        return before != after
+    return abs(after - before) > TOLD_AREA * before or float(told @ now) < TOLD_COSINE * before * after
+
+
+def _fields(openings: dict[int, np.ndarray], voxel_m: float) -> dict[str, Any]:
+    normals = np.array(list(openings.values()), np.float64).reshape(-1, 3)
+    lengths = np.linalg.norm(normals, axis=1)
+    directions = np.divide(normals, lengths[:, None], out=np.zeros_like(normals), where=lengths[:, None] > 0)
+    return {
+        "frontier_ids": np.array(list(openings), np.int64),
+        "frontier_directions": directions.astype(np.float32),
+        "frontier_areas_m2": (lengths * voxel_m**2).astype(np.float32),
+    }

@@ -1,0 +1,1 @@
+"""Distances, the Voronoi diagram, and the graph of places on it (pure)."""

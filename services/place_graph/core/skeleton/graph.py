@@ -1,0 +1,294 @@
+"""Places with lasting ids and the edges between them, updated inside a region of the map (pure)."""
+
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from prior_sg.services.place_graph.core.skeleton.links import clear_lines, lenses, line_d2, nearest, thinned
+from prior_sg.services.place_graph.core.skeleton.places import Extraction
+from prior_sg.services.place_graph.core.volume.grid import UNKNOWN_D2, Box, VoxelGrid
+
+Voxel = tuple[int, int, int]
+
+
+class Place(NamedTuple):
+    """One place: the voxel at its centre, squared distance (voxels) to the nearest obstacle, basis points."""
+
+    voxel: Voxel
+    d2: int
+    basis: int
+
+
+@dataclass(frozen=True)
+class Rules:
+    """What makes places one and what joins them, all lengths in voxels."""
+
+    cell: int  # side of a compression cell
+    merge: float  # touching places nearer than this are one
+    edge: float  # smallest clearance between touching places
+    reach: float  # longest edge across free space ...
+    free: float  # ... its smallest clearance ...
+    check: int = 0  # ... how many places in sight are looked at ...
+    find: int = 0  # ... and how many of them joined; 0 = all
+    overlap: float = 0.0  # smallest radius of the lens that two spheres share
+    overlap_check: int = 0  # nearest places looked at for such edges; 0 = none
+
+
+@dataclass
+class Changes:
+    """Ids that an update touched (also those that are gone), and into which place a gone one went."""
+
+    touched: set[int] = field(default_factory=set)
+    merged: dict[int, int] = field(default_factory=dict)
+    opened: set[int] = field(default_factory=set)  # ids whose openings were looked at again
+
+    def add(self, later: "Changes") -> None:
+        """Changes that came after these."""
+        self.touched |= later.touched
+        self.merged |= later.merged
+        self.opened |= later.opened
+
+
+@dataclass(frozen=True)
+class _Sight:
+    """The distance field of a window, to look along lines."""
+
+    d2: np.ndarray
+    box: Box
+
+    def observed(self, voxel: Voxel) -> bool:
+        """Whether a voxel of the window was observed."""
+        return bool(self.d2[tuple(np.array(voxel) - self.box.low)] != UNKNOWN_D2)
+
+    def clear(self, start: np.ndarray, stop: np.ndarray) -> bool:
+        """Whether the straight line between two voxels stays in free space."""
+        return line_d2(self.d2, start - self.box.low, stop - self.box.low) > 0
+
+
+class PlaceGraph:
+    """All places of the map, also those too isolated to be published."""
+
+    def __init__(self, rules: Rules) -> None:
+        self.rules = rules
+        self.places: dict[int, Place] = {}
+        self.edges: dict[int, dict[int, int]] = {}  # id -> neighbour -> squared clearance (voxels)
+        self._touching: dict[int, set[int]] = {}  # ids whose GVD voxels touch
+        self.frozen: set[int] = set()  # places whose voxels were dropped: they stay as they were until seen again
+        self._by_cell: dict[Voxel, set[int]] = {}
+        self._next_id = 0
+
+    def update(self, grid: VoxelGrid, extraction: Extraction, region: Box, changed: Box) -> Changes:
+        """Replace the places inside `region` (whole cells) by the extracted ones, keep ids, renew edges nearby.
+
+        Distances have changed inside `changed` only.
+        """
+        window = region.grown(self._reach_voxels).clipped(grid.bounds)
+        sight = _Sight(grid.gather("d2", window, UNKNOWN_D2), window)
+        changes = Changes()
+        id_of, left = self._replace(extraction, region, sight, changes)
+        gone = self._voxels(left)
+        self._retire(left, extraction, id_of, sight, changes)
+        stirred = self._touch(region, extraction, id_of) | (changes.touched & self.places.keys())
+        voxels = np.concatenate((self._voxels(sorted(stirred)), [changed.low, changed.high - 1], gone))
+        self._relink(Box(voxels.min(axis=0), voxels.max(axis=0) + 1), grid, changes)
+        return changes
+
+    def freeze(self, box: Box) -> None:
+        """The voxels of a box were dropped: its places stay as they are until they are seen again."""
+        self.frozen.update(self.within(box))
+
+    @property
+    def _reach_voxels(self) -> int:
+        """How long an edge can be: as far as free space may be crossed, or as far as places that touch lie apart."""
+        return int(np.ceil(max(self.rules.reach, 3 * self.rules.cell)))
+
+    def _replace(
+        self, extraction: Extraction, region: Box, sight: _Sight, changes: Changes
+    ) -> tuple[dict[int, int], list[int]]:
+        """Give the extracted places of `region` their old ids, or new ones.
+
+        Returns the id of every extracted place that has one, and the old ids of `region` that nothing took over.
+        """
+        old_ids = self.within(region)
+        inside = region.contains(extraction.voxels)
+        new = np.flatnonzero(inside)
+        frozen = np.array([i in self.frozen for i in old_ids], np.bool_)
+        matched = _match(self._voxels(old_ids), extraction.voxels[new], frozen, self.rules, sight)
+        id_of: dict[int, int] = {}
+        for position, index in enumerate(new.tolist()):
+            if position in matched:
+                id_of[index] = old_ids[matched[position]]
+            else:
+                id_of[index], self._next_id = self._next_id, self._next_id + 1
+            x, y, z = extraction.voxels[index].tolist()
+            place = Place((x, y, z), int(extraction.d2[index]), int(extraction.basis[index]))
+            if self.places.get(id_of[index]) != place:
+                changes.touched.add(id_of[index])
+                self._put(id_of[index], place)
+        for index in np.flatnonzero(~inside).tolist():
+            outside = self._id_at(extraction.voxels[index])
+            if outside is not None:
+                id_of[index] = outside
+        self.frozen.difference_update(id_of.values())
+        unseen = {i for i in self.frozen.intersection(old_ids) if not sight.observed(self.places[i].voxel)}
+        self.frozen.difference_update(set(old_ids) - unseen)
+        return id_of, sorted(set(old_ids) - set(id_of.values()) - unseen)
+
+    def _retire(
+        self, gone: list[int], extraction: Extraction, id_of: dict[int, int], sight: _Sight, changes: Changes
+    ) -> None:
+        """Remove places; each goes into the place that now owns its centre, else into the nearest in clear sight."""
+        known = sorted(id_of)
+        for place_id in gone:
+            voxel = np.array(self.places[place_id].voxel, np.int64)
+            owner = id_of.get(extraction.place_at(voxel))
+            if owner is None and known:
+                squared = ((extraction.voxels[known] - voxel) ** 2).sum(axis=1)
+                nearest = known[int(squared.argmin())]
+                if squared.min() <= self.rules.merge**2 and sight.clear(voxel, extraction.voxels[nearest]):
+                    owner = id_of[nearest]
+            if owner is not None:
+                changes.merged[place_id] = owner
+                self._inherit(place_id, owner)
+            changes.touched.add(place_id)
+            changes.touched.update(self.edges.get(place_id, ()))
+            self._drop(place_id)
+
+    def _inherit(self, place_id: int, heir: int) -> None:
+        """Edges to frozen places cannot be found again; they go to whoever takes over."""
+        for other in self.frozen.intersection(self.edges.get(place_id, ())):
+            clearance = self.edges[place_id][other]
+            self.edges.setdefault(heir, {}).setdefault(other, clearance)
+            self.edges[other].setdefault(heir, clearance)
+
+    def _touch(self, region: Box, extraction: Extraction, id_of: dict[int, int]) -> set[int]:
+        """Renew which places touch, for all pairs with an end inside `region`; returns whose company changed."""
+        inside = set(self.within(region)) - self.frozen
+        before = {place_id: self._touching.pop(place_id, set()) for place_id in inside}
+        for place_id, others in before.items():
+            for other in others - inside:
+                self._touching[other].discard(place_id)
+        for one, two in extraction.touching.tolist():
+            a, b = id_of.get(one), id_of.get(two)
+            if a is not None and b is not None and (a in inside or b in inside):
+                self._touching.setdefault(a, set()).add(b)
+                self._touching.setdefault(b, set()).add(a)
+        return {place_id for place_id, others in before.items() if others != self._touching.get(place_id, set())}
+
+    def _relink(self, region: Box, grid: VoxelGrid, changes: Changes) -> None:
+        """Renew the edges that may have changed: those with an end in `region`, or both ends within reach of it."""
+        inside = set(self.within(region))
+        near = set(self.within(region.grown(self._reach_voxels)))
+        window = region.grown(2 * self._reach_voxels).clipped(grid.bounds)
+        sight = _Sight(grid.gather("d2", window, UNKNOWN_D2), window)
+        renewed: dict[int, dict[int, int]] = {a: {} for a in near}
+        renewed.update({b: {} for a in inside for b in self.edges.get(a, ())})
+
+        def concerned(a: int, b: int) -> bool:
+            return (a in inside or b in inside or (a in near and b in near)) and self.frozen.isdisjoint((a, b))
+
+        for a, b, clearance in self._links_within(window, sight):
+            if concerned(a, b):
+                renewed.setdefault(a, {})[b] = renewed.setdefault(b, {})[a] = clearance
+        for a in sorted(renewed):
+            known = self.edges.get(a, {})
+            links = {b: clearance for b, clearance in known.items() if not concerned(a, b)} | renewed[a]
+            if links != known:
+                changes.touched.add(a)
+            self.edges[a] = links
+
+    def _links_within(self, box: Box, sight: _Sight) -> list[tuple[int, int, int]]:
+        """Edges between the places of `box`: smaller id, larger id, squared clearance."""
+        ids = [i for i in self.within(box) if i not in self.frozen]
+        index = {place_id: n for n, place_id in enumerate(ids)}
+        touching = np.zeros((len(ids), len(ids)), np.bool_)
+        for place_id in ids:
+            for other in self._touching.get(place_id, ()):
+                if other in index:
+                    touching[index[place_id], index[other]] = True
+        voxels = self._voxels(ids) - sight.box.low
+        rules = self.rules
+        clear = clear_lines(sight.d2, voxels, touching, rules.edge**2, rules.reach**2, rules.free**2)
+        keep = thinned(clear, voxels, touching, rules.edge**2)
+        if rules.check or rules.find:
+            keep &= touching | nearest(clear > 0, voxels, rules.check) & nearest(keep & ~touching, voxels, rules.find)
+        if rules.overlap_check:
+            radii = np.sqrt([self.places[i].d2 for i in ids])
+            lens2 = lenses(sight.d2, voxels, radii, rules.overlap, self._reach_voxels)
+            lens2[~nearest(np.ones_like(keep), voxels, rules.overlap_check)] = 0
+            clear = np.where(keep, clear, lens2)
+            keep |= np.triu(lens2 > 0, 1)
+        return [(ids[one], ids[two], int(clear[one, two])) for one, two in np.argwhere(keep).tolist()]
+
+    def _voxels(self, ids: list[int]) -> np.ndarray:
+        return np.array([self.places[i].voxel for i in ids], np.int64).reshape(-1, 3)
+
+    def within(self, box: Box) -> list[int]:
+        """Ids of the places whose centre lies in `box`, ascending."""
+        low = np.floor_divide(box.low, self.rules.cell)
+        high = np.floor_divide(box.high - 1, self.rules.cell) + 1
+        found: list[int] = []
+        for x in range(int(low[0]), int(high[0])):
+            for y in range(int(low[1]), int(high[1])):
+                for z in range(int(low[2]), int(high[2])):
+                    found.extend(self._by_cell.get((x, y, z), ()))
+        return sorted(np.array(found, np.int64)[box.contains(self._voxels(found))].tolist())
+
+    def _id_at(self, voxel: np.ndarray) -> int | None:
+        """The place with exactly this centre."""
+        center = (int(voxel[0]), int(voxel[1]), int(voxel[2]))
+        for place_id in self._by_cell.get(self._cell(center), ()):
+            if self.places[place_id].voxel == center:
+                return place_id
+        return None
+
+    def _cell(self, voxel: Voxel) -> Voxel:
+        x, y, z = voxel
+        return x // self.rules.cell, y // self.rules.cell, z // self.rules.cell
+
+    def _put(self, place_id: int, place: Place) -> None:
+        if place_id in self.places:
+            self._leave_cell(place_id)
+        self.places[place_id] = place
+        self._by_cell.setdefault(self._cell(place.voxel), set()).add(place_id)
+
+    def _drop(self, place_id: int) -> None:
+        self._leave_cell(place_id)
+        del self.places[place_id]
+        self.frozen.discard(place_id)
+        for other in self.edges.pop(place_id, {}):
+            self.edges[other].pop(place_id, None)
+        for other in self._touching.pop(place_id, set()):
+            self._touching[other].discard(place_id)
+
+    def _leave_cell(self, place_id: int) -> None:
+        cell = self._cell(self.places[place_id].voxel)
+        self._by_cell[cell].discard(place_id)
+        if not self._by_cell[cell]:
+            del self._by_cell[cell]
+
+
+def _match(
+    old_voxels: np.ndarray, new_voxels: np.ndarray, frozen: np.ndarray, rules: Rules, sight: _Sight
+) -> dict[int, int]:
+    """Index of the old place that each new one continues: nearest first, within a cell or its side, in clear sight.
+
+    What lies between a `frozen` place and a new one is not known: they are one if they would merge.
+    """
+    cell_voxels = rules.cell
+    squared = ((old_voxels[:, None] - new_voxels[None]) ** 2).sum(axis=2)
+    same_cell = (old_voxels[:, None] // cell_voxels == new_voxels[None] // cell_voxels).all(axis=2)
+    rows, columns = np.nonzero(same_cell | (squared <= cell_voxels**2))
+    order = np.lexsort((columns, rows, squared[rows, columns]))
+    matched: dict[int, int] = {}
+    taken: set[int] = set()
+    for row, column in zip(rows[order].tolist(), columns[order].tolist(), strict=True):
+        if row in taken or column in matched:
+            continue
+        near = squared[row, column] <= rules.merge**2 if frozen[row] else squared[row, column] == 0
+        if not near and not sight.clear(old_voxels[row], new_voxels[column]):
+            continue
+        matched[column] = row
+        taken.add(row)
+    return matched

@@ -1,0 +1,165 @@
+"""From GVD voxels to places: compression cells, representatives, merging (Hydra, `graph_extractor`; pure)."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from prior_sg.services.place_graph.core.skeleton.distance import STEPS
+from prior_sg.services.place_graph.core.volume.grid import Box, VoxelGrid
+
+
+@dataclass(frozen=True)
+class Extraction:
+    """Places of one box, in the order of their voxels. A group is a connected set of GVD voxels in one cell."""
+
+    voxels: np.ndarray  # (place, 3) int64, world voxel index of the representative
+    d2: np.ndarray  # (place,) int64, squared voxels to the nearest obstacle
+    basis: np.ndarray  # (place,) int64
+    touching: np.ndarray  # (pair, 2) int64, places whose voxels touch, smaller first, sorted
+    members: np.ndarray  # window of int32: place index of a member voxel, -1 elsewhere
+    box: Box  # where `members` lies
+
+    def place_at(self, voxel: np.ndarray) -> int:
+        """Index of the place that the voxel belongs to, -1 if none."""
+        return int(self.members[tuple(voxel - self.box.low)]) if self.box.contains(voxel) else -1
+
+
+def cells_of(voxels: np.ndarray, cell_voxels: int) -> np.ndarray:
+    """Compression cell (n, 3) of voxels (n, 3)."""
+    return np.floor_divide(voxels, cell_voxels)
+
+
+def whole_cells(box: Box, cell_voxels: int, margin_cells: int = 0) -> Box:
+    """The box widened to whole compression cells and by `margin_cells` further ones."""
+    low = np.floor_divide(box.low, cell_voxels) - margin_cells
+    high = -np.floor_divide(-box.high, cell_voxels) + margin_cells
+    return Box(low * cell_voxels, high * cell_voxels)
+
+
+def extract(  # noqa: PLR0917
+    grid: VoxelGrid, box: Box, cell_voxels: int, min_d2: float, merge_d2: float, widest: bool = False
+) -> Extraction:
+    """Places of all cells inside `box`, which must consist of whole cells; the grid's GVD must be up to date.
+
+    Of places that merge the one with most basis points stays, or with `widest` the widest.
+    """
+    basis = grid.gather("basis", box)
+    d2 = grid.gather("d2", box)
+    members = _member_voxels(basis, d2, min_d2)
+    labels = np.full(basis.shape, -1, np.int32)
+    groups = _grow_groups(members, labels, box.low, cell_voxels)
+    local, group_d2, group_basis = _representatives(members, labels, d2, basis, groups)
+    pairs = _unique_pairs(_touching(members, labels))
+    first, second = (group_d2, group_basis) if widest else (group_basis, group_d2)
+    root = _merge(local, first, second, pairs, merge_d2)
+    kept = np.flatnonzero(root == np.arange(groups))
+    index = np.full(groups, -1, np.int64)
+    index[kept] = np.arange(len(kept))
+    place_of = index[root] if groups else index
+    labels[tuple(members.T)] = place_of[labels[tuple(members.T)]]
+    touching = _unique_pairs(place_of[pairs])
+    return Extraction(local[kept] + box.low, group_d2[kept], group_basis[kept], touching, labels, box)
+
+
+def _member_voxels(basis: np.ndarray, d2: np.ndarray, min_d2: float) -> np.ndarray:
+    """GVD voxels (n, 3) with room enough around them, in ascending order."""
+    return np.argwhere((basis > 0) & (d2 >= min_d2))
+
+
+def _unique_pairs(pairs: np.ndarray) -> np.ndarray:
+    """Pairs (n, 2) of different indices, smaller first, sorted, once each."""
+    ordered = np.sort(pairs[pairs[:, 0] != pairs[:, 1]], axis=1)
+    return np.unique(ordered, axis=0).reshape(-1, 2)
+
+
+@njit(cache=True, nogil=True)
+def _grow_groups(members, labels, low, cell_voxels):  # noqa: ANN001, ANN202
+    """Label each 26-connected set of members inside one cell (-2: not reached yet); return the number of sets."""
+    for n in range(len(members)):
+        labels[members[n, 0], members[n, 1], members[n, 2]] = -2
+    stack = np.empty((len(members), 3), np.int64)
+    groups = 0
+    for n in range(len(members)):
+        if labels[members[n, 0], members[n, 1], members[n, 2]] != -2:
+            continue
+        labels[members[n, 0], members[n, 1], members[n, 2]] = groups
+        stack[0] = members[n]
+        depth = 1
+        while depth > 0:
+            depth -= 1
+            i, j, k = stack[depth]
+            for s in range(26):
+                a, b, c = i + STEPS[s, 0], j + STEPS[s, 1], k + STEPS[s, 2]
+                if a < 0 or b < 0 or c < 0 or a >= labels.shape[0] or b >= labels.shape[1] or c >= labels.shape[2]:
+                    continue
+                same_cell = (
+                    (a + low[0]) // cell_voxels == (i + low[0]) // cell_voxels
+                    and (b + low[1]) // cell_voxels == (j + low[1]) // cell_voxels
+                    and (c + low[2]) // cell_voxels == (k + low[2]) // cell_voxels
+                )
+                if same_cell and labels[a, b, c] == -2:
+                    labels[a, b, c] = groups
+                    stack[depth, 0], stack[depth, 1], stack[depth, 2] = a, b, c
+                    depth += 1
+        groups += 1
+    return groups
+
+
+def _representatives(
+    members: np.ndarray, labels: np.ndarray, d2: np.ndarray, basis: np.ndarray, groups: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Per group the voxel with most basis points, then the widest, then the first: voxel, squared distance, basis."""
+    where = tuple(members.T)
+    member_d2, member_basis, group = d2[where].astype(np.int64), basis[where].astype(np.int64), labels[where]
+    order = np.lexsort((np.arange(len(members)), -member_d2, -member_basis, group))
+    first = order[np.searchsorted(group[order], np.arange(groups))]
+    return members[first], member_d2[first], member_basis[first]
+
+
+@njit(cache=True, nogil=True)
+def _touching(members, labels):  # noqa: ANN001, ANN202
+    """Pairs of group labels with neighbouring voxels (26-neighbourhood), with repeats."""
+    pairs = np.empty((len(members) * 4 + 16, 2), np.int64)
+    count = 0
+    for n in range(len(members)):
+        i, j, k = members[n]
+        last = -1
+        for s in range(13, 26):  # the other half of the neighbours sees the pair from its side
+            a, b, c = i + STEPS[s, 0], j + STEPS[s, 1], k + STEPS[s, 2]
+            if a < 0 or b < 0 or c < 0 or a >= labels.shape[0] or b >= labels.shape[1] or c >= labels.shape[2]:
+                continue
+            other = labels[a, b, c]
+            if other < 0 or other == labels[i, j, k] or other == last:
+                continue
+            if count == len(pairs):
+                pairs = np.concatenate((pairs, np.empty_like(pairs)))
+            pairs[count, 0], pairs[count, 1] = labels[i, j, k], other
+            count += 1
+            last = other
+    return pairs[:count]
+
+
+@njit(cache=True, nogil=True)
+def _merge(voxels, first, second, pairs, merge_d2):  # noqa: ANN001, ANN202
+    """Root of each group: a group that touches a better one nearby is absorbed by the best such, and so on upwards.
+
+    Better means greater in the `first` measure, then in the `second`, then earlier. The rule looks at neighbours only,
+    so what happens far away never changes who absorbs whom.
+    """
+    parent = np.arange(len(voxels))
+    for n in range(len(pairs)):
+        one, two = pairs[n, 0], pairs[n, 1]
+        dx, dy, dz = voxels[one] - voxels[two]
+        if dx * dx + dy * dy + dz * dz > merge_d2:
+            continue
+        worse, better = one, two
+        if (first[one], second[one], -one) > (first[two], second[two], -two):
+            worse, better = two, one
+        best = parent[worse]
+        if best == worse or (first[better], second[better], -better) > (first[best], second[best], -best):
+            parent[worse] = better
+    for n in range(len(parent)):
+        while parent[parent[n]] != parent[n]:
+            parent[n] = parent[parent[n]]
+    return parent

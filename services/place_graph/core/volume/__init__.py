@@ -1,0 +1,1 @@
+"""The voxel map and what depth images do to it (pure)."""

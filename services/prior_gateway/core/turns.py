@@ -1,0 +1,520 @@
+"""A prior graph from a language model, as a conversation (paper, Prior Graph Extraction; pure).
+
+Top-down: regions, then the objects that are relevant and discriminative with geometry and appearance of each region,
+then the objects' sizes, then P(o | r), then P(ri <-> rj). The conversation is a generator: it yields what to say and is
+sent what was answered; whoever drives it owns network, retries and time. Every answer is checked; a faulty one goes
+back with its faults.
+"""
+
+import json
+import math
+from collections.abc import Callable, Generator, Iterable, Sequence
+from dataclasses import dataclass, field
+from string import Template
+from typing import Any, TypeVar
+
+import msgspec
+import numpy as np
+
+from prior_sg.schemas.priors import LONGEST_NAME, LONGEST_PHRASE, MOST_REGIONS, Prior, Task
+
+PROMPT_FIELDS: dict[str, set[str]] = {
+    "system": set(),
+    "regions": {"environment", "task", "most_regions"},
+    "fixed_regions": {"environment", "task", "regions"},
+    "describe": {"environment", "task", "regions", "batch"},
+    "sizes": {"environment", "objects", "batch"},
+    "containment": {"environment", "task", "regions", "objects", "batch"},
+    "adjacency": {"environment", "task", "regions"},
+    "revise": {"environment", "task", "regions", "disagreements"},
+    "reason": set(),
+    "answer": {"schema"},
+    "faults": {"faults"},
+}
+MOST_FAULTS = 12  # told at once
+LONGEST_ECHO = 8000  # characters of a faulty answer that go back to the model
+ASYMMETRY = 15.0  # percent by which two statements about one pair may differ; their mean counts
+OBJECTS_PER_REGION = 8  # asked for
+MOST_LISTED = 16  # objects or phrases of one region
+LEAST, MOST = 0.01, 0.99  # no estimate of a model is certain
+LARGEST_CM, HIGHEST_CM = 10_000, 2_000  # sides of an object, and its lower edge above the floor
+
+Schema = dict[str, Any]
+A = TypeVar("A")
+Dialogue = Generator["Turn", str, A]
+
+
+class SynthesisConfig(msgspec.Struct, frozen=True, kw_only=True):
+    """How a model is asked for a prior."""
+
+    samples: int = 3  # generations averaged (K)
+    reason: bool = True  # let the model think in plain text before each answer
+    repairs: int = 2  # times a faulty answer goes back (N)
+    most_regions: int = 12
+    regions_per_call: int = 0  # described in one call; 0 = all. Small models do better with 1
+    max_tokens: int = 4096  # of one answer
+    steps: int = 0  # let numbers be chosen from so many, for servers that enforce no minimum and maximum; 0 = any
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.samples <= 16 or self.max_tokens < 1:
+            raise ValueError("samples (1 to 16) or max_tokens is out of range")
+        if min(self.repairs, self.regions_per_call, self.steps) < 0 or self.steps == 1:
+            raise ValueError("repairs and regions_per_call must not be negative; steps is 0 or at least 2")
+        if not 3 <= self.most_regions <= MOST_REGIONS:
+            raise ValueError(f"most_regions must lie between 3 and {MOST_REGIONS}")
+
+    def number(self, low: int, high: int) -> Schema:
+        """The form of a whole number."""
+        form: Schema = {"type": "integer", "minimum": low, "maximum": high}
+        return form | {"enum": np.linspace(low, high, self.steps).round().astype(int).tolist()} if self.steps else form
+
+    @property
+    def length(self) -> Schema:
+        """The form of a side in centimetres; steps, if any, are geometric, up to the size of a room."""
+        form: Schema = {"type": "integer", "minimum": 1, "maximum": LARGEST_CM}
+        steps = np.unique(np.geomspace(2, 1000, self.steps).round().astype(int)).tolist()
+        return form | {"enum": steps} if self.steps else form
+
+    @property
+    def percent(self) -> Schema:
+        """The form of a percentage."""
+        return self.number(0, 100)
+
+
+@dataclass(frozen=True)
+class Prompts:
+    """The texts of one version."""
+
+    version: str
+    texts: dict[str, Template]
+
+    def __call__(self, name: str, **fields: str) -> str:
+        return self.texts[name].substitute(fields)
+
+
+@dataclass(frozen=True)
+class Turn:
+    """What to say: the conversation so far, ending with the user's text, and the form of the answer (None = free)."""
+
+    messages: tuple[tuple[str, str], ...]  # (role, text)
+    schema: Schema | None = None
+    name: str = "thoughts"
+
+
+@dataclass(frozen=True)
+class Draft:
+    """One generation, complete. Matrices are probabilities; rows are regions."""
+
+    regions: list[str]
+    parents: list[str]
+    existence: np.ndarray  # (region,), sums to one
+    phrases: list[list[str]]
+    inclination_deg: np.ndarray  # (region, 2): mean, standard deviation
+    query_radius_m: np.ndarray  # (region,)
+    objects: list[str]
+    sizes_m: np.ndarray  # (object, 4): longest and shortest horizontal side, height, lower edge above the floor
+    containment: np.ndarray  # (region, object)
+    adjacency: np.ndarray  # (region, region), diagonal 1
+
+
+class Unusable(Exception):
+    """The model's answer still had faults after all repairs; the message is one sentence."""
+
+
+class Described(msgspec.Struct):
+    """What a model says of one region."""
+
+    phrases: list[str]
+    objects: list[str]
+    inclination_deg: float
+    inclination_spread_deg: float
+    scale_cm: float
+
+
+class Sized(msgspec.Struct):
+    """What a model says of the size of one object."""
+
+    longest_cm: float
+    shortest_cm: float
+    height_cm: float
+    bottom_cm: float
+
+
+class Placed(msgspec.Struct):
+    """Zone and share of one region."""
+
+    parent: str
+    share: float
+
+
+class Named(Placed):
+    """A region that the model has chosen."""
+
+    name: str
+
+
+class NamedList(msgspec.Struct):
+    """The answer to `regions`."""
+
+    regions: list[Named]
+
+
+@dataclass
+class Talk:
+    """Who asks: the prompts, the settings and the fields that many prompts share."""
+
+    prompts: Prompts
+    cfg: SynthesisConfig
+    fields: dict[str, str] = field(default_factory=dict)
+
+    def ask(self, name: str, schema: Schema, read: Callable[[str], tuple[A, list[str]]], **more: str) -> Dialogue[A]:
+        """One question: thought about, answered as JSON, sent back with its faults. Raises Unusable."""
+        fields = {key: value for key, value in (self.fields | more).items() if key in PROMPT_FIELDS[name]}
+        question, form = self.prompts(name, **fields), self.prompts("answer", schema=json.dumps(schema))
+        messages = [("system", self.prompts("system"))]
+        if self.cfg.reason:
+            messages.append(("user", f"{question}\n\n{self.prompts('reason')}"))
+            thoughts = yield Turn(tuple(messages))
+            messages += [("assistant", thoughts.strip()[:LONGEST_ECHO] or "-"), ("user", form)]
+        else:
+            messages.append(("user", f"{question}\n\n{form}"))
+        for _ in range(self.cfg.repairs + 1):
+            text = yield Turn(tuple(messages), schema, name)
+            answer, faults = read(text)
+            if not faults:
+                return answer
+            told = "\n".join(f"- {fault}" for fault in faults[:MOST_FAULTS])
+            messages += [("assistant", text[:LONGEST_ECHO] or "-"), ("user", self.prompts("faults", faults=told))]
+        times = f"{self.cfg.repairs} repair{'s' if self.cfg.repairs != 1 else ''}"
+        raise Unusable(f"its answer about {name.replace('_', ' ')} was still faulty after {times}: {faults[0]}")
+
+
+def synthesise(task: Task, prompts: Prompts, cfg: SynthesisConfig) -> Dialogue[Draft]:
+    """One generation of a prior for a task. Raises Unusable."""
+    talk = Talk(prompts, cfg, {"environment": task.environment or "any", "task": task.task or "find the way around"})
+    if task.regions:
+        regions = list(task.regions)
+        placed = yield from place_regions(talk, regions)
+    else:
+        regions, placed = yield from choose_regions(talk)
+    talk.fields["regions"] = ", ".join(regions)
+    described: dict[str, Described] = {}
+    for batch in batches(regions, cfg.regions_per_call):
+        described |= yield from describe(talk, batch)
+    objects = list(dict.fromkeys(name for region in regions for name in described[region].objects))
+    talk.fields["objects"] = ", ".join(objects)
+    sized: dict[str, Sized] = {}
+    for batch in batches(objects, OBJECTS_PER_REGION * cfg.regions_per_call):
+        sized |= yield from sizes(talk, batch)
+    held: dict[str, dict[str, float]] = {}
+    for batch in batches(regions, cfg.regions_per_call):
+        held |= yield from containment(talk, batch, objects)
+    touching = yield from adjacency(talk, regions)
+    shares = np.maximum([placed[region].share for region in regions], 1.0)
+    one_by_one = [described[region] for region in regions]
+    return Draft(
+        regions=regions,
+        parents=[placed[region].parent.strip() for region in regions],
+        existence=shares / shares.sum(),
+        phrases=[entry.phrases for entry in one_by_one],
+        inclination_deg=np.array([(entry.inclination_deg, entry.inclination_spread_deg) for entry in one_by_one]),
+        query_radius_m=np.array([entry.scale_cm / 100 for entry in one_by_one]),
+        objects=objects,
+        sizes_m=np.array([msgspec.structs.astuple(sized[name]) for name in objects]) / 100,
+        containment=_probability([[held[region][name] for name in objects] for region in regions]),
+        adjacency=touching,
+    )
+
+
+def batches(names: list[str], size: int) -> list[list[str]]:
+    """`names` in pieces of at most `size`; 0 = in one."""
+    return [names[i : i + size] for i in range(0, len(names), size)] if size else [names]
+
+
+def choose_regions(talk: Talk) -> Dialogue[tuple[list[str], dict[str, Placed]]]:
+    """The regions into which the task divides the environment."""
+    item = _object({"name": TEXT, "parent": TEXT, "share": talk.cfg.percent})
+    schema = _object({"regions": {"type": "array", "items": item, "minItems": 3, "maxItems": talk.cfg.most_regions}})
+
+    def read(text: str) -> tuple[dict[str, Placed], list[str]]:
+        answer, faults = parse(text, NamedList)
+        if answer is None:
+            return {}, faults
+        for region in answer.regions:
+            region.name = " ".join(region.name.split()).casefold()
+        names = [region.name for region in answer.regions]
+        found: dict[str, Placed] = {region.name: region for region in answer.regions}
+        faults = [f"the region {name!r} is named more than once" for name in sorted({*names}) if names.count(name) > 1]
+        if len(found) < 3 or len(found) > talk.cfg.most_regions:
+            faults.append(f"name between 3 and {talk.cfg.most_regions} different regions; there are {len(found)}")
+        return found, faults + _faults_of_names("region", names) + _faults_of_places(found)
+
+    found = yield from talk.ask("regions", schema, read, most_regions=str(talk.cfg.most_regions))
+    return list(found), found
+
+
+def place_regions(talk: Talk, regions: list[str]) -> Dialogue[dict[str, Placed]]:
+    """Zone and share of regions that the task has fixed."""
+    schema = _object(dict.fromkeys(regions, _object({"parent": TEXT, "share": talk.cfg.percent})))
+
+    def read(text: str) -> tuple[dict[str, Placed], list[str]]:
+        found, faults = parse(text, dict[str, Placed])
+        if found is None:
+            return {}, faults
+        return found, _faults_of_keys("region", found, regions) or _faults_of_places(found)
+
+    return (yield from talk.ask("fixed_regions", schema, read, regions=", ".join(regions)))
+
+
+def describe(talk: Talk, batch: list[str]) -> Dialogue[dict[str, Described]]:
+    """Appearance, objects and geometry of some regions."""
+    form = _object(
+        {
+            "phrases": {"type": "array", "items": TEXT, "minItems": 2, "maxItems": 5},
+            "objects": {"type": "array", "items": TEXT, "minItems": 2, "maxItems": OBJECTS_PER_REGION},
+            "inclination_deg": talk.cfg.number(0, 90),
+            "inclination_spread_deg": talk.cfg.number(1, 45),
+            "scale_cm": talk.cfg.number(20, 999),
+        }
+    )
+
+    def read(text: str) -> tuple[dict[str, Described], list[str]]:
+        found, faults = parse(text, dict[str, Described])
+        if found is None:
+            return {}, faults
+        if faults := _faults_of_keys("region", found, batch):
+            return {}, faults
+        for entry in found.values():
+            entry.phrases = _tidy(entry.phrases)
+            entry.objects = _tidy(name.casefold() for name in entry.objects)
+        return found, [fault for name, entry in found.items() for fault in _faults_of_description(name, entry)]
+
+    return (yield from talk.ask("describe", _object(dict.fromkeys(batch, form)), read, batch=", ".join(batch)))
+
+
+def sizes(talk: Talk, batch: list[str]) -> Dialogue[dict[str, Sized]]:
+    """Size of some objects, and how high above the floor they begin."""
+    side, lower = talk.cfg.length, talk.cfg.number(0, 250)
+    form = _object({"longest_cm": side, "shortest_cm": side, "height_cm": side, "bottom_cm": lower})
+
+    def read(text: str) -> tuple[dict[str, Sized], list[str]]:
+        found, faults = parse(text, dict[str, Sized])
+        if found is None:
+            return {}, faults
+        faults = _faults_of_keys("object", found, batch)
+        faults += [fault for name, entry in found.items() for fault in _faults_of_size(name, entry)]
+        longest = [entry.longest_cm for entry in found.values()]
+        if any(value != round(value) for value in longest) and max(longest) <= 10:
+            faults.append("the lengths look like metres; give centimetres")
+        return found, faults
+
+    return (yield from talk.ask("sizes", _object(dict.fromkeys(batch, form)), read, batch=", ".join(batch)))
+
+
+def containment(talk: Talk, batch: list[str], objects: list[str]) -> Dialogue[dict[str, dict[str, float]]]:
+    """P(o | r) of some regions, in percent, for all objects."""
+    schema = _object(dict.fromkeys(batch, _object(dict.fromkeys(objects, talk.cfg.percent))))
+
+    def read(text: str) -> tuple[dict[str, dict[str, float]], list[str]]:
+        return read_matrix(text, {region: objects for region in batch}, ("region", "object"))
+
+    return (yield from talk.ask("containment", schema, read, batch=", ".join(batch)))
+
+
+def adjacency(talk: Talk, regions: list[str]) -> Dialogue[np.ndarray]:
+    """P(ri <-> rj), (region, region), symmetric with diagonal 1. Each pair is asked for once; a model that gives it in
+    both directions must say about the same twice."""
+    form = {region: regions[i + 1 :] for i, region in enumerate(regions[:-1])}
+    schema = _object({region: _object(dict.fromkeys(others, talk.cfg.percent)) for region, others in form.items()})
+
+    def read(text: str) -> tuple[np.ndarray, list[str]]:
+        found, faults = parse(text, dict[str, dict[str, float]])
+        return (np.eye(len(regions)), faults) if found is None else read_adjacency(found, regions)
+
+    if len(regions) == 1:
+        return np.eye(1)
+    return (yield from talk.ask("adjacency", schema, read))
+
+
+def read_matrix(
+    text: str, form: dict[str, list[str]], kinds: tuple[str, str]
+) -> tuple[dict[str, dict[str, float]], list[str]]:
+    """A matrix of percentages in the form {row: {column: percent}}, with everything that is wrong about it."""
+    found, faults = parse(text, dict[str, dict[str, float]])
+    if found is None:
+        return {}, faults
+    faults = _faults_of_keys(kinds[0], found, list(form))
+    for row, columns in form.items():
+        if row in found:
+            faults += _faults_of_keys(kinds[1], found[row], columns, f" of {row!r}")
+    return found, faults + _faults_of_percentages(found)
+
+
+def read_adjacency(found: dict[str, dict[str, float]], regions: list[str]) -> tuple[np.ndarray, list[str]]:
+    """The symmetric matrix of probabilities, and what is wrong with what was found."""
+    faults = [f"there is no region {name!r}" for name in _unknown(found, regions)]
+    faults += [f"there is no region {name!r}" for row in found.values() for name in _unknown(row, regions)]
+    faults += _faults_of_percentages(found)
+    matrix = np.eye(len(regions))
+    for i, one in enumerate(regions):
+        for j, other in enumerate(regions[:i]):
+            said = [found[a][b] for a, b in ((one, other), (other, one)) if b in found.get(a, {})]
+            if not said:
+                faults.append(f"the pair {other!r} and {one!r} is missing")
+            elif max(said) - min(said) > ASYMMETRY:
+                faults.append(f"{other!r} and {one!r}: {min(said):g} one way, {max(said):g} the other; it is one pair")
+            else:
+                matrix[i, j] = matrix[j, i] = float(_probability(sum(said) / len(said)))
+    return matrix, list(dict.fromkeys(faults))
+
+
+def revise(prior: Prior, told: str, form: dict[str, dict[str, dict[str, tuple[float, float]]]], talk: Talk) -> Dialogue:
+    """New percentages for the entries in which expectation and observation disagree.
+
+    `form` is {matrix: {row: {column: (expected, observed)}}} in percent. An answer must not leave the span between the
+    two: evidence may be weighed, not contradicted.
+    """
+    schema = _object(
+        {
+            kind: _object({r: _object(dict.fromkeys(row, talk.cfg.percent)) for r, row in rows.items()})
+            for kind, rows in form.items()
+        }
+    )
+    talk.fields |= {"environment": prior.environment, "task": prior.task}
+    talk.fields["regions"] = ", ".join(region.name for region in prior.regions)
+
+    def read(text: str) -> tuple[dict[str, dict[str, dict[str, float]]], list[str]]:
+        found, faults = parse(text, dict[str, dict[str, dict[str, float]]])
+        if found is None:
+            return {}, faults
+        faults = _faults_of_keys("matrix", found, list(form))
+        for kind, rows in form.items():
+            faults += _faults_of_keys("region", found.get(kind, {}), list(rows), f" of {kind}")
+            for row, columns in rows.items():
+                given = found.get(kind, {}).get(row, {})
+                faults += _faults_of_keys("entry", given, list(columns), f" of {row!r}")
+                faults += _faults_of_spans(row, given, columns)
+        return found, faults
+
+    return (yield from talk.ask("revise", schema, read, disagreements=told))
+
+
+def _faults_of_spans(row: str, given: dict[str, float], columns: dict[str, tuple[float, float]]) -> list[str]:
+    return [
+        f"{row!r}, {name!r}: {given[name]:g} lies outside {min(span):.0f} to {max(span):.0f}, "
+        "which were expected and observed"
+        for name, span in columns.items()
+        if name in given and not math.floor(min(span)) <= given[name] <= math.ceil(max(span))
+    ]
+
+
+def parse(text: str, kind: type[A]) -> tuple[A | None, list[str]]:
+    """The JSON object in an answer, decoded and typed, or the one fault that prevents it. Thoughts before and a code
+    fence around it are ignored; text in its place is no answer."""
+    start, end = text.find("{"), text.rfind("}")
+    if "</think>" in text:
+        start = text.find("{", text.rfind("</think>"))
+    if start < 0:
+        said = " ".join(text.split())[:120]
+        return None, [f"there is no JSON object in it, but: {said!r}" if said else "it is empty"]
+    if end < start:
+        return None, ["the JSON object is cut off; answer more briefly"]
+    try:
+        return msgspec.json.decode(text[start : end + 1], type=kind), []
+    except msgspec.ValidationError as error:
+        return None, [f"it does not have the form asked for: {error}"]
+    except msgspec.DecodeError as error:
+        return None, [f"it is not valid JSON: {error}"]
+
+
+TEXT: Schema = {"type": "string"}
+
+
+def _object(properties: dict[str, Schema]) -> Schema:
+    """Every property required and no other allowed, so that a server that constrains its sampling cannot omit one."""
+    return {
+        "type": "object",
+        "properties": properties,
+        "required": list(properties),
+        "additionalProperties": False,
+    }
+
+
+def _probability(percent: Any) -> np.ndarray:
+    return np.clip(np.asarray(percent, dtype=float) / 100, LEAST, MOST)
+
+
+def _unknown(found: dict[str, Any], known: Sequence[str]) -> list[str]:
+    return [name for name in found if name not in known]
+
+
+def _faults_of_keys(kind: str, found: dict[str, Any], wanted: list[str], where: str = "") -> list[str]:
+    faults = [f"there is no {kind} {name!r}{where}" for name in _unknown(found, wanted)]
+    return faults + [f"the {kind} {name!r}{where} is missing" for name in wanted if name not in found]
+
+
+def _faults_of_names(kind: str, names: Sequence[str]) -> list[str]:
+    faults = [
+        f"a name of the kind {kind} has neither letter nor digit"
+        for name in names
+        if not any(c.isalnum() for c in name)
+    ]
+    return faults + [f"the name {name[:LONGEST_NAME]!r}... is too long" for name in names if len(name) > LONGEST_NAME]
+
+
+def _faults_of_places(found: dict[str, Placed]) -> list[str]:
+    faults = [
+        f"{name!r}: the share {at.share:g} is no percentage" for name, at in found.items() if not 0 <= at.share <= 100
+    ]
+    total = sum(at.share for at in found.values())
+    if not faults and total <= 2:  # fractions, or nothing at all
+        faults.append(f"the shares sum to {total:g}; they are percentages and sum to 100")
+    return faults + _faults_of_names("zone", [at.parent for at in found.values() if at.parent])
+
+
+def _tidy(texts: Iterable[str]) -> list[str]:
+    """Each text once, with single spaces; one without letter or digit says nothing and is left out."""
+    return [text for text in dict.fromkeys(" ".join(text.split()) for text in texts) if any(c.isalnum() for c in text)]
+
+
+def _faults_of_description(name: str, entry: Described) -> list[str]:
+    faults = _faults_of_names("object", entry.objects)
+    if not entry.phrases:
+        faults.append(f"{name!r}: there is no phrase")
+    if not 1 <= len(entry.objects) <= MOST_LISTED or len(entry.phrases) > MOST_LISTED:
+        faults.append(f"{name!r}: give 1 to {MOST_LISTED} objects and as many phrases at most")
+    faults += [
+        f"{name!r}: a phrase is longer than {LONGEST_PHRASE} characters"
+        for p in entry.phrases
+        if len(p) > LONGEST_PHRASE
+    ]
+    if not (0 <= entry.inclination_deg <= 90 and 0 < entry.inclination_spread_deg <= 90):
+        faults.append(f"{name!r}: inclination must be 0 to 90 degrees, its spread above 0")
+    if not 10 <= entry.scale_cm <= 10000:
+        faults.append(f"{name!r}: scale_cm {entry.scale_cm:g} is no sensible distance in centimetres")
+    return faults
+
+
+def _faults_of_size(name: str, entry: Sized) -> list[str]:
+    sides = (entry.longest_cm, entry.shortest_cm, entry.height_cm)
+    faults = []
+    if min(sides) <= 0 or max(sides) > LARGEST_CM:
+        faults.append(f"{name!r}: sides are centimetres between 0 and {LARGEST_CM}")
+    if entry.shortest_cm > entry.longest_cm:
+        faults.append(f"{name!r}: the shortest side is longer than the longest")
+    if not 0 <= entry.bottom_cm <= HIGHEST_CM:
+        faults.append(f"{name!r}: its lower edge is 0 to {HIGHEST_CM} centimetres above the floor")
+    return faults
+
+
+def _faults_of_percentages(found: dict[str, dict[str, float]]) -> list[str]:
+    values = [value for row in found.values() for value in row.values()]
+    faults = [
+        f"{row!r}, {column!r}: {value:g} is no percentage"
+        for row, columns in found.items()
+        for column, value in columns.items()
+        if not 0 <= value <= 100
+    ]
+    if any(value != round(value) for value in values) and max(values) <= 1:
+        faults.append("the values look like fractions; give percentages from 0 to 100")
+    return faults

@@ -1,0 +1,1 @@
+"""What the gateway touches outside: models, disk, keys, the shipped library."""

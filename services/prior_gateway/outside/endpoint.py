@@ -1,0 +1,315 @@
+"""Language models over HTTP: one turn in, its text or the reason for none out.
+
+Two dialects behind one small interface: any OpenAI-compatible chat endpoint (structured output by response_format) and
+Anthropic's Messages API (structured output by a forced tool). Around them time-outs, retries with back-off and jitter,
+a pace, a budget and a circuit breaker. The key is read from the environment or a file, sent in a header, and taken out
+of whatever the server says.
+"""
+
+import asyncio
+import email.utils
+import logging
+import os
+import random
+import re
+import time
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Protocol
+from urllib.parse import urlsplit
+
+import httpx
+import msgspec
+
+from prior_sg.schemas.priors import ModelReply, ModelRequest
+from prior_sg.services.prior_gateway.core.compose import DEFAULT_ENDPOINTS, Config
+from prior_sg.services.runtime.service import Identity, ServiceError
+
+log = logging.getLogger(__name__)
+RETRIED = frozenset({408, 409, 425, 429, 500, 502, 503, 504, 529})
+LOOPBACK = ("localhost", "127.0.0.1", "::1")
+VERSION_HEADER = {"anthropic-version": "2023-06-01"}
+EXCERPT = 200  # characters of a server's error that are told
+
+
+class Failed(Exception):
+    """One attempt failed; `wait_s` is what the server asks for."""
+
+    def __init__(self, kind: str, reason: str, again: bool, wait_s: float = 0.0) -> None:
+        super().__init__(reason)
+        self.kind, self.again, self.wait_s = kind, again, wait_s
+
+
+@dataclass(frozen=True)
+class Said:
+    """What a server's answer holds."""
+
+    text: str
+    tokens_in: int = 0
+    tokens_out: int = 0
+
+
+class Dialect(Protocol):
+    """How one kind of endpoint is spoken to."""
+
+    path: str
+
+    def headers(self, key: str) -> dict[str, str]:
+        """Headers with the key, if there is one."""
+
+    def body(self, request: ModelRequest) -> dict[str, Any]:
+        """The request as JSON."""
+
+    def said(self, answer: Any) -> Said:
+        """The text of an answer. Raises KeyError, IndexError or TypeError when it has another form."""
+
+
+@dataclass(frozen=True)
+class OpenAi:
+    """Chat completions as OpenAI, vLLM, Ollama, llama.cpp and many others serve them."""
+
+    cfg: Config
+    path: str = "/chat/completions"
+
+    def headers(self, key: str) -> dict[str, str]:
+        return {"authorization": f"Bearer {key}"} if key else {}
+
+    def body(self, request: ModelRequest) -> dict[str, Any]:
+        limit = "max_completion_tokens" if self.cfg.base_url == DEFAULT_ENDPOINTS["openai"] else "max_tokens"
+        body: dict[str, Any] = {
+            "model": self.cfg.model,
+            "messages": [{"role": role, "content": text} for role, text in request.messages],
+            limit: request.max_tokens,
+        }
+        if self.cfg.temperature is not None:
+            body["temperature"] = self.cfg.temperature
+        if request.schema and self.cfg.structured != "none":
+            schema = msgspec.json.decode(request.schema)
+            named = {"name": request.schema_name, "strict": True, "schema": schema}
+            body["response_format"] = (
+                {"type": "json_schema", "json_schema": named}
+                if self.cfg.structured == "json_schema"
+                else {"type": "json_object", "schema": schema}
+            )
+        return body
+
+    def said(self, answer: Any) -> Said:
+        message, usage = answer["choices"][0]["message"], answer.get("usage") or {}
+        text = message.get("content") or message.get("refusal") or ""
+        return Said(str(text), int(usage.get("prompt_tokens") or 0), int(usage.get("completion_tokens") or 0))
+
+
+@dataclass(frozen=True)
+class Anthropic:
+    """The Messages API."""
+
+    cfg: Config
+    path: str = "/v1/messages"
+
+    def headers(self, key: str) -> dict[str, str]:
+        return VERSION_HEADER | ({"x-api-key": key} if key else {})
+
+    def body(self, request: ModelRequest) -> dict[str, Any]:
+        body: dict[str, Any] = {
+            "model": self.cfg.model,
+            "max_tokens": request.max_tokens,
+            "system": "\n\n".join(text for role, text in request.messages if role == "system"),
+            "messages": [{"role": role, "content": text} for role, text in request.messages if role != "system"],
+        }
+        if self.cfg.temperature is not None:
+            body["temperature"] = self.cfg.temperature
+        if request.schema and self.cfg.structured != "none":
+            schema = msgspec.json.decode(request.schema)
+            body["tools"] = [{"name": request.schema_name, "description": "Give the answer.", "input_schema": schema}]
+            body["tool_choice"] = {"type": "tool", "name": request.schema_name}
+        return body
+
+    def said(self, answer: Any) -> Said:
+        blocks, usage = answer["content"], answer.get("usage") or {}
+        tools = [msgspec.json.encode(block["input"]).decode() for block in blocks if block["type"] == "tool_use"]
+        texts = [block["text"] for block in blocks if block["type"] == "text"]
+        text = tools[0] if tools else "\n".join(texts)
+        return Said(text, int(usage.get("input_tokens") or 0), int(usage.get("output_tokens") or 0))
+
+
+DIALECTS: dict[str, type] = {"openai": OpenAi, "anthropic": Anthropic}
+
+
+class Endpoint:
+    """One model behind one URL. Clock, sleep and randomness are arguments, for tests."""
+
+    def __init__(
+        self,
+        cfg: Config,
+        key: str,
+        now: Callable[[], float] = time.monotonic,
+        sleep: Callable[[float], Awaitable[None]] = asyncio.sleep,
+        rng: random.Random | None = None,
+    ) -> None:
+        self.cfg, self._calls, self._key = cfg, cfg.calls, key
+        self._dialect: Dialect = DIALECTS[cfg.provider](cfg)
+        self._now, self._sleep, self._rng = now, sleep, rng or random.Random()
+        self._next_s = 0.0
+        self._failures, self._closed_until_s = 0, 0.0
+        self._asked, self._spent_usd = 0, 0.0
+
+    async def ask(self, request: ModelRequest) -> ModelReply:
+        """One turn. What can go wrong comes back as `failure` and `reason`, never as an exception."""
+        attempts = 0
+        end_s = self._now() + self._calls.deadline_s
+        while True:
+            attempts += 1
+            try:
+                self._admit()
+                await self._pace()
+                said = await self._once(request)
+            except Failed as error:
+                wait_s = max(error.wait_s, self._backoff_s(attempts))
+                if error.again and attempts < self._calls.attempts and self._now() + wait_s < end_s:
+                    log.info("the model is asked again", extra={"why": str(error), "wait_s": round(wait_s, 1)})
+                    await self._sleep(wait_s)
+                    continue
+                self._note(failed=error.kind not in ("budget", "paused"))
+                log.warning("the model gave no answer", extra={"kind": error.kind, "why": str(error)})
+                return self._reply(request, attempts, failure=error.kind, reason=str(error))
+            self._note(failed=False)
+            self._spent_usd += (
+                said.tokens_in * self._calls.usd_per_million_in + said.tokens_out * self._calls.usd_per_million_out
+            ) / 1e6
+            return self._reply(
+                request, attempts, text=self._clean(said.text), tokens_in=said.tokens_in, tokens_out=said.tokens_out
+            )
+
+    def _reply(self, request: ModelRequest, attempts: int, **fields: Any) -> ModelReply:
+        return ModelReply(conversation=request.conversation, turn=request.turn, attempts=attempts, **fields)
+
+    def _clean(self, text: str) -> str:
+        return text.replace(self._key, "***") if self._key else text
+
+    def _admit(self) -> None:
+        """Raise Failed when the circuit is open or the budget is spent."""
+        calls = self._calls
+        if (left_s := self._closed_until_s - self._now()) > 0:
+            reason = f"the endpoint failed {self._failures} times in a row and is left alone for another {left_s:.0f} s"
+            raise Failed("paused", reason, again=False)
+        if calls.most_calls and self._asked >= calls.most_calls:
+            raise Failed("budget", f"all {calls.most_calls} calls of this process are spent", again=False)
+        if calls.most_usd and self._spent_usd >= calls.most_usd:
+            raise Failed("budget", f"the budget of {calls.most_usd:g} USD of this process is spent", again=False)
+        self._asked += 1
+
+    async def _pace(self) -> None:
+        """At most so many requests a minute, evenly spaced."""
+        start_s = max(self._now(), self._next_s)
+        self._next_s = start_s + 60.0 / self._calls.requests_per_minute
+        if (wait_s := start_s - self._now()) > 0:
+            await self._sleep(wait_s)
+
+    def _backoff_s(self, attempts: int) -> float:
+        """Exponential, with full jitter (never less than half)."""
+        most_s = min(self._calls.backoff_s * 2 ** (attempts - 1), self._calls.most_backoff_s)
+        return most_s * self._rng.uniform(0.5, 1.0)
+
+    def _note(self, failed: bool) -> None:
+        """The circuit opens after several failures in a row; the first call after the pause is a trial."""
+        self._failures = self._failures + 1 if failed else 0
+        if self._failures >= self._calls.breaker_failures:
+            self._closed_until_s = self._now() + self._calls.breaker_s
+
+    async def _once(self, request: ModelRequest) -> Said:
+        timeout_s = self._calls.timeout_s
+        try:
+            async with asyncio.timeout(timeout_s):
+                status, headers, content = await self._post(request)
+        except (TimeoutError, httpx.TimeoutException) as error:
+            raise Failed("timeout", f"no complete answer within {timeout_s:g} s", again=True) from error
+        except httpx.TransportError as error:
+            reason = self._clean(f"{urlsplit(self.cfg.base_url).netloc} cannot be reached ({type(error).__name__})")
+            raise Failed("unreachable", reason, again=True) from error
+        if status != 200:
+            raise self._refused(status, headers, content)
+        try:
+            return self._dialect.said(msgspec.json.decode(content))
+        except (msgspec.DecodeError, KeyError, IndexError, TypeError, AttributeError, ValueError) as error:
+            raise Failed("garbled", "the server's answer is cut off or of another form", again=True) from error
+
+    async def _post(self, request: ModelRequest) -> tuple[int, httpx.Headers, bytes]:
+        """Status, headers and at most the allowed number of bytes of the answer."""
+        timeout = httpx.Timeout(self._calls.timeout_s, connect=self._calls.connect_s)
+        most = self._calls.most_answer_bytes
+        async with (
+            httpx.AsyncClient(timeout=timeout) as client,
+            client.stream(
+                "POST",
+                self.cfg.base_url.rstrip("/") + self._dialect.path,
+                headers=self._dialect.headers(self._key),
+                json=self._dialect.body(request),
+            ) as response,
+        ):
+            content = b""
+            async for piece in response.aiter_bytes():
+                content += piece
+                if len(content) > most:
+                    raise Failed("too large", f"the answer is larger than {most / 1e6:g} MB", again=False)
+            return response.status_code, response.headers, content
+
+    def _refused(self, status: int, headers: httpx.Headers, content: bytes) -> Failed:
+        said = self._clean(" ".join(content.decode(errors="replace").split()))[:EXCERPT]
+        reason = f"the server answered {status}" + (f": {said}" if said else "")
+        wait_s = retry_after_s(headers.get("retry-after", ""), datetime.now(UTC))
+        if wait_s > self._calls.most_backoff_s:
+            return Failed("busy", f"the server asks to wait {wait_s:.0f} s ({status})", again=False)
+        kind = "busy" if status == 429 else "server" if status >= 500 else "rejected"
+        return Failed(kind, reason, again=status in RETRIED, wait_s=wait_s)
+
+
+def retry_after_s(header: str, now: datetime) -> float:
+    """Seconds that a Retry-After header asks for, in either of its forms; 0 when it says nothing sensible."""
+    if re.fullmatch(r"\d{1,9}(\.\d+)?", header.strip()):
+        return float(header)
+    try:
+        return max((email.utils.parsedate_to_datetime(header) - now).total_seconds(), 0.0)
+    except (TypeError, ValueError):
+        return 0.0
+
+
+def read_key(cfg: Config) -> str:
+    """The key, from the file or the variable that the config names. Raises ServiceError, which never shows a key."""
+    if cfg.key_file:
+        path = Path(cfg.key_file).expanduser()
+        try:
+            key = path.read_text(encoding="utf-8").strip()
+        except (OSError, UnicodeDecodeError) as error:
+            raise ServiceError(f"prior_gateway.key_file: {path} cannot be read") from error
+        where = str(path)
+    elif cfg.key_variable:
+        where = f"the environment variable {cfg.key_variable}"
+        key = os.environ.get(cfg.key_variable, "").strip()
+    else:
+        return ""
+    if not key:
+        raise ServiceError(
+            f"{where} holds no key for {cfg.provider}; set it, name another with prior_gateway.key_env or "
+            "prior_gateway.key_file, or use prior_gateway.provider=library"
+        )
+    if not key.isascii() or any(c.isspace() for c in key):
+        raise ServiceError(f"{where} holds something that is no key: it must be one word of ASCII characters")
+    parts = urlsplit(cfg.base_url)
+    if parts.scheme != "https" and parts.hostname not in LOOPBACK:
+        raise ServiceError("prior_gateway.endpoint: a key is sent over https only, or to this machine")
+    return key
+
+
+def open_endpoint(cfg: Config, identity: Identity) -> Callable[[ModelRequest], Awaitable[ModelReply]]:
+    """The errand that asks the configured model. Raises ServiceError when its key is missing."""
+    if cfg.provider == "library":
+
+        async def nobody(request: ModelRequest) -> ModelReply:
+            return ModelReply(
+                conversation=request.conversation, turn=request.turn, failure="none", reason="no model is configured"
+            )
+
+        return nobody
+    return Endpoint(cfg, read_key(cfg)).ask

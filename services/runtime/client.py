@@ -1,0 +1,132 @@
+"""A program's end of the bus: publish, ask and listen with typed messages."""
+
+import contextlib
+import threading
+import time
+import uuid
+from collections.abc import Callable
+from types import TracebackType
+from typing import Any, TypeVar
+
+from prior_sg.schemas.codec import DecodeError, Message, decode, encode
+from prior_sg.schemas.priors import Prior, PriorRequest, Task
+from prior_sg.schemas.status import ServiceStatus, StatusRequest
+from prior_sg.schemas.topics import PRIOR, PRIORS, TASK, Query, Topic, alive_key, status_key
+from prior_sg.services.runtime.bus import Answer, Bus, BusError, Sample, pack_header
+
+R = TypeVar("R", bound=Message)
+POLL_S = 0.5
+PATIENT_POLLS = 4
+
+
+class NoPriorError(Exception):
+    """The task has no prior; the message is the gateway's reason."""
+
+
+class Client:
+    """Use as a context manager; leaves the bus at the end."""
+
+    def __init__(self, bus: Bus) -> None:
+        self.bus = bus
+        self.writer = f"client/{uuid.uuid4().hex[:8]}/{time.time_ns()}"
+        self._sequences: dict[str, int] = {}
+        self._alive: dict[str, str] = {}
+        self._watching = False
+
+    def __enter__(self) -> "Client":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.bus.close()
+
+    def publish(self, topic: Topic, message: Message) -> None:
+        """Publish one message."""
+        key = topic.key_of(message)
+        sequence = self._sequences.get(key, 0)
+        self._sequences[key] = sequence + 1
+        self.bus.put(topic, key, encode(message), pack_header(self.writer, sequence, time.time_ns()))
+
+    def listen(self, topic: Topic, robot: str, on_sample: Callable[[Sample], None]) -> None:
+        """Receive samples on a foreign thread."""
+        self.bus.subscribe(topic, topic.pattern(robot), on_sample, lambda topic, number: None)
+
+    def ask(self, query: Query, request: Message, timeout_s: float = 10.0) -> Any:
+        """The reply, decoded. Raises BusError when nobody answers in time."""
+        return self._ask(query.key_of(request), query.reply, request, query.name, timeout_s)
+
+    def _ask(self, key: str, reply_type: type[R], request: Message, name: str, timeout_s: float) -> R:
+        arrived = threading.Event()
+        answers: list[Answer] = []
+
+        def receive(answer: Answer) -> None:
+            answers.append(answer)
+            arrived.set()
+
+        self.bus.call(key, encode(request), timeout_s, receive)
+        if not arrived.wait(timeout_s + 1.0):
+            raise BusError(f"{name}: no answer within {timeout_s:.0f} s; is the service running (`prior-sg health`)?")
+        answer = answers[0]
+        if answer.payload is None:
+            raise BusError(f"{name}: {_explain(answer.reason)}")
+        try:
+            return decode(reply_type, answer.payload)
+        except DecodeError as error:
+            raise BusError(f"{name}: the answer is not valid: {error}") from error
+
+    def give_task(self, task: Task, timeout_s: float, waiting: Callable[[str], None] = lambda reason: None) -> Prior:
+        """Publish a task and wait for the prior that answers it; a model may take minutes, and `waiting` is told why
+        meanwhile. Raises NoPriorError, BusError."""
+        found: list[Prior] = []
+        arrived = threading.Event()
+        given_ns = time.time_ns()
+
+        def see(sample: Sample) -> None:
+            with contextlib.suppress(DecodeError):
+                prior = decode(Prior, sample.payload)
+                if sample.sent_ns >= given_ns and prior.answers(task):
+                    found.append(prior)
+                    arrived.set()
+
+        self.listen(PRIOR, "*", see)
+        self.publish(TASK, task)
+        request = PriorRequest(environment=task.environment, task=task.task, regions=task.regions)
+        end_s, polls = time.monotonic() + timeout_s, 0
+        while not arrived.wait(POLL_S):
+            reply, polls = self.ask(PRIORS, request), polls + 1
+            if not reply.priors and not reply.pending:
+                raise NoPriorError(reply.reason)
+            if reply.priors and not reply.pending and polls > PATIENT_POLLS:  # another clock may be behind ours
+                return reply.priors[0]
+            if time.monotonic() > end_s:
+                raise NoPriorError(f"no prior within {timeout_s:.0f} s: {reply.reason or 'see `prior-sg health`'}")
+            waiting(reply.reason)
+        return found[0]
+
+    def alive(self, settle_s: float = 0.3) -> dict[str, str]:
+        """Instance to service of everything alive now."""
+        if not self._watching:
+            self._watching = True
+            self.bus.watch(alive_key("*", "*"), self._saw)
+            time.sleep(settle_s)
+        return dict(self._alive)
+
+    def status(self, service: str, instance: str, timeout_s: float = 3.0) -> ServiceStatus:
+        """Health of one process. Raises BusError."""
+        return self._ask(
+            status_key(service, instance), ServiceStatus, StatusRequest(), f"status of {instance}", timeout_s
+        )
+
+    def _saw(self, key: str, alive: bool) -> None:
+        service, instance = key.split("/")[-2:]
+        if alive:
+            self._alive[instance] = service
+        else:
+            self._alive.pop(instance, None)
+
+
+def _explain(reason: str) -> str:
+    if reason == "nobody":
+        return "nobody answers; is the service running (`prior-sg health`)?"
+    return "no answer in time; the service is busy or hangs" if reason == "timeout" else reason

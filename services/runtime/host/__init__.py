@@ -1,0 +1,1 @@
+"""Runs one service on a bus."""

@@ -1,0 +1,106 @@
+"""Where a service's inputs wait: filled from foreign threads, emptied by one.
+
+`latest` samples replace an older one of the same key that nobody has read; `every` samples queue up. Repeats are
+dropped and gaps counted by each writer's own sequence numbers.
+"""
+
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Hashable
+from dataclasses import dataclass, field
+from itertools import count
+from typing import Any
+
+from prior_sg.services.runtime.bus import Sample
+
+
+@dataclass
+class Counts:
+    """What happened to one topic."""
+
+    received: int = 0
+    consumed: int = 0
+    published: int = 0
+    malformed: int = 0
+    skipped: int = 0
+    duplicate: int = 0
+    missed: int = 0
+    last_age_ms: float = -1.0
+
+
+@dataclass
+class Inbox:
+    """`wake` is called, from whatever thread, when the inbox turns from empty to not empty."""
+
+    wake: Callable[[], None]
+    counts: dict[str, Counts] = field(default_factory=dict)
+    _lock: threading.Lock = field(default_factory=threading.Lock)
+    _waiting: "OrderedDict[Hashable, Any]" = field(default_factory=OrderedDict)
+    _sequences: dict[tuple[str, str], int] = field(default_factory=dict)
+    _ids: count = field(default_factory=count)
+
+    def of(self, topic: str) -> Counts:
+        """The counts of a topic."""
+        return self.counts.setdefault(topic, Counts())
+
+    def offer(self, sample: Sample) -> None:
+        """Take in one sample."""
+        with self._lock:
+            counts = self.of(sample.topic.name)
+            counts.received += 1
+            if not self._is_new(sample, counts):
+                counts.duplicate += 1
+                return
+            if sample.topic.delivery == "latest":
+                place: Hashable = (sample.topic.name, sample.key)
+                if self._waiting.pop(place, None) is not None:
+                    counts.skipped += 1
+            else:
+                place = next(self._ids)
+            self._put(place, sample)
+
+    def put(self, item: Any, once: Hashable | None = None, first: bool = False) -> None:
+        """Take in anything else; with `once`, only if no item of that name is waiting; with `first`, before all."""
+        with self._lock:
+            if once is None or once not in self._waiting:
+                place = next(self._ids) if once is None else once
+                self._put(place, item)
+                if first:
+                    self._waiting.move_to_end(place, last=False)
+
+    def missed(self, topic: str, number: int) -> None:
+        """Count samples known to be lost for good."""
+        with self._lock:
+            self.of(topic).missed += number
+
+    def take(self) -> Any | None:
+        """The oldest item, or None."""
+        with self._lock:
+            return self._waiting.popitem(last=False)[1] if self._waiting else None
+
+    def waiting(self) -> list[Any]:
+        """What waits, oldest first."""
+        with self._lock:
+            return list(self._waiting.values())
+
+    def __len__(self) -> int:
+        return len(self._waiting)
+
+    def _put(self, place: Hashable, item: Any) -> None:
+        was_empty = not self._waiting
+        self._waiting[place] = item
+        if was_empty:
+            self.wake()
+
+    def _is_new(self, sample: Sample, counts: Counts) -> bool:
+        """Whether this sample continues its writer's sequence; a reader that joins late misses nothing by that."""
+        if not sample.writer:
+            return True
+        known = (sample.writer, sample.key)
+        last = self._sequences.get(known)
+        if last is not None and sample.sequence <= last:
+            return False
+        if last is not None and sample.topic.delivery != "latest":
+            counts.missed += sample.sequence - last - 1
+        self._sequences[known] = sample.sequence
+        return True

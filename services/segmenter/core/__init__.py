@@ -1,0 +1,1 @@
+"""From places, pyramids and priors to regions (pure)."""

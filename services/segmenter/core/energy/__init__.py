@@ -1,0 +1,1 @@
+"""The Markov random field and its minimisation (pure)."""

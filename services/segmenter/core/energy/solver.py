@@ -1,0 +1,296 @@
+"""A labelling that follows a changing field at a cost that follows the change (pure).
+
+    solver = Solver()
+    labels = solver.update(field, labels, dirty=rows, expired=clock_says_so)   # at every change of the field
+    labels = solver.drain(expired=clock_says_so)                               # when idle, until `solver.pending` is 0
+
+The caller says which places changed (`dirty`: those with another unary cost, other edges, other weights or a
+neighbour that is gone; new places too), or leaves it to the solver, which then compares the field with the last one.
+Row numbers may change between updates: `previous` says which row each place had (-1: a new place), as
+`graph.Step.previous` does. A place without a label yet has label -1; labels may be others than the solver's last. The
+solver keeps references to the field's arrays, not copies: where they are changed in place, `dirty` must be given.
+
+The change is solved as a local problem with fixed surroundings, which grows while labels at its border change:
+
+1. Message passing on the changed places and those within `reach` steps proposes labels. Each connected set of places
+   that the proposal labels otherwise is taken if it lowers the energy by itself.
+2. The alpha-beta-swaps that the change can have made profitable are tried, then those that their own changes can have.
+
+Both stop when `expired()` says so; the labels are valid at any time and the energy of the field in hand never rises.
+Once `pending` is 0, no alpha-beta-swap on the whole field lowers the energy (see `moves`), as after a fresh solve.
+Idle time also goes into longer message passing over the whole field, at the start and whenever much has changed.
+"""
+
+from collections.abc import Callable
+from typing import Literal
+
+import msgspec
+import numpy as np
+from numba import njit
+
+from prior_sg.services.segmenter.core.energy import swap_moves
+from prior_sg.services.segmenter.core.energy.maxflow import CUTS
+from prior_sg.services.segmenter.core.energy.mrf import Field, least_gain
+from prior_sg.services.segmenter.core.energy.trws import empty_messages, lay_down, run_pass, take_up
+from prior_sg.services.segmenter.core.map.arcs import Arcs, arcs_of, ball
+
+Expired = Callable[[], bool]
+
+
+class Settings(msgspec.Struct, frozen=True, kw_only=True):
+    """How hard to try. Chosen on random fields like place graphs; see docs/performance.md."""
+
+    min_cut: Literal["pymaxflow", "scipy"] = "pymaxflow"  # library for large cuts; PyMaxflow is under the GPL
+    compiled_up_to: int = 2_000  # free places in a cut that compiled code solves itself
+    round_trips: int = 6  # of message passing
+    idle_round_trips: int = 20  # of message passing over the whole field when all else is done
+    worn_share: float = 0.2  # changed places, of all, after which that is due again
+    reach: int = 5  # steps from a changed place within which message passing may propose labels
+    near: int = 150  # places of a swap's local problem
+    chunk: int = 8_000  # visits of places between two looks at the budget, 2 ms or so
+
+    def __post_init__(self) -> None:
+        counts = (self.round_trips, self.idle_round_trips, self.reach, self.compiled_up_to, self.worn_share)
+        if min(counts) < 0 or min(self.near, self.chunk) < 1:
+            raise ValueError("a count, a reach or a share is negative, or near or chunk less than 1")
+
+
+def never() -> bool:
+    """No budget."""
+    return False
+
+
+def _same_edges(one: Field, other: Field) -> bool:
+    return one.edges is other.edges and one.weights is other.weights
+
+
+class Solver:
+    """Labels of the last field, and what is still to be tried on it."""
+
+    def __init__(self, settings: Settings | None = None) -> None:
+        self.settings = settings or Settings()
+        self.labels = np.zeros(0, np.int64)
+        self._field: Field | None = None
+        self._graph: Arcs = arcs_of(0, np.zeros((0, 2)), np.zeros(0))
+        self._unary = np.zeros((0, 0))
+        self._pairwise = np.zeros((0, 0))
+        self._work = swap_moves.empty_work(0, 0, 0)
+        self._least_gain = 0.0
+        self._changes = 0  # places reported dirty since message passing last went over the whole field
+        self._unproposed = np.zeros(0, np.int64)  # rows around which message passing has yet to propose
+
+    @property
+    def pending(self) -> int:
+        """Places at which a swap is still to be tried or around which labels are to be proposed; 0 when settled."""
+        return swap_moves.waiting(self._work, swap_moves.DEEP) + len(self._unproposed) + self._worn
+
+    def update(
+        self,
+        field: Field,
+        labels: np.ndarray,
+        expired: Expired = never,
+        *,
+        dirty: np.ndarray | None = None,
+        previous: np.ndarray | None = None,
+    ) -> np.ndarray:
+        """Labels (place,) for `field`, starting from `labels`, by work near the change only; see the module."""
+        self.take(field, labels, dirty=dirty, previous=previous)
+        self._propose_near(expired)
+        self._swap(swap_moves.NEAR, expired)
+        return self.labels.copy()
+
+    def drain(self, expired: Expired = never) -> np.ndarray:
+        """Go on with what is pending, on the whole field; the labels (place,) so far."""
+        self._propose_near(expired)
+        self._swap(swap_moves.DEEP, expired)
+        if self._worn and not expired():
+            if self._propose(np.arange(len(self.labels)), self.settings.idle_round_trips, expired):
+                self._changes = 0
+            self._swap(swap_moves.DEEP, expired)
+        return self.labels.copy()
+
+    @property
+    def _worn(self) -> bool:
+        """Whether so much changed since message passing went over the whole field that it may well find better."""
+        return self._changes > self.settings.worn_share * len(self.labels)
+
+    def _swap(self, depth: int, expired: Expired) -> None:
+        settings, arrays = self.settings, (self._graph, self._unary, self._pairwise, self.labels, self._work)
+        limits = swap_moves.Limits(depth, settings.near, settings.compiled_up_to, settings.chunk, self._least_gain)
+        while swap_moves.waiting(self._work, depth) and not expired():
+            swap_moves.run_swaps(*arrays, CUTS[settings.min_cut], limits)
+
+    def take(
+        self,
+        field: Field,
+        labels: np.ndarray,
+        *,
+        dirty: np.ndarray | None = None,
+        previous: np.ndarray | None = None,
+    ) -> None:
+        """Only note the change; `drain` does the work."""
+        before, count = self._field, len(field.unary)
+        if before is not None and before.unary.shape[1] != field.unary.shape[1]:
+            before = None
+        if before is not None and previous is None and len(before.unary) != count:
+            raise ValueError("the number of places changed: `previous` must say which row each place had")
+        same_edges = before is not None and previous is None and _same_edges(before, field)
+        graph = self._graph if same_edges else arcs_of(count, field.edges, field.weights)
+        unary = np.ascontiguousarray(field.unary, dtype=np.float64)
+        pairwise = np.ascontiguousarray(field.pairwise, dtype=np.float64)
+        everything = before is None or not np.array_equal(self._pairwise, pairwise)
+        origin = np.arange(count) if previous is None else previous
+        if everything:
+            dirty = np.arange(count)
+        elif dirty is None:
+            dirty = changed_rows(self._graph, self._unary, graph, unary, origin)
+        elif dirty.dtype == np.bool_:
+            dirty = np.flatnonzero(dirty)
+        if not same_edges:
+            self._carry(before, origin, field, graph)
+        given, found = np.asarray(labels), self.labels
+        self._graph, self._unary, self._pairwise, self._field = graph, unary, pairwise, field
+        self.labels = np.array(given, dtype=np.int64)
+        label_new(self.labels, graph, unary, pairwise)
+        if not everything:
+            known = np.flatnonzero(origin >= 0)
+            swap_moves.flag_around(known[given[known] != found[origin[known]]], swap_moves.NEAR, graph, self._work)
+        swap_moves.flag_all(dirty, swap_moves.DEEP if before is None else swap_moves.NEAR, self._work)
+        self._unproposed = np.union1d(self._unproposed, dirty).astype(np.int64)
+        self._changes += len(dirty)
+        self._least_gain = max(0.0 if before is None else self._least_gain, least_gain(unary[dirty]))
+
+    def _carry(self, before: Field | None, origin: np.ndarray, field: Field, graph: Arcs) -> None:
+        """Scratch space for new rows and arcs, with what was pending before on the rows where it is now."""
+        old_work, old_unproposed = self._work, self._unproposed
+        arcs, (count, label_count) = len(graph.neighbours), field.unary.shape
+        self._work = swap_moves.empty_work(count, label_count, arcs)
+        self._messages = empty_messages(count, arcs, field.pairwise, np.float32)
+        self._unproposed = np.zeros(0, np.int64)
+        if before is None:
+            return
+        known = np.flatnonzero(origin >= 0)
+        self._work.pending[known] = old_work.pending[origin[known]]
+        swap_moves.requeue(self._work)
+        waits = np.zeros(len(old_work.mark), np.bool_)
+        waits[old_unproposed] = True
+        self._unproposed = known[waits[origin[known]]]
+
+    def _propose(self, rows: np.ndarray, round_trips: int, expired: Expired) -> bool:
+        """Message passing on `rows` (ascending) takes what lowers the energy; False if there was no budget for it.
+
+        A budget that ends it early is not made up for: the swaps go first then, lest nothing ever gets done.
+        """
+        graph, messages, labels, trips = self._graph, self._messages, self.labels, 0
+        scene = (graph, self._unary, self._pairwise)
+        messages.pairwise[: len(self._pairwise), : len(self._pairwise)] = self._pairwise
+        take_up(rows, graph, self._unary, labels, messages)
+        before = labels[rows]
+        while trips < round_trips and not expired():
+            round_trip(rows, labels, *scene, messages, self._work.mark, self._least_gain)
+            trips += 1
+        lay_down(rows, messages)
+        swap_moves.flag_around(rows[labels[rows] != before], swap_moves.NEAR, graph, self._work)
+        return trips > 0 or not round_trips
+
+    def _propose_near(self, expired: Expired) -> None:
+        """Proposals around the places that changed."""
+        if len(self._unproposed):
+            rows = ball(
+                self._unproposed, self.settings.reach, self._graph.starts, self._graph.neighbours, self._messages.inside
+            )
+            if self._propose(rows, self.settings.round_trips, expired):
+                self._unproposed = self._unproposed[:0]
+
+
+@njit(cache=True, nogil=True)
+def round_trip(rows, labels, graph, unary, pairwise, messages, mark, least_gain):  # noqa: PLR0917, ANN001, ANN201
+    """Pass messages there and back over `rows`; fuse the labels of both passes into `labels`."""
+    for forward in (True, False):
+        run_pass(rows, forward, graph, messages)
+        fuse(rows, messages.proposed, labels, graph, unary, pairwise, mark, least_gain)
+
+
+@njit(cache=True, nogil=True)
+def changed_rows(graph_before, unary_before, graph, unary, origin):  # noqa: ANN001, ANN201
+    """Rows (dirty,) of `graph` that are new, or whose costs, neighbours or weights differ; origin[row] = row before."""
+    places, labels = unary.shape
+    row_now = np.full(len(unary_before), -1, np.int64)
+    for row in range(places):
+        if origin[row] >= 0:
+            row_now[origin[row]] = row
+    dirty = np.empty(places, np.int64)
+    count = 0
+    for row in range(places):
+        old = origin[row]
+        same = old >= 0
+        if same:
+            for label in range(labels):
+                same &= unary[row, label] == unary_before[old, label]
+        if same:
+            first, last = graph_before.starts[old], graph_before.starts[old + 1]
+            same = last - first == graph.starts[row + 1] - graph.starts[row]
+            for arc in range(first, last):
+                same = same and _has_arc(graph, row, row_now[graph_before.neighbours[arc]], graph_before.weights[arc])
+        if not same:
+            dirty[count] = row
+            count += 1
+    return dirty[:count].copy()
+
+
+@njit(cache=True, nogil=True)
+def _has_arc(graph, row, neighbour, weight):  # noqa: ANN001, ANN202
+    for arc in range(graph.starts[row], graph.starts[row + 1]):
+        if graph.neighbours[arc] == neighbour and graph.weights[arc] == weight:
+            return True
+    return False
+
+
+@njit(cache=True, nogil=True)
+def label_new(labels, graph, unary, pairwise):  # noqa: ANN001, ANN201
+    """Give each place without a label the cheapest one, its labelled neighbours considered."""
+    costs = np.empty(unary.shape[1])
+    for place in range(len(labels)):
+        if labels[place] >= 0:
+            continue
+        costs[:] = unary[place]
+        for arc in range(graph.starts[place], graph.starts[place + 1]):
+            label = labels[graph.neighbours[arc]]
+            if label >= 0:
+                costs += graph.weights[arc] * pairwise[label]
+        labels[place] = np.argmin(costs)
+
+
+@njit(cache=True, nogil=True)
+def fuse(rows, proposed, labels, graph, unary, pairwise, mark, least_gain):  # noqa: PLR0917, ANN001, ANN201
+    """Take each connected set of places that `proposed` labels otherwise if that alone gains more than `least_gain`.
+
+    Sets that do not touch each other change the energy independently, so each is decided by itself. `mark` is scratch,
+    all zero before and after.
+    """
+    starts, neighbours, weights = graph.starts, graph.neighbours, graph.weights
+    costs = np.empty(unary.shape[1])
+    members, former = np.empty(len(rows), np.int64), np.empty(len(rows), np.int64)
+    for row in rows:
+        mark[row] = 1 if proposed[row] != labels[row] else 0
+    for row in rows:
+        if mark[row] == 0:
+            continue
+        members[0], count, index, gain = row, 1, 0, 0.0
+        mark[row] = 0
+        while index < count:
+            place = members[index]
+            for arc in range(starts[place], starts[place + 1]):
+                neighbour = neighbours[arc]
+                if mark[neighbour] == 1:
+                    mark[neighbour] = 0
+                    members[count] = neighbour
+                    count += 1
+            swap_moves.conditional(place, starts, neighbours, weights, unary, pairwise, labels, costs)
+            gain += costs[labels[place]] - costs[proposed[place]]
+            former[index] = labels[place]
+            labels[place] = proposed[place]
+            index += 1
+        if gain <= least_gain:
+            for index in range(count):
+                labels[members[index]] = former[index]

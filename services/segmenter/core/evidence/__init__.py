@@ -1,0 +1,1 @@
+"""Descriptors of places from stored pyramids (pure)."""

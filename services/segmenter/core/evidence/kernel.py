@@ -1,0 +1,275 @@
+"""Semantic integration kernel and temporal fusion: from pyramids to one descriptor per place (pure).
+
+All pyramids stay in an archive, without their images, so that new or moved places, a corrected pose or another query
+radius are integrated over every frame as if they had been there from the start.
+"""
+
+from collections.abc import Set
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+from scipy import ndimage
+
+from prior_sg.schemas.features import Pyramid
+from prior_sg.schemas.frames import Intrinsics
+from prior_sg.services.geometry import inverse
+from prior_sg.services.segmenter.core.loops import accumulate, weigh
+
+PAIRS_PER_BLOCK = 1 << 19  # frame-place pairs tested at once; bounds the memory of the visibility test
+
+
+class KernelConfig(msgspec.Struct, frozen=True, kw_only=True):
+    """Which places a frame observes, and how its crops are weighted."""
+
+    gamma: float = 1.0  # bandwidth of the scale trust, in squared natural logarithms (unpublished)
+    min_depth_m: float = 0.3  # places closer to the camera plane are not observed
+    max_depth_m: float = 10.0  # nor places further away
+    border_share: float = 0.0  # share of the image's sides, at its border, in which places are not observed
+    occlusion_tolerance_m: float = (
+        0.3  # a place may lie this far behind the depth surface; less than wall and clearance
+    )
+
+    def __post_init__(self) -> None:
+        if not (self.gamma > 0 and 0 <= self.min_depth_m < self.max_depth_m and 0 <= self.border_share < 0.5):
+            raise ValueError("gamma and the depth range must be positive, and border_share below 0.5")
+
+
+class Frame(NamedTuple):
+    """One pyramid, compact: crops sorted by layer, arrays of its own."""
+
+    camera_from_world: np.ndarray  # (4, 4)
+    intrinsics: Intrinsics
+    centers_px: np.ndarray  # (crop, 2) float32
+    sigmas_px: np.ndarray  # (crop,) float32
+    layer_starts: np.ndarray  # (layer,) first crop of each layer
+    embeddings: np.ndarray  # (crop, dim) float16
+    surface_m: np.ndarray  # (row, column) float16, holes filled
+
+
+def compact(pyramid: Pyramid) -> Frame:
+    """What integration needs of a pyramid, copied."""
+    order = np.argsort(pyramid.layers, kind="stable")
+    return Frame(
+        camera_from_world=inverse(pyramid.world_from_camera),
+        intrinsics=pyramid.intrinsics,
+        centers_px=pyramid.centers_px[order],
+        sigmas_px=pyramid.sigmas_px[order],
+        layer_starts=np.unique(pyramid.layers[order], return_index=True)[1],
+        embeddings=pyramid.embeddings[order],
+        surface_m=fill_holes(pyramid.surface_m).astype(np.float16),
+    )
+
+
+def fill_holes(surface_m: np.ndarray) -> np.ndarray:
+    """The surface with each unmeasured cell (0) at the depth of the nearest measured one; a copy.
+
+    Sensors lose depth on dark, shiny and far surfaces. The neighbour's depth hides places beyond what was measured
+    around the hole, so a hole never shows a place through a wall; without any measurement nothing is visible.
+    """
+    holes = surface_m <= 0
+    if not holes.any() or holes.all():
+        return surface_m.copy()
+    rows, columns = ndimage.distance_transform_edt(holes, return_distances=False, return_indices=True)
+    return surface_m[rows, columns]
+
+
+def project(frame: Frame, positions_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels (n, 2) and depths (n,) of world positions (n, 3); pixels behind the camera are not meaningful."""
+    rotation, shift, camera = frame.camera_from_world[:3, :3], frame.camera_from_world[:3, 3], frame.intrinsics
+    x, y, depths_m = (positions_m @ rotation.T + shift).T
+    safe_m = np.where(depths_m > 1e-6, depths_m, 1.0)
+    pixels = np.stack((x / safe_m * camera.fx_px + camera.cx_px, y / safe_m * camera.fy_px + camera.cy_px), axis=1)
+    return pixels, depths_m
+
+
+def visible(frame: Frame, positions_m: np.ndarray, cfg: KernelConfig) -> np.ndarray:
+    """Rows of the places that the frame observes: in front, inside the image, and not behind the depth surface.
+
+    A place counts as hidden when its centre lies behind the surface at its pixel by more than the tolerance, which
+    covers the errors of depth and of the coarse surface.
+    """
+    pixels, depths_m = project(frame, positions_m)
+    size = np.array((frame.intrinsics.width_px, frame.intrinsics.height_px))
+    border = cfg.border_share * size
+    seen = (depths_m >= cfg.min_depth_m) & (depths_m <= cfg.max_depth_m)
+    seen &= ((pixels >= border - 0.5) & (pixels < size - 0.5 - border)).all(axis=1)
+    rows = np.flatnonzero(seen)
+    cells = ((pixels[rows] + 0.5) / size * frame.surface_m.shape[::-1]).astype(np.int64)
+    surface_m = frame.surface_m[cells[:, 1], cells[:, 0]]
+    return rows[(surface_m > 0) & (depths_m[rows] - cfg.occlusion_tolerance_m <= surface_m)]
+
+
+def kernel(frame: Frame, positions_m: np.ndarray, query_radius_m: float, gamma: float) -> tuple[np.ndarray, np.ndarray]:
+    """Integration weights W (place, crop) and trust T (place,) of observed places (eqs. query_state, spatial_affinity,
+    scale_trust, observation_trust).
+
+    Crops of one layer have one scale, so w_sca times the highest w_spa of a layer is the highest W in it.
+    """
+    pixels, depths_m = project(frame, positions_m)
+    focal_px = 0.5 * (frame.intrinsics.fx_px + frame.intrinsics.fy_px)
+    query_states = np.column_stack((pixels, focal_px * query_radius_m / depths_m)).astype(np.float32)
+    crop_states = np.column_stack((frame.centers_px, frame.sigmas_px))
+    return weigh(query_states, crop_states, frame.layer_starts, float(gamma))
+
+
+class Evidence:
+    """Running sums per place over all frames that observed it: sum of T e_p, sum of T, and count.
+
+    Places hold a slot each; slots of removed places are used again.
+    """
+
+    def __init__(self) -> None:
+        self.slots: dict[int, int] = {}
+        self._free: list[int] = []
+        self._used = 0
+        self.sums = np.zeros((0, 0), dtype=np.float32)  # (slot, dim): sum over frames of T e_p
+        self.trust = np.zeros(0)  # (slot,)
+        self.frames = np.zeros(0, dtype=np.int64)  # (slot,) keyframes that observed the place
+
+    def add(self, place_ids: list[int]) -> None:
+        """Empty slots for these places, which are new or to be integrated afresh."""
+        for place in place_ids:
+            if place not in self.slots:
+                self.slots[place] = self._free.pop() if self._free else self._used
+                self._used = max(self._used, self.slots[place] + 1)
+        self._reserve(self._used, self.sums.shape[1])
+        taken = self.of(place_ids)
+        self.sums[taken], self.trust[taken], self.frames[taken] = 0.0, 0.0, 0
+
+    def remove(self, place_ids: list[int]) -> None:
+        """Forget places."""
+        self._free.extend(self.slots.pop(place) for place in place_ids)
+
+    def of(self, place_ids: list[int]) -> np.ndarray:
+        """Slots of places."""
+        return np.fromiter((self.slots[place] for place in place_ids), dtype=np.int64, count=len(place_ids))
+
+    def blank(self) -> "Evidence":
+        """The same places in the same slots, nothing observed yet."""
+        other = Evidence()
+        other.slots, other._free, other._used = dict(self.slots), list(self._free), self._used
+        other._reserve(self._used, 0)
+        return other
+
+    def observe(self, slots: np.ndarray, frame: Frame, weights: np.ndarray, trust: np.ndarray) -> None:
+        """Add one frame's observation of the places in `slots` (eqs. single_observation_feature,
+        temporal_fusion_places)."""
+        self._reserve(self._used, frame.embeddings.shape[1])
+        accumulate(self.sums, slots, weights, trust, frame.embeddings.astype(np.float32))
+        self.trust[slots] += trust
+        self.frames[slots] += 1
+
+    def fits(self, frame: Frame) -> bool:
+        """Whether the frame's embeddings have as many dimensions as those observed before."""
+        return not self.frames.any() or frame.embeddings.shape[1] == self.sums.shape[1]
+
+    def descriptors(self, slots: np.ndarray) -> np.ndarray:
+        """d_vis (place, dim), unit length; zero for places never observed."""
+        sums = self.sums[slots].astype(np.float64)
+        lengths = np.linalg.norm(sums, axis=1, keepdims=True)
+        return np.divide(sums, lengths, out=np.zeros_like(sums), where=lengths > 0)
+
+    def _reserve(self, slots: int, dim: int) -> None:
+        """Room for `slots` slots of `dim` dimensions; the dimensions change only while nothing was observed."""
+        have, width = self.sums.shape
+        if slots <= have and dim == width:
+            return
+        if dim != width and self.frames.any():
+            raise ValueError(f"embeddings of {dim} dimensions do not go with those of {width}")
+        size = max(have, slots if slots <= have else max(slots, 2 * have, 64))
+        sums = np.zeros((size, dim), dtype=np.float32)
+        if dim == width:
+            sums[:have] = self.sums
+        self.sums = sums
+        self.trust = np.concatenate((self.trust, np.zeros(size - have)))
+        self.frames = np.concatenate((self.frames, np.zeros(size - have, dtype=np.int64)))
+
+
+class Archive:
+    """All frames, in the order of arrival, with a frustum test of many places against all of them at once."""
+
+    def __init__(self) -> None:
+        self.frames: list[Frame] = []
+        self._index: dict[int, int] = {}  # by frame id
+
+    def add(self, frame_id: int, frame: Frame) -> bool:
+        """Keep a frame; False when this id is already here."""
+        if frame_id in self._index:
+            return False
+        self._index[frame_id] = len(self.frames)
+        self.frames.append(frame)
+        return True
+
+    def move(self, frame_id: int, world_from_camera: np.ndarray) -> tuple[Frame, Frame] | None:
+        """Give a frame another pose; returns it before and after, None where it is unknown or stands there already."""
+        index = self._index.get(frame_id)
+        if index is None:
+            return None
+        before, camera_from_world = self.frames[index], inverse(world_from_camera)
+        if np.array_equal(before.camera_from_world, camera_from_world):
+            return None
+        self.frames[index] = before._replace(camera_from_world=camera_from_world)
+        return before, self.frames[index]
+
+    @property
+    def frame_ids(self) -> Set[int]:
+        """Numbers of the frames that are here."""
+        return self._index.keys()
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def candidates(self, positions_m: np.ndarray, cfg: KernelConfig) -> np.ndarray:
+        """Frames (indices, ascending) whose frustum may hold any of the positions; never leaves out one that does."""
+        if not self.frames or not len(positions_m):
+            return np.zeros(0, dtype=np.int64)
+        poses = np.stack([frame.camera_from_world for frame in self.frames])
+        limits = np.array([_frustum_tangents(frame.intrinsics) for frame in self.frames])
+        block = max(PAIRS_PER_BLOCK // len(positions_m), 1)
+        found = []
+        for start in range(0, len(poses), block):
+            pose, limit = poses[start : start + block], limits[start : start + block, :, None]
+            x, y, z = np.moveaxis(pose[:, :3, :3] @ positions_m.T + pose[:, :3, 3:], 1, 0)
+            inside = (z >= cfg.min_depth_m) & (z <= cfg.max_depth_m)
+            inside &= (x >= limit[:, 0] * z) & (x <= limit[:, 1] * z) & (y >= limit[:, 2] * z) & (y <= limit[:, 3] * z)
+            found.append(np.flatnonzero(inside.any(axis=1)) + start)
+        return np.concatenate(found)
+
+
+def _frustum_tangents(camera: Intrinsics) -> tuple[float, float, float, float]:
+    """Bounds of x / z and y / z inside the image, and one pixel more so that rounding leaves nothing out."""
+    return (
+        (-1.5 - camera.cx_px) / camera.fx_px,
+        (camera.width_px + 0.5 - camera.cx_px) / camera.fx_px,
+        (-1.5 - camera.cy_px) / camera.fy_px,
+        (camera.height_px + 0.5 - camera.cy_px) / camera.fy_px,
+    )
+
+
+class Targets(NamedTuple):
+    """Places to integrate into: the slots of their evidence, and where they are in the world."""
+
+    slots: np.ndarray  # (place,)
+    positions_m: np.ndarray  # (place, 3)
+
+
+def integrate(
+    evidence: Evidence, frame: Frame, targets: Targets, query_radius_m: float, cfg: KernelConfig
+) -> np.ndarray:
+    """Add one frame to the evidence of the targets that it observes; returns their rows."""
+    if not len(frame.sigmas_px):
+        return np.zeros(0, dtype=np.int64)
+    rows = visible(frame, targets.positions_m, cfg)
+    if len(rows):
+        weights, trust = kernel(frame, targets.positions_m[rows], query_radius_m, cfg.gamma)
+        evidence.observe(targets.slots[rows], frame, weights, trust)
+    return rows
+
+
+def integrate_all(
+    evidence: Evidence, archive: Archive, targets: Targets, query_radius_m: float, cfg: KernelConfig
+) -> None:
+    """Add every stored frame to targets that have none yet."""
+    for index in archive.candidates(targets.positions_m, cfg):
+        integrate(evidence, archive.frames[index], targets, query_radius_m, cfg)

@@ -1,0 +1,1 @@
+"""The place graph as received, and what is known of each place (pure)."""

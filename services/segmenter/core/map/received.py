@@ -1,0 +1,175 @@
+"""The place graph as received: arrays in the order of place ids (pure).
+
+A delta is small beside the map, so what it does not touch is only copied, never sorted, searched or compared.
+"""
+
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from numba import njit
+
+from prior_sg.schemas.places import PlaceDelta
+
+
+def _empty(dtype: str, *shape: int) -> np.ndarray:
+    return np.zeros((0, *shape), dtype=dtype)
+
+
+@dataclass(eq=False)
+class PlaceGraph:
+    """Places sorted by id, and edges between their rows. Once built it does not change."""
+
+    ids: np.ndarray = field(default_factory=lambda: _empty("int64"))  # (place,)
+    positions_m: np.ndarray = field(default_factory=lambda: _empty("float64", 3))  # (place, 3) world
+    radii_m: np.ndarray = field(default_factory=lambda: _empty("float64"))  # (place,)
+    edges: np.ndarray = field(default_factory=lambda: _empty("int64", 2))  # (edge, 2) rows, smaller first, sorted
+    clearances_m: np.ndarray = field(default_factory=lambda: _empty("float64"))  # (edge,)
+    on_ground: bool = False  # 2D places: they lie on the ground, and their radii along it
+
+    def rows(self, place_ids: np.ndarray) -> np.ndarray:
+        """Row of each id, -1 where there is no such place."""
+        if not len(self.ids):
+            return np.full(len(place_ids), -1)
+        rows = np.minimum(np.searchsorted(self.ids, place_ids), len(self.ids) - 1)
+        return np.where(self.ids[rows] == place_ids, rows, -1)
+
+    @cached_property
+    def lengths_m(self) -> np.ndarray:
+        """Length (edge,) of each edge."""
+        first, second = self.edges.T
+        return np.linalg.norm(self.positions_m[first] - self.positions_m[second], axis=1)
+
+    @cached_property
+    def adjacency(self) -> "Adjacency":
+        """Neighbours of each place."""
+        return Adjacency(*_adjacency(len(self.ids), self.edges))
+
+
+@dataclass(frozen=True, eq=False)
+class Adjacency:
+    """Neighbours by row, compressed: those of row i stand at starts[i] to starts[i + 1]."""
+
+    starts: np.ndarray  # (place + 1,)
+    neighbours: np.ndarray  # (2 edge,) rows
+    edges: np.ndarray  # (2 edge,) the edge to each
+
+
+@njit(cache=True, nogil=True)
+def _adjacency(count, edges):  # noqa: ANN001, ANN202
+    starts = np.zeros(count + 1, np.int64)
+    for first, second in edges:
+        starts[first + 1] += 1
+        starts[second + 1] += 1
+    starts = np.cumsum(starts)
+    at = starts[:-1].copy()
+    neighbours = np.empty(2 * len(edges), np.int64)
+    numbers = np.empty(2 * len(edges), np.int64)
+    for number in range(len(edges)):
+        for one, other in ((0, 1), (1, 0)):
+            row = edges[number, one]
+            neighbours[at[row]] = edges[number, other]
+            numbers[at[row]] = number
+            at[row] += 1
+    return starts, neighbours, numbers
+
+
+@dataclass(frozen=True)
+class Step:
+    """How one graph follows from the one before."""
+
+    graph: PlaceGraph
+    previous: np.ndarray  # (place,) row of each place in the former graph, -1 = new
+    moved: np.ndarray  # (place,) bool: new, or the position differs
+    touched: np.ndarray  # (place,) bool: new, moved, or an edge of it may have changed
+    upserted: np.ndarray  # (upserted,) rows of the graph that the delta names
+    removed: np.ndarray  # (removed,) rows of the former graph that are gone
+
+
+def apply(graph: PlaceGraph, delta: PlaceDelta, replaces: bool) -> Step:
+    """The graph after `delta`, in the order that the delta's schema states; with `replaces`, the delta is all of it.
+
+    A place that was merged into another hands its edges over to it; edges to places that do not exist are dropped.
+    """
+    merged = [(gone, into) for gone, into in delta.merged_ids.tolist() if gone != into]
+    upserted, first = np.unique(delta.place_ids, return_index=True)
+    known = graph.rows(upserted)
+    kept = np.full(len(graph.ids), not replaces)
+    gone = graph.rows(np.concatenate((delta.removed_ids, np.array([pair[0] for pair in merged], dtype=np.int64))))
+    kept[gone[gone >= 0]] = False
+    kept[known[known >= 0]] = True
+    previous = np.flatnonzero(kept)
+    new = upserted[known < 0]
+    at = np.searchsorted(graph.ids[previous], new)
+    previous = np.insert(previous, at, -1)
+    old = previous >= 0
+    after = PlaceGraph(
+        ids=np.insert(graph.ids[kept], at, new),
+        positions_m=np.insert(graph.positions_m[kept], at, 0.0, axis=0),
+        radii_m=np.insert(graph.radii_m[kept], at, 0.0),
+        on_ground=len(delta.surface_ids) > 0 or (graph.on_ground and not replaces),
+    )
+    rows = after.rows(upserted)
+    moved = ~old
+    moved[rows] |= (after.positions_m[rows] != delta.positions_m[first]).any(axis=1)
+    after.positions_m[rows], after.radii_m[rows] = delta.positions_m[first], delta.radii_m[first]
+    ends = _join_edges(graph, after, delta, merged, replaces)
+    touched = moved.copy()
+    touched[ends] = True
+    return Step(after, previous, moved, touched, upserted=rows, removed=np.flatnonzero(~kept))
+
+
+def _join_edges(
+    graph: PlaceGraph, after: PlaceGraph, delta: PlaceDelta, merged: list[tuple[int, int]], replaces: bool
+) -> np.ndarray:
+    """Fill in the edges of `after`, and return the rows of `after` at their changed ends.
+
+    Where several say something of one pair, the delta wins, then the edge that was there, then one inherited by
+    merging.
+    """
+    count = max(len(after.ids), 1)
+    row_after = after.rows(graph.ids)
+    stays = np.full(len(graph.edges), not replaces)
+    stays[_edge_numbers(graph, delta.removed_edges)] = False
+    stays &= ~_mark(graph, delta.removed_ids)[graph.edges].any(axis=1)
+    handed = stays & _mark(graph, np.array([pair[0] for pair in merged], dtype=np.int64))[graph.edges].any(axis=1)
+    inherited = graph.ids[graph.edges[handed]]
+    for gone, into in merged:
+        inherited[inherited == gone] = into
+    untouched = stays & ~handed
+    pairs, clearances_m = row_after[graph.edges[untouched]], graph.clearances_m[untouched]
+    keys = pairs[:, 0] * count + pairs[:, 1]  # ascending: rows keep their order
+    told = after.rows(np.concatenate((delta.edges, inherited)).reshape(-1)).reshape(-1, 2)
+    told_m = np.concatenate((delta.clearances_m, graph.clearances_m[handed]))
+    from_delta = np.arange(len(told)) < len(delta.edges)
+    valid = (told >= 0).all(axis=1) & (told[:, 0] != told[:, 1])
+    told, told_m, from_delta = np.sort(told[valid], axis=1), told_m[valid], from_delta[valid]
+    told_keys, first = np.unique(told[:, 0] * count + told[:, 1], return_index=True)
+    told, told_m, from_delta = told[first], told_m[first].astype(np.float64), from_delta[first]
+    at = np.searchsorted(keys, told_keys)
+    there = at < len(keys)
+    there[there] = keys[at[there]] == told_keys[there]
+    clearances_m[at[there & from_delta]] = told_m[there & from_delta]
+    after.edges = np.insert(pairs, at[~there], told[~there], axis=0)
+    after.clearances_m = np.insert(clearances_m, at[~there], told_m[~there])
+    ends = np.concatenate((told.reshape(-1), row_after[graph.edges[~untouched]].reshape(-1)))
+    return ends[ends >= 0]
+
+
+def _mark(graph: PlaceGraph, place_ids: np.ndarray) -> np.ndarray:
+    """Mask (place,) of these places."""
+    mask, rows = np.zeros(len(graph.ids), dtype=bool), graph.rows(place_ids)
+    mask[rows[rows >= 0]] = True
+    return mask
+
+
+def _edge_numbers(graph: PlaceGraph, pairs: np.ndarray) -> np.ndarray:
+    """Which edges join these pairs (n, 2) of place ids, in any order; pairs without an edge are left out."""
+    if not (len(pairs) and len(graph.edges)):
+        return np.zeros(0, dtype=np.int64)
+    count = len(graph.ids)
+    rows = graph.rows(pairs.reshape(-1)).reshape(-1, 2)
+    rows = np.sort(rows[(rows >= 0).all(axis=1)], axis=1)
+    keys, wanted = graph.edges[:, 0] * count + graph.edges[:, 1], rows[:, 0] * count + rows[:, 1]
+    at = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
+    return at[keys[at] == wanted]

@@ -1,0 +1,1 @@
+"""Regions: components that last, and what followers know of them (pure)."""

@@ -1,0 +1,171 @@
+"""What followers have been told, and the smallest delta to what they should know (pure)."""
+
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from prior_sg.schemas.regions import Region, RegionDelta, RegionEvent
+
+_NONE = np.zeros(0, dtype=np.int64)
+
+
+class Source(NamedTuple):
+    """Where and from what a delta is made; fields as in RegionDelta."""
+
+    robot: str
+    epoch: int
+    stamp_ns: int = 0
+    prior_digest: str = ""
+    environment: str = ""
+    task: str = ""
+    space: str = ""
+    labels: tuple[str, ...] = ()
+    energy: float = 0.0
+
+
+class Beliefs(NamedTuple):
+    """What is believed of some places, as it travels."""
+
+    place_ids: np.ndarray  # (place,)
+    regions: np.ndarray  # (place,)
+    posteriors: np.ndarray  # (place, label) float16
+    unknown: np.ndarray  # (place,) float16
+    predicted: np.ndarray  # (place,) bool
+
+    def at(self, rows: np.ndarray) -> "Beliefs":
+        """Those of some rows."""
+        return Beliefs(*(column[rows] for column in self))
+
+    @classmethod
+    def none(cls, labels: int) -> "Beliefs":
+        """Of no place."""
+        half = np.zeros(0, np.float16)
+        return cls(_NONE, _NONE, np.zeros((0, labels), np.float16), half, np.zeros(0, dtype=bool))
+
+
+@dataclass
+class Ledger:
+    """Everything that a follower of all deltas knows. Places are kept by slot, so a delta costs what it changes."""
+
+    revision: int = -1
+    source: Source | None = None
+    regions: dict[int, Region] = field(default_factory=dict)
+    told: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=bool))  # (slot,)
+    beliefs: Beliefs = field(default_factory=lambda: Beliefs.none(0))  # (slot,)
+    gone: dict[int, Beliefs] = field(default_factory=dict)  # places that have left, but followers do not know yet
+
+    def forget(self, slots: np.ndarray) -> None:
+        """These slots' places have left the graph; the slots may be given to others."""
+        known = slots[slots < len(self.told)]
+        for slot in known[self.told[known]].tolist():
+            self.gone[int(self.beliefs.place_ids[slot])] = self.beliefs.at(np.array([slot]))
+        self.told[known] = False
+
+    def tell(
+        self,
+        source: Source,
+        slots: np.ndarray,
+        now: Beliefs,
+        regions: dict[int, Region],
+        events: list[RegionEvent],
+        *,
+        everything: bool,
+        tolerance: float,
+    ) -> RegionDelta | None:
+        """The delta from what is known to what is so; None when there is nothing to tell.
+
+        `now` holds the places in `slots` (sorted by id), which are all that may have changed, or all with `everything`.
+        A belief is sent when the region of the place changed or a probability moved by more than `tolerance` since it
+        was last sent.
+        """
+        self._reserve(int(slots.max(initial=-1)) + 1, len(source.labels), everything)
+        sent = np.flatnonzero(~self.told[slots] | self._differs(slots, now, tolerance))
+        upserts = [region for _, region in sorted(regions.items()) if self.regions.get(region.id) != region]
+        gone_regions = sorted(self.regions.keys() - regions.keys())
+        moved_on = self.source is not None and source.space != self.source.space
+        if not (everything or moved_on or len(sent) or upserts or gone_regions or self.gone or events):
+            return None
+        for known, news in zip(self.beliefs, now, strict=True):
+            known[slots[sent]] = news[sent]
+        self.told[slots[sent]] = True
+        gone_places = [] if everything else sorted(self.gone)
+        self.gone.clear()
+        self.source, self.regions, self.revision = source, dict(regions), self.revision + 1
+        listed = list(self.regions.values()) if everything else upserts
+        return self._delta(
+            source,
+            sorted(listed, key=lambda region: region.id),
+            now.at(sent),
+            removed=([] if everything else gone_regions, gone_places),
+            events=events,
+            snapshot=everything,
+        )
+
+    def snapshot(self, robot: str, epoch: int) -> RegionDelta:
+        """Everything told so far; before the first delta, the empty state that it follows on."""
+        rows = np.flatnonzero(self.told)
+        parts = [self.beliefs.at(rows), *self.gone.values()]
+        whole = Beliefs(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+        whole = whole.at(np.argsort(whole.place_ids, kind="stable"))
+        listed = [region for _, region in sorted(self.regions.items())]
+        source = Source(robot, epoch) if self.source is None else self.source
+        return self._delta(source, listed, whole, removed=([], []), events=[], snapshot=True)
+
+    def _delta(
+        self,
+        source: Source,
+        regions: list[Region],
+        beliefs: Beliefs,
+        *,
+        removed: tuple[list[int], list[int]],
+        events: list[RegionEvent],
+        snapshot: bool,
+    ) -> RegionDelta:
+        about = source._asdict() | {"labels": list(source.labels)}
+        return RegionDelta(
+            **about,
+            revision=self.revision,
+            snapshot=snapshot,
+            regions=regions,
+            removed_ids=np.array(removed[0], dtype=np.int64),
+            place_ids=beliefs.place_ids,
+            place_regions=beliefs.regions,
+            posteriors=beliefs.posteriors,
+            unknown=beliefs.unknown,
+            removed_place_ids=np.array(removed[1], dtype=np.int64),
+            predicted_ids=beliefs.place_ids[beliefs.predicted],
+            events=events,
+        )
+
+    def _differs(self, slots: np.ndarray, now: Beliefs, tolerance: float) -> np.ndarray:
+        before = self.beliefs.at(slots)
+        return (
+            (now.regions != before.regions)
+            | (now.predicted != before.predicted)
+            | _moved(now.posteriors, before.posteriors, tolerance).any(axis=1)
+            | _moved(now.unknown, before.unknown, tolerance)
+        )
+
+    def _reserve(self, slots: int, labels: int, everything: bool) -> None:
+        """Room for `slots` slots; with `everything`, nothing is known any more."""
+        if everything:
+            self.told[:] = False
+            self.gone.clear()
+        have = len(self.told)
+        if slots <= have and self.beliefs.posteriors.shape[1] == labels:
+            return
+        size = max(slots, 2 * have) if slots > have else have
+        widths = (None, None, labels, None, None)
+        grown = []
+        for column, width in zip(self.beliefs, widths, strict=True):
+            room = np.zeros((size,) if width is None else (size, width), dtype=column.dtype)
+            if room.shape[1:] == column.shape[1:]:
+                room[:have] = column
+            grown.append(room)
+        self.beliefs = Beliefs(*grown)
+        self.told = np.concatenate((self.told, np.zeros(size - have, dtype=bool)))
+
+
+def _moved(now: np.ndarray, before: np.ndarray, tolerance: float) -> np.ndarray:
+    return np.abs(now.astype(np.float32) - before.astype(np.float32)) > tolerance

@@ -1,0 +1,1 @@
+"""Task-driven hierarchical scene graphs from posed RGB-D streams."""

@@ -1,0 +1,180 @@
+"""The same behaviour on the local bus and over a real Zenoh router."""
+
+import threading
+import time
+
+import pytest
+
+from prior_sg.schemas.codec import encode
+from prior_sg.schemas.frames import IngestState
+from prior_sg.schemas.priors import Task
+from prior_sg.schemas.topics import INGEST_STATE, KEYFRAME, TASK
+from prior_sg.services.runtime.bus import Answer, BusError, Hub, LocalBus, key_matches, pack_header, unpack_header
+from prior_sg.services.runtime.zenoh_bus import ZenohBus
+
+
+@pytest.fixture(params=["local", "zenoh"])
+def new_bus(request):
+    buses = []
+    hub = Hub()
+    address = request.getfixturevalue("endpoint") if request.param == "zenoh" else ""
+
+    def new():
+        buses.append(ZenohBus(address) if address else LocalBus(hub))
+        return buses[-1]
+
+    yield new
+    for bus in buses:
+        bus.close()
+
+
+def eventually(condition, timeout_s=20.0):
+    end_s = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < end_s, "did not happen"
+        time.sleep(0.01)
+
+
+def put(bus, topic, message, writer, sequence):
+    bus.put(topic, topic.key_of(message), encode(message), pack_header(writer, sequence, 123))
+
+
+def task(robot, text):
+    return Task(robot=robot, stamp_ns=1, environment="e", task=text)
+
+
+def find_each_other(writer, robot, got):
+    """Put until the reader has heard: of what is put before that, only the cache is left."""
+    probe = 0
+    while not got:
+        put(writer, TASK, task(robot, "probe"), "probe", probe)
+        time.sleep(0.05)
+        probe += 1
+        assert probe < 400, "nobody hears"
+    eventually(lambda: got[-1].sequence == probe - 1)
+    got.clear()
+
+
+def test_samples_arrive_in_order_with_their_writer(new_bus):
+    reader, writer, got = new_bus(), new_bus(), []
+    reader.subscribe(TASK, TASK.pattern("order"), got.append, lambda topic, number: None)
+    find_each_other(writer, "order", got)
+    for index in range(50):
+        put(writer, TASK, task("order", str(index)), "w", index)
+    eventually(lambda: len(got) == 50)
+    assert [(s.writer, s.sequence, s.sent_ns) for s in got] == [("w", i, 123) for i in range(50)]
+    assert got[0].key == "psg/order/task"
+
+
+def test_a_late_reader_of_every_gets_the_cache(new_bus):
+    writer, got = new_bus(), []
+    for index in range(10):
+        put(writer, TASK, task("late", str(index)), "w", index)
+    time.sleep(0.3)
+    new_bus().subscribe(TASK, TASK.pattern("late"), got.append, lambda topic, number: None)
+    eventually(lambda: len(got) >= TASK.cache)
+    assert [s.sequence for s in got] == list(range(10 - TASK.cache, 10))
+
+
+def test_a_late_reader_of_latest_gets_nothing_old(new_bus):
+    writer, got = new_bus(), []
+    state = IngestState(
+        robot="old", stamp_ns=0, frames_read=0, frames_total=0, keyframes=0, encoded=0, rejected=0, finished=False
+    )
+    put(writer, INGEST_STATE, state, "w", 0)
+    time.sleep(0.2)
+    new_bus().subscribe(INGEST_STATE, INGEST_STATE.pattern("old"), got.append, lambda topic, number: None)
+    time.sleep(0.3)
+    put(writer, INGEST_STATE, state, "w", 1)
+    eventually(lambda: got)
+    assert [s.sequence for s in got] == [1]
+
+
+def test_robots_do_not_see_each_other(new_bus):
+    reader, writer, mine, all_of_them = new_bus(), new_bus(), [], []
+    reader.subscribe(TASK, TASK.pattern("mine"), mine.append, lambda topic, number: None)
+    reader.subscribe(TASK, TASK.pattern("*"), all_of_them.append, lambda topic, number: None)
+    put(writer, TASK, task("mine", "a"), "w", 0)
+    put(writer, TASK, task("yours", "b"), "w", 0)
+    eventually(lambda: {s.key for s in all_of_them} >= {"psg/mine/task", "psg/yours/task"})
+    assert {s.key for s in mine} == {"psg/mine/task"}
+
+
+def call(bus, key, payload, timeout_s=2.0):
+    answers, arrived = [], threading.Event()
+
+    def receive(answer):
+        answers.append(answer)
+        arrived.set()
+
+    bus.call(key, payload, timeout_s, receive)
+    assert arrived.wait(timeout_s + 3)
+    time.sleep(0.05)
+    assert len(answers) == 1
+    return answers[0]
+
+
+def test_calls_are_answered_refused_or_nobody(new_bus):
+    server, caller = new_bus(), new_bus()
+    server.serve("psg/test/echo/*", lambda request: request.reply(request.payload[::-1]))
+    server.serve("psg/test/no", lambda request: request.refuse("busy"))
+    time.sleep(0.2)
+    assert call(caller, "psg/test/echo/x", b"abc") == Answer(b"cba")
+    assert call(caller, "psg/test/no", b"") == Answer(None, "busy")
+    assert call(caller, "psg/test/nobody", b"") == Answer(None, "nobody")
+
+
+def test_a_call_may_be_answered_later_from_another_thread(new_bus):
+    server, caller = new_bus(), new_bus()
+    server.serve("psg/test/later", lambda request: threading.Timer(0.2, request.reply, [b"done"]).start())
+    time.sleep(0.2)
+    assert call(caller, "psg/test/later", b"") == Answer(b"done")
+
+
+def test_a_server_that_dies_does_not_leave_the_caller_waiting(endpoint):
+    server, caller = ZenohBus(endpoint), ZenohBus(endpoint)
+    held = []
+    server.serve("psg/test/dies", held.append)
+    time.sleep(0.2)
+    threading.Timer(0.3, server.close).start()
+    answer = call(caller, "psg/test/dies", b"", timeout_s=20.0)
+    assert answer == Answer(None, "nobody")  # not the time-out
+    caller.close()
+
+
+def test_who_is_alive(new_bus):
+    watcher, other, seen = new_bus(), new_bus(), []
+    other.announce("psg/alive/svc/one")
+    watcher.watch("psg/alive/*/*", lambda key, alive: seen.append((key, alive)))
+    eventually(lambda: ("psg/alive/svc/one", True) in seen)
+    other.close()
+    eventually(lambda: ("psg/alive/svc/one", False) in seen)
+
+
+def test_no_router_is_one_clear_sentence():
+    with pytest.raises(BusError, match=r"no router answers on tcp/127.0.0.1:1; start one with"):
+        ZenohBus("tcp/127.0.0.1:1", wait_s=0.1)
+
+
+@pytest.mark.parametrize(
+    "pattern, key, matches",
+    [
+        ("a/*/c", "a/b/c", True),
+        ("a/*/c", "a/b/d", False),
+        ("a/*", "a/b/c", False),
+        ("a/**", "a/b/c", True),
+        ("a/b", "a/b", True),
+    ],
+)
+def test_key_patterns(pattern, key, matches):
+    assert key_matches(pattern, key) is matches
+
+
+@pytest.mark.parametrize("header", [None, b"", b"short", pack_header("", 1, 2), b"\xff" * 40])
+def test_damaged_headers_mean_an_unknown_writer(header):
+    assert unpack_header(header)[0] == ""
+
+
+def test_header_round_trip():
+    assert unpack_header(pack_header("segmenter/1/2", 5, 6)) == ("segmenter/1/2", 5, 6)
+    assert KEYFRAME.pattern("*") == "psg/*/keyframe"

@@ -1,0 +1,273 @@
+"""A service on a bus: order, back-pressure, counting of bad input, questions, jobs; the same over Zenoh and locally."""
+
+import asyncio
+import contextlib
+import time
+
+import msgspec
+import numpy as np
+import pytest
+
+from prior_sg.schemas.codec import Message, decode, encode
+from prior_sg.schemas.frames import Intrinsics, Keyframe
+from prior_sg.schemas.places import MapRequest, SnapshotRequest, VoxelMap
+from prior_sg.schemas.priors import Task
+from prior_sg.schemas.status import Consumed, JobDone, Tick
+from prior_sg.schemas.topics import ENCODE, JOURNAL, KEYFRAME, PLACE_SNAPSHOT, TASK, VOXEL_MAP
+from prior_sg.services.runtime.bus import Hub, LocalBus, pack_header
+from prior_sg.services.runtime.client import Client
+from prior_sg.services.runtime.host.host import Host, UndeclaredError
+from prior_sg.services.runtime.service import Ask, Identity, Service
+from prior_sg.services.runtime.zenoh_bus import ZenohBus
+
+CAMERA = Intrinsics(4, 3, 5.0, 5.0, 2.0, 1.5)
+
+
+class Config(msgspec.Struct, frozen=True):
+    frames: int = 12
+    work_s: float = 0.0
+
+
+class Frame(Message, kw_only=True):
+    frame_id: int
+
+
+def keyframe(frame_id):
+    return Keyframe(
+        robot="r",
+        frame_id=frame_id,
+        stamp_ns=frame_id,
+        intrinsics=CAMERA,
+        world_from_camera=np.eye(4),
+        color=b"",
+        depth=b"",
+        depth_scale_m=0.001,
+    )
+
+
+def source_step(state, message, cfg):
+    match message:
+        case Frame():
+            state["lead"].append(message.frame_id)
+            yield KEYFRAME, keyframe(message.frame_id)
+            yield ENCODE, keyframe(message.frame_id)
+        case JobDone():
+            state["done"].append((message.frame_id, message.worker, message.attempts))
+
+
+async def source_drive(port, cfg):
+    for frame_id in range(cfg.frames):
+        await port.room(2)
+        await port.consume(Frame(frame_id=frame_id))
+
+
+def reader_step(state, message, cfg):
+    if isinstance(message, Keyframe):
+        time.sleep(cfg.work_s)
+        state.append(message.frame_id)
+    yield from ()
+
+
+SOURCE = Service(
+    "source", "", "robot", Config, lambda cfg, me: {"lead": [], "done": []}, source_step,
+    writes=(KEYFRAME, ENCODE), drive=source_drive,
+)  # fmt: skip
+READER = Service("reader", "", "robot", Config, lambda cfg, me: [], reader_step, reads=(KEYFRAME,))
+WORKER = Service("worker", "", "fleet", Config, lambda cfg, me: [], reader_step, job=ENCODE)
+
+
+@pytest.fixture(params=["local", "zenoh"])
+def new_bus(request):
+    if request.param == "local":
+        hub = Hub()
+        return lambda: LocalBus(hub)
+    address = request.getfixturevalue("endpoint")
+    return lambda: ZenohBus(address)
+
+
+@contextlib.asynccontextmanager
+async def running(new_bus, *services):
+    """Hosts of (service, config, instance), started in order and stopped at the end."""
+    hosts, tasks = [], []
+    for service, cfg, instance in services:
+        bus = await asyncio.to_thread(new_bus)
+        robot = "r" if service.scope == "robot" else "*"
+        hosts.append(Host(service, bus, cfg, Identity(robot, instance, time.time_ns())))
+        tasks.append(asyncio.create_task(hosts[-1].run()))
+        await asyncio.sleep(0.3)
+    try:
+        yield hosts
+    finally:
+        for host in hosts:
+            host.stop()
+        await asyncio.gather(*tasks)
+
+
+async def until(condition, timeout_s=15.0):
+    end_s = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < end_s, "did not happen"
+        await asyncio.sleep(0.01)
+
+
+def test_a_slow_reader_holds_the_source_back_and_loses_nothing(new_bus):
+    async def main():
+        services = [(READER, Config(work_s=0.02), "a"), (WORKER, Config(), "w"), (SOURCE, Config(frames=12), "s")]
+        async with running(new_bus, *services) as (reader, worker, source):
+            while len(source._state["lead"]) < 12:
+                assert len(source._state["lead"]) <= len(reader._state) + 3
+                await asyncio.sleep(0.001)
+            await until(lambda: len(source._state["done"]) == 12 and len(reader._state) == 12)
+            assert reader._state == list(range(12))
+            assert sorted(worker._state) == list(range(12))
+
+    asyncio.run(main())
+
+
+def test_jobs_are_shared_by_workers_and_survive_one(new_bus):
+    async def main():
+        services = [
+            (READER, Config(), "a"),
+            (WORKER, Config(work_s=0.05), "w1"),
+            (WORKER, Config(work_s=0.05), "w2"),
+            (SOURCE, Config(frames=16), "s"),
+        ]
+        async with running(new_bus, *services) as (_, first, second, source):
+            await until(lambda: len(source._state["done"]) >= 4)
+            first.stop()
+            await until(lambda: len(source._state["done"]) == 16)
+            assert sorted(frame_id for frame_id, _, _ in source._state["done"]) == list(range(16))
+            assert len(second._state) >= 8
+            assert set(first._state) | set(second._state) == set(range(16))
+
+    asyncio.run(main())
+
+
+def test_a_source_waits_for_its_first_reader_and_worker(new_bus):
+    async def main():
+        async with running(new_bus, (SOURCE, Config(frames=3), "s")) as (source,):
+            await asyncio.sleep(0.5)
+            assert source._state["lead"] == []
+            async with running(new_bus, (READER, Config(), "a"), (WORKER, Config(), "w")) as (reader, _):
+                await until(lambda: len(source._state["done"]) == 3)
+                await until(lambda: reader._state == [0, 1, 2])
+
+    asyncio.run(main())
+
+
+def test_bad_input_is_counted_and_stops_nothing(new_bus):
+    async def main():
+        async with running(new_bus, (READER, Config(), "a")) as (reader,):
+            bus = await asyncio.to_thread(new_bus)
+            good = encode(keyframe(1))
+            for payload, header in [
+                (b"\x00\xff", b"?"),
+                (good[:-5], pack_header("w", 0, 0)),
+                (good, pack_header("w", 1, 0)),
+            ]:
+                bus.put(KEYFRAME, KEYFRAME.key_of(keyframe(1)), payload, header)
+            bus.put(KEYFRAME, KEYFRAME.key_of(keyframe(1)), good, pack_header("w", 1, 0))
+            await until(lambda: reader._state == [1] and reader.inbox.of("KEYFRAME").duplicate == 1)
+            counts = {count.topic: count for count in reader.status().topics}["KEYFRAME"]
+            assert (counts.malformed, counts.consumed, counts.duplicate) == (2, 1, 1)
+            await asyncio.to_thread(bus.close)
+
+    asyncio.run(main())
+
+
+def test_the_journal_tells_what_was_consumed_and_in_which_order(new_bus):
+    async def main():
+        entries = []
+        journal = await asyncio.to_thread(new_bus)
+        journal.subscribe(
+            JOURNAL, JOURNAL.pattern("r"), lambda s: entries.append(decode(Consumed, s.payload)), lambda t, n: None
+        )
+        async with running(new_bus, (READER, Config(), "j1")):
+            bus = await asyncio.to_thread(new_bus)
+            for frame_id in range(3):
+                bus.put(
+                    KEYFRAME, KEYFRAME.key_of(keyframe(0)), encode(keyframe(frame_id)), pack_header("me", frame_id, 0)
+                )
+            anonymous = encode(keyframe(9))
+            bus.put(KEYFRAME, KEYFRAME.key_of(keyframe(0)), anonymous, b"")
+            await until(lambda: len([e for e in entries if e.instance == "j1"]) >= 5)
+            await asyncio.to_thread(bus.close)
+        await until(lambda: any(e.instance == "j1" and e.topic == "STOP" for e in entries))
+        mine = [e for e in entries if e.instance == "j1"]
+        assert [e.order for e in mine] == list(range(6))
+        assert [e.topic for e in mine] == ["START", *["KEYFRAME"] * 4, "STOP"]
+        assert [(e.writer, e.sequence) for e in mine[1:4]] == [("me", 0), ("me", 1), ("me", 2)]
+        assert mine[4].writer == "" and mine[4].inline == anonymous
+        await asyncio.to_thread(journal.close)
+
+    asyncio.run(main())
+
+
+def asking_step(state, message, cfg):
+    match message:
+        case Tick() if not state:
+            yield Ask(VOXEL_MAP, MapRequest(robot="r"))
+        case VoxelMap():
+            state.append(message.voxel_m)
+
+
+def answer(state, request, cfg):
+    return VoxelMap(robot="r", voxel_m=0.25, free=np.zeros((0, 3), np.int16), occupied=np.zeros((0, 3), np.int16))
+
+
+ASKER = Service("asker", "", "robot", Config, lambda cfg, me: [], asking_step, asks=(VOXEL_MAP,), tick_s=0.05)
+ANSWERER = Service("answerer", "", "robot", Config, lambda cfg, me: [], reader_step, answers={VOXEL_MAP: answer})
+
+
+def test_a_question_is_repeated_until_somebody_can_answer(new_bus):
+    async def main():
+        async with running(new_bus, (ASKER, Config(), "a")) as (asker,):
+            await asyncio.sleep(0.3)
+            assert asker.status().waiting_for == ["VOXEL_MAP"] and asker._state == []
+            async with running(new_bus, (ANSWERER, Config(), "b")):
+                await until(lambda: asker._state)
+            assert set(asker._state) == {0.25}
+
+    asyncio.run(main())
+
+
+def test_malformed_questions_are_refused(new_bus):
+    async def main():
+        async with running(new_bus, (ANSWERER, Config(), "b")) as (answerer,):
+            bus = await asyncio.to_thread(new_bus)
+            answers = []
+            bus.call(VOXEL_MAP.key_of(MapRequest(robot="r")), b"\xc1junk", 2.0, answers.append)
+            await until(lambda: answers)
+            assert answers[0].payload is None and "not a valid MapRequest" in answers[0].reason
+            assert answerer.inbox.of("VOXEL_MAP").malformed == 1
+            await asyncio.to_thread(bus.close)
+
+    asyncio.run(main())
+
+
+def test_the_client_asks_and_sees_health(new_bus):
+    async def main():
+        async with running(new_bus, (ANSWERER, Config(), "b1")):
+            with await asyncio.to_thread(lambda: Client(new_bus())) as client:
+                reply = await asyncio.to_thread(client.ask, VOXEL_MAP, MapRequest(robot="r"))
+                assert reply.voxel_m == 0.25
+                assert (await asyncio.to_thread(client.alive))["b1"] == "answerer"
+                status = await asyncio.to_thread(client.status, "answerer", "b1")
+                assert status.service == "answerer" and status.resident_mb > 1
+
+    asyncio.run(main())
+
+
+@pytest.mark.parametrize(
+    "output",
+    [(TASK, Task(robot="r", stamp_ns=0, environment="e", task="t")), Ask(PLACE_SNAPSHOT, SnapshotRequest(robot="r"))],
+)
+def test_undeclared_outputs_are_faults_of_the_service(output):
+    service = Service("rogue", "", "robot", Config, lambda cfg, me: [], lambda s, m, c: iter([output]), tick_s=0.01)
+
+    async def main():
+        host = Host(service, LocalBus(Hub()), Config(), Identity("r", "x", 1))
+        with pytest.raises(UndeclaredError, match="does not declare"):
+            await asyncio.wait_for(host.run(), 5)
+
+    asyncio.run(main())

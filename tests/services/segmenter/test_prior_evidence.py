@@ -1,0 +1,111 @@
+"""What a map tells the prior gateway about its prior: counted in a world of three rooms in a row."""
+
+import numpy as np
+
+from prior_sg.schemas.codec import decode, encode
+from prior_sg.schemas.priors import PriorEvidence
+from prior_sg.schemas.status import Tick
+from prior_sg.schemas.topics import PRIOR_EVIDENCE, TEXT
+from prior_sg.services.prior_gateway.core import learning
+from prior_sg.services.runtime.service import Ask, Identity
+from prior_sg.services.segmenter.core import prior_evidence
+from prior_sg.services.segmenter.core.experts.context import ObjectView
+from prior_sg.services.segmenter.core.state import Config
+from prior_sg.services.segmenter.service import SERVICE
+from tests.help.world import ROBOT, place_delta, place_grid, prior, task, text, walk
+
+ROOMS = ["kitchen", "hall", "bedroom"]
+TICK = Tick(stamp_ns=10**18)
+
+
+def told(cfg: Config, ticks: int, names=ROOMS) -> list[PriorEvidence]:
+    """Everything told about the prior by the given tick."""
+    positions, edges = place_grid(3)
+    state, found = SERVICE.init(cfg, Identity(ROBOT, "i", 1)), []
+    queue = [place_delta(positions, edges), task(), prior(names), *walk(3), *[TICK] * ticks]
+    while queue:
+        for output in list(SERVICE.step(state, queue.pop(0), cfg)):
+            if isinstance(output, Ask) and output.query is TEXT:
+                queue.insert(0, text(np.eye(3)[: len(output.request.concepts)]))
+            elif not isinstance(output, Ask) and output[0] is PRIOR_EVIDENCE:
+                found.append(decode(PriorEvidence, encode(output[1])))  # with the checks of the wire
+    return found
+
+
+def test_rooms_in_a_row_are_counted_once_and_only_neighbours_touch():
+    [seen] = told(Config(evidence_ticks=4), 20)  # nothing new after the first time
+    assert (seen.robot, seen.environment, seen.task, seen.prior_digest) == (
+        ROBOT,
+        "home",
+        "tidy up",
+        prior(ROOMS).digest(),
+    )
+    assert seen.regions == ROOMS
+    assert seen.instances.tolist() == [1, 1, 1]
+    np.testing.assert_array_equal(seen.pairs, 1 - np.eye(3))
+    np.testing.assert_array_equal(seen.touching, [[0, 1, 0], [1, 0, 1], [0, 1, 0]])
+    np.testing.assert_allclose(seen.places.sum(), 50, atol=0.1)  # 48 on the grid, two in doorways
+    assert seen.objects == []
+
+
+def test_regions_of_few_places_do_not_count():
+    [seen] = told(Config(evidence_ticks=1, evidence_places=17), 20)[-1:]  # a room has 16, two of them a doorway more
+    assert seen.instances.sum() < 3
+    assert told(Config(evidence_ticks=1, evidence_places=51), 20) == []
+
+
+def test_it_can_be_switched_off():
+    assert told(Config(evidence_ticks=0), 20) == []
+
+
+def test_the_gateway_learns_from_it():
+    [seen] = told(Config(evidence_ticks=4), 20)
+    before = prior(ROOMS)
+    after = learning.revised(before, learning.totals(before, [seen]), 4.0, before.provenance)
+    expected = (4 * 0.3 + np.array([[0, 1, 0], [1, 0, 1], [0, 1, 0]])) / 5  # P = (strength P + k) / (strength + n)
+    off = ~np.eye(3, dtype=bool)
+    np.testing.assert_allclose(after.adjacency[off], expected[off], rtol=1e-6)
+    np.testing.assert_array_equal(after.containment, before.containment)
+
+
+def test_objects_count_for_the_region_of_their_nearest_place_by_their_best_candidate():
+    positions_m, regions = np.array([[0.0, 0, 0], [1, 0, 0], [10, 0, 0], [20, 0, 0]]), np.array([7, 7, 9, 8])
+    view = ObjectView(
+        ids=np.arange(5),
+        positions_m=np.array([[0.2, 0, 0], [1.3, 0, 0], [9.5, 0, 0], [12.0, 0, 0], [20.0, 0, 0]]),
+        concepts=np.array([[0.9, 0.1], [0.4, 0.6], [0.2, 0.8], [1.0, 0.0], [1.0, 0.0]]),
+        weights=np.array([1.0, 1.0, 0.5, 1.0, 1.0]),
+    )
+    held = prior_evidence._held(
+        view, positions_m, regions, np.array([7, 9])
+    )  # 8 is too small, the object at 12 too far
+    np.testing.assert_allclose(held, [[0.9, 0.6], [0.1, 0.4]])
+
+
+def seen_with(weight: float) -> PriorEvidence:
+    """The evidence of three labelled rooms with an oven in the kitchen."""
+    positions, edges = place_grid(3)
+    cfg = Config(evidence_ticks=0)
+    state = SERVICE.init(cfg, Identity(ROBOT, "i", 1))
+    queue = [place_delta(positions, edges), task(), prior(ROOMS), *walk(3), TICK]
+    while queue:
+        for output in list(SERVICE.step(state, queue.pop(0), cfg)):
+            if isinstance(output, Ask) and output.query is TEXT:
+                queue.insert(0, text(np.eye(3)[: len(output.request.concepts)]))
+    state.objects = ObjectView(np.array([1]), np.array([[2.0, 2.0, 0.5]]), np.array([[0.9, 0.1]]), np.array([weight]))
+    return decode(PriorEvidence, encode(prior_evidence.evidence(state, cfg)))
+
+
+def test_what_a_region_holds_revises_containment():
+    seen, before = seen_with(1.0), prior(ROOMS)
+    assert seen.objects == ["oven", "bed"]
+    np.testing.assert_allclose(seen.holding, [[0.9, 0.1], [0, 0], [0, 0]], rtol=1e-6)
+    after = learning.revised(before, learning.totals(before, [seen]), 4.0, before.provenance)
+    np.testing.assert_allclose(after.containment, (4 * 0.5 + np.array([[0.9, 0.1], [0, 0], [0, 0]])) / 5, rtol=1e-6)
+
+
+def test_objects_without_a_say_are_no_sign_that_one_has_looked():
+    seen, before = seen_with(0.0), prior(ROOMS)
+    assert seen.objects == [] and seen.holding.shape == (3, 0)
+    after = learning.revised(before, learning.totals(before, [seen]), 4.0, before.provenance)
+    np.testing.assert_array_equal(after.containment, before.containment)
