@@ -31,7 +31,8 @@ from prior_sg.services.feature_pyramid.encoders.base import Options, load_encode
 from prior_sg.services.feature_pyramid.encoders.conse import classifier_file, resized
 from prior_sg.services.feature_pyramid.encoders.onnx_session import Session
 from prior_sg.services.runtime.bus import Sample
-from prior_sg.services.runtime.jobs.dispatcher import Ended, JobPool
+from prior_sg.services.runtime.jobs.board import Ended
+from prior_sg.services.runtime.jobs.pool import JobPool
 from prior_sg.services.runtime.zenoh_bus import ZenohBus, free_endpoint, open_router
 
 BATCHES = (1, 4, 16)
