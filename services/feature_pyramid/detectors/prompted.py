@@ -5,8 +5,9 @@ from typing import Any
 import numpy as np
 
 from prior_sg.services.feature_pyramid import pretrained
-from prior_sg.services.feature_pyramid.core.crops import Config
-from prior_sg.services.feature_pyramid.detectors.base import Detector, Found, Grid, Shot, mask_in_box, without_doubles
+from prior_sg.services.feature_pyramid.core.config import Config
+from prior_sg.services.feature_pyramid.core.lift import Grid, mask_in_box, without_doubles
+from prior_sg.services.feature_pyramid.detectors.base import Detector, Found, Shot
 from prior_sg.services.feature_pyramid.detectors.masks import load_masks
 
 MODELS = {"grounding_dino": "GroundingDinoForObjectDetection", "owlv2": "Owlv2ForObjectDetection"}
