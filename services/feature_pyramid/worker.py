@@ -14,6 +14,7 @@ from prior_sg.services import intent
 from prior_sg.services.feature_pyramid.core.config import Config
 from prior_sg.services.feature_pyramid.core.crops import Selection, coarse_surface, select_crops
 from prior_sg.services.feature_pyramid.core.lift import lift, object_crops
+from prior_sg.services.feature_pyramid.core.upright import quarter_turns, turned
 from prior_sg.services.feature_pyramid.decode import BrokenImage, blank, read_color, read_depth
 from prior_sg.services.feature_pyramid.detectors.base import Detector, Found, Shot
 from prior_sg.services.feature_pyramid.encoders.base import Encoder
@@ -27,7 +28,7 @@ class View(NamedTuple):
     sought: tuple[str, ...]  # names of the objects that the detector was asked for
     found: list[Found]  # objects
     points_camera_m: list[np.ndarray]  # of each object, (point, 3)
-    crops: list[np.ndarray]  # RGB, uint8 (side, side, 3): those selected, then one of each object
+    crops: list[np.ndarray]  # RGB, uint8 (side, side, 3), upright: those selected, then one of each object
     surface_m: np.ndarray
     broken: bool
 
@@ -84,7 +85,8 @@ def view(frame: Keyframe, detector: Detector, sought: tuple[str, ...], cfg: Conf
     selection = select_crops(depth_m, camera, cfg)
     found = [] if broken else detector.detect(Shot(color, depth_m, camera, frame.world_from_camera), sought)
     found, points_camera_m = lift(found, depth_m, camera, cfg)
-    crops = selection.crops.cut(color) + object_crops(found, camera.width_px, camera.height_px).cut(color)
+    cut = selection.crops.cut(color) + object_crops(found, camera.width_px, camera.height_px).cut(color)
+    crops = [turned(crop, quarter_turns(frame.world_from_camera)) for crop in cut]
     return View(selection, sought, found, points_camera_m, crops, coarse_surface(depth_m, cfg.surface_cell_px), broken)
 
 
