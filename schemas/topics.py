@@ -119,6 +119,14 @@ TOPICS = (
     JOURNAL,
 )
 
+_TOPIC_OF = {topic.type: topic for topic in TOPICS if topic.delivery != "job"}
+
+
+def topic_of(message_type: type[Message]) -> Topic | None:
+    """The topic on which messages of this type are published; None of those that are only asked, answered or fed."""
+    return _TOPIC_OF.get(message_type)
+
+
 ARCHIVE = Query("ARCHIVE", ArchiveRequest, ArchiveReply, f"{ROOT}/{{robot}}/ask/keyframes")
 PLACE_SNAPSHOT = Query("PLACE_SNAPSHOT", SnapshotRequest, PlaceDelta, f"{ROOT}/{{robot}}/ask/places")
 VOXEL_MAP = Query("VOXEL_MAP", MapRequest, VoxelMap, f"{ROOT}/{{robot}}/ask/voxels")
