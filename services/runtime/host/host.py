@@ -20,7 +20,7 @@ from typing import Any, cast
 import msgspec
 import psutil
 
-from prior_sg.schemas.codec import DecodeError, Message, decode, encode
+from prior_sg.schemas.codec import DecodeError, Message, decode, encode, versions
 from prior_sg.schemas.status import Consumed, JobDone, ServiceStatus, Started, StatusRequest, Tick, TopicCount
 from prior_sg.schemas.topics import JOURNAL, Query, Topic, alive_key, status_key, worker_keys
 from prior_sg.services.runtime.bus import Answer, Bus, Request, Sample, pack_header
@@ -144,6 +144,7 @@ class Host:
             epoch=self.identity.epoch,
             config=config,
             reads=[topic.name for topic in service.reads],
+            versions=versions(),
         )
         self._journal("START", inline=encode(started))
         log.info("started", extra={"robot": robot, "config": msgspec.to_builtins(self.cfg)})
