@@ -22,10 +22,10 @@ from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
 
 from prior_sg.schemas.places import VoxelMap
+from prior_sg.schemas.regions import NO_REGION
 from prior_sg.schemas.scene import Scene
 from prior_sg.services.geometry import inside_polygon
 
-NO_REGION = -1
 BOUNDARY_TOLERANCE_M = 0.5  # about half a doorway
 CALIBRATION_BINS = 10
 SCORES = (

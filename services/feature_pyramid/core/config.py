@@ -2,15 +2,14 @@
 
 import msgspec
 
+from prior_sg.schemas.features import DEFAULT_SPACE
 from prior_sg.services.feature_pyramid.core.segments import SegmentsConfig
 
 
 class Config(msgspec.Struct, frozen=True, kw_only=True):
     """Settings of the feature pyramid; one embedding space per worker."""
 
-    space: str = (
-        "conse/efficientnet-lite2/minilm-l6-v2"  # the encoder: conse/…, open_clip/MODEL/PRETRAINED, onnx:FOLDER
-    )
+    space: str = DEFAULT_SPACE  # the encoder: conse/…, open_clip/MODEL/PRETRAINED, onnx:FOLDER
     runtime: str = "onnx"  # or torch: what runs the networks of conse
     device: str = "auto"  # cpu, cuda, or auto: cuda where there is one
     smallest_crop_px: int = 0  # side of layer 0; smaller images use their shorter side; 0 = what suits the encoder

@@ -17,7 +17,7 @@ from typing import Any, cast
 import msgspec
 import psutil
 
-from prior_sg.schemas.codec import DecodeError, Message, decode, encode
+from prior_sg.schemas.codec import DecodeError, Message, decode, encode, versions
 from prior_sg.schemas.status import Consumed, JobDone, ServiceStatus, Started, StatusRequest, Tick, TopicCount
 from prior_sg.schemas.topics import JOURNAL, Query, Topic, alive_key, status_key, worker_keys
 from prior_sg.services.runtime.bus import Bus, Request, Sample
@@ -122,6 +122,7 @@ class Host:
             epoch=self.identity.epoch,
             config=config,
             reads=[topic.name for topic in service.reads],
+            versions=versions(),
         )
         self._outbox.journal("START", inline=encode(started))
         log.info("started", extra={"robot": robot, "config": msgspec.to_builtins(self.cfg)})
