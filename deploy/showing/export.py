@@ -25,9 +25,9 @@ import msgspec
 import numpy as np
 import spark_dsg
 
-from prior_sg.deploy.evaluation.metrics import GroundTruth
 from prior_sg.deploy.showing.map import draw_map, label_colors
 from prior_sg.deploy.showing.places import draw_places
+from prior_sg.deploy.truth import GroundTruth
 from prior_sg.schemas.objects import SceneObject
 from prior_sg.schemas.places import VoxelMap
 from prior_sg.schemas.regions import NO_REGION, Region
