@@ -14,6 +14,10 @@ class ServiceError(RuntimeError):
     """A service cannot run as it is configured; the message is one sentence that says what to do."""
 
 
+class UndeclaredError(Exception):
+    """A service wrote or asked what its declaration does not name: a fault in the service."""
+
+
 @dataclass(frozen=True)
 class Identity:
     """Who a running service is. `robot` is `*` for a service of the whole fleet."""
@@ -81,3 +85,18 @@ class Service:
     close: Callable[[Any], None] = lambda state: None
     replay_tolerance: float = 1e-6  # by which floats of a replay may differ; networks differ with threads and machine
     replay_config: Callable[[Any], Any] = lambda cfg: cfg  # the config for a replay, which must touch nothing outside
+
+    def check_write(self, topic: Topic) -> None:
+        """Raise UndeclaredError unless the service declares this topic."""
+        if topic not in self.writes:
+            raise UndeclaredError(f"{self.name} wrote {topic.name}, which it does not declare")
+
+    def check_ask(self, ask: Ask) -> None:
+        """Raise UndeclaredError unless the service declares this question or errand."""
+        if ask.query not in (*self.asks, *self.errands):
+            raise UndeclaredError(f"{self.name} asked {ask.query.name}, which it does not declare")
+
+    def answer_key(self, query: Query, robot: str, cfg: Any) -> str:
+        """The key expression on which a process of this service answers a question."""
+        fields = {name: robot if name == "robot" else "*" for name in query.request.__struct_fields__}
+        return query.key.format(**(fields | self.key_fields(cfg)))

@@ -16,8 +16,8 @@ from prior_sg.schemas.status import Consumed, JobDone, Tick
 from prior_sg.schemas.topics import ENCODE, JOURNAL, KEYFRAME, PLACE_SNAPSHOT, TASK, VOXEL_MAP
 from prior_sg.services.runtime.bus import Hub, LocalBus, pack_header
 from prior_sg.services.runtime.client import Client
-from prior_sg.services.runtime.host.host import Host, UndeclaredError
-from prior_sg.services.runtime.service import Ask, Identity, Service
+from prior_sg.services.runtime.host.host import Host
+from prior_sg.services.runtime.service import Ask, Identity, Service, UndeclaredError
 from prior_sg.services.runtime.zenoh_bus import ZenohBus
 
 CAMERA = Intrinsics(4, 3, 5.0, 5.0, 2.0, 1.5)
