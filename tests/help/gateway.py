@@ -18,7 +18,7 @@ class Gateway:
     def __init__(self, cfg: Config, found: dict | None = None, instance: str = "g1") -> None:
         identity = Identity("*", instance, 1)
         errands = {errand: partial(self.do, errand.open(cfg, identity)) for errand in service.SERVICE.errands}
-        self.found, self.published = found, []
+        self.cfg, self.found, self.published = cfg, found, []
         self.runner = Runner(service.SERVICE, cfg, identity, errands)
         self.state = self.runner.state
 
