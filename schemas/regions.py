@@ -7,6 +7,7 @@ import numpy as np
 
 from prior_sg.schemas.codec import Message, Shape
 
+NO_REGION = -1  # in place of a region id: not labelled yet
 _NO_IDS = msgspec.field(default_factory=lambda: np.zeros(0, np.int64))
 
 

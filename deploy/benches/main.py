@@ -16,6 +16,7 @@ from prior_sg.deploy.benches.learning import learning_bench
 from prior_sg.deploy.benches.places import place_bench
 from prior_sg.deploy.benches.swap import swap_bench
 from prior_sg.deploy.sample import SAMPLE
+from prior_sg.deploy.settings import DEMO_ENVIRONMENT, DEMO_TASK
 from prior_sg.schemas.frames import Keyframe
 from prior_sg.schemas.priors import PriorRequest, Task
 from prior_sg.schemas.topics import KEYFRAME, PRIOR, PRIORS, TASK, TEXT
@@ -72,7 +73,7 @@ def bus() -> tuple[dict, dict]:
 def e2e() -> tuple[dict, dict]:
     """Keyframe in hand → region delta that follows from it, encoder time excluded, without transport."""
     keyframes = _sample_keyframes()
-    request = PriorRequest(environment="residential home", task="real-estate listing")
+    request = PriorRequest(environment=DEMO_ENVIRONMENT, task=DEMO_TASK)
     prior = Runner(BY_NAME["prior_gateway"]).answer(PRIORS, request).priors[0]
     encoder, place_graph, segmenter = (
         Runner(BY_NAME[name], identity=Identity("bench", name, 1))

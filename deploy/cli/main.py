@@ -19,14 +19,11 @@ from prior_sg.deploy.cli import priors
 from prior_sg.deploy.evaluation import command as evaluation
 from prior_sg.deploy.running import serve
 from prior_sg.deploy.sample import SAMPLE
+from prior_sg.deploy.settings import DEFAULT_ROBOT, DEMO_ENVIRONMENT, DEMO_TASK, connect_in_force
 
 if TYPE_CHECKING:
     from prior_sg.schemas.status import ServiceStatus, TopicCount
     from prior_sg.services.runtime.client import Client
-
-DEFAULT_CONNECT = "tcp/127.0.0.1:7447"
-DEMO_ENVIRONMENT = "residential home"
-DEMO_TASK = "real-estate listing"
 
 console = Console(highlight=False)
 
@@ -40,10 +37,9 @@ def _example(text: str) -> dict:
 
 
 def _add_bus(parser: argparse.ArgumentParser, robot: bool = True) -> None:
-    default = os.environ.get("PSG_CONNECT", DEFAULT_CONNECT)
-    parser.add_argument("--connect", default=default, help="Zenoh router (default: %(default)s)")
+    parser.add_argument("--connect", default=connect_in_force(), help="Zenoh router (default: %(default)s)")
     if robot:
-        parser.add_argument("--robot", default="robot1", help="name of the robot (default: %(default)s)")
+        parser.add_argument("--robot", default=DEFAULT_ROBOT, help="name of the robot (default: %(default)s)")
 
 
 def _at_least_one(text: str) -> int:
@@ -236,11 +232,11 @@ def _encoder_settings(choice: str) -> list[str]:
 
 def cmd_demo(arguments: argparse.Namespace) -> int:
     """The main job on the embedded sample."""
-    from prior_sg.deploy.cli import report
+    from prior_sg.deploy.truth import truth_of
 
     arguments.source, arguments.environment = str(SAMPLE), DEMO_ENVIRONMENT
     if not (arguments.regions or arguments.open) and arguments.task == DEMO_TASK:
-        truth = report.truth_of(arguments.source) or {"regions": []}
+        truth = truth_of(arguments.source) or {"regions": []}
         arguments.regions = ",".join(dict.fromkeys(region["label"] for region in truth["regions"]))
         console.print(
             f"region names fixed to the ground truth's: {arguments.regions.replace(',', ', ')} (--open frees them)"
@@ -251,12 +247,12 @@ def cmd_demo(arguments: argparse.Namespace) -> int:
 def cmd_run(arguments: argparse.Namespace) -> int:
     """The main job on a source of the user's."""
     from prior_sg.deploy.cli import report
-    from prior_sg.deploy.evaluation.oracles import read_objects
     from prior_sg.deploy.running.job import Job, run
+    from prior_sg.deploy.truth import read_objects, truth_of
 
     if not Path(arguments.source).exists():
         raise UserError(f"{arguments.source} does not exist")
-    truth = report.truth_of(arguments.source)  # also finds out at once whether the source is of a known layout
+    truth = truth_of(arguments.source)  # also finds out at once whether the source is of a known layout
     job = Job(
         source=arguments.source,
         out=arguments.out,
@@ -281,9 +277,10 @@ def cmd_run(arguments: argparse.Namespace) -> int:
 
 def cmd_up(arguments: argparse.Namespace) -> int:
     """Services and a router until Ctrl-C."""
-    from prior_sg.deploy.cli import report
-    from prior_sg.deploy.running.job import check_settings, make_folder
+    from prior_sg.deploy.running.job import make_folder
     from prior_sg.deploy.running.supervisor import Supervisor
+    from prior_sg.deploy.settings import check_settings
+    from prior_sg.deploy.truth import truth_of
     from prior_sg.services.registry import BY_NAME, SERVICES
     from prior_sg.services.runtime.zenoh_bus import open_router
 
@@ -294,7 +291,7 @@ def cmd_up(arguments: argparse.Namespace) -> int:
     make_folder(arguments.out)
     settings = [f"scene_store.path={arguments.out / 'scene.sqlite'}", f"ingest.speed={arguments.speed}"]
     if arguments.source:
-        report.truth_of(arguments.source)  # finds out at once whether the source is of a known layout
+        truth_of(arguments.source)  # finds out at once whether the source is of a known layout
         settings.append(f"ingest.source={arguments.source}")
     settings += _settings(arguments)
     check_settings(arguments.config, settings)

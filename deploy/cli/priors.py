@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.table import Table
 
 from prior_sg.deploy.running.inprocess import InProcess
-from prior_sg.deploy.running.serve import resolved_config
+from prior_sg.deploy.settings import resolved_config
 from prior_sg.schemas.codec import DecodeError, decode
 from prior_sg.schemas.priors import ObjectPrior, Prior, PriorRevision, Provenance, RegionPrior, Spread, Task
 from prior_sg.schemas.topics import PRIOR, PRIOR_REVISION

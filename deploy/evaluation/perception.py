@@ -15,7 +15,8 @@ from typing import Any
 
 import msgspec
 
-from prior_sg.deploy.evaluation.metrics import GroundTruth
+from prior_sg.deploy.settings import Layers
+from prior_sg.deploy.truth import GroundTruth
 from prior_sg.schemas.codec import decode, encode
 from prior_sg.schemas.features import Pyramid, TextEmbeddings, TextRequest
 from prior_sg.schemas.frames import Keyframe
@@ -30,9 +31,8 @@ from prior_sg.services.runtime.runner import Runner
 from prior_sg.services.runtime.service import Identity
 
 ROBOT = "eval"
-CODE = {"ingest": "core.py", "place_graph": "*.py", "feature_pyramid": "*.py"}  # what makes a perception
+CODE = {"ingest": "core/*.py", "place_graph": "**/*.py", "feature_pyramid": "**/*.py"}  # what makes a perception
 
-Layers = Mapping[str, Mapping[str, Any]]
 Report = Callable[[str, int, int], None]  # what is being done, steps done, steps in all (0 = unknown)
 TextOf = Callable[[Sequence[Sequence[str]]], TextEmbeddings]
 
@@ -211,5 +211,5 @@ def code_digest(service: str, files: str) -> str:
     folder = Path(__file__).parent.parent.parent / "services" / service
     digest = hashlib.blake2b(digest_size=16)
     for file in sorted(folder.glob(files)):
-        digest.update(file.name.encode() + file.read_bytes())
+        digest.update(str(file.relative_to(folder)).encode() + file.read_bytes())
     return digest.hexdigest()

@@ -9,24 +9,16 @@ import signal
 import sys
 import time
 import uuid
-from typing import Any
 
+from prior_sg.deploy.settings import DEFAULT_ROBOT, connect_in_force, resolved_config
 from prior_sg.services.ingest.sources import SourceError
 from prior_sg.services.registry import BY_NAME
 from prior_sg.services.runtime.bus import BusError
-from prior_sg.services.runtime.config import (
-    ConfigError,
-    check_sections,
-    from_arguments,
-    from_environment,
-    merge,
-    read_file,
-    resolve,
-)
+from prior_sg.services.runtime.config import ConfigError
 from prior_sg.services.runtime.host.host import Host
 from prior_sg.services.runtime.logs import start_logging
 from prior_sg.services.runtime.record import LogError
-from prior_sg.services.runtime.service import Identity, Service, ServiceError
+from prior_sg.services.runtime.service import Identity, ServiceError
 from prior_sg.services.runtime.zenoh_bus import ZenohBus
 
 log = logging.getLogger(__name__)
@@ -38,21 +30,13 @@ EXIT_HOPELESS = 2  # starting again would fail again
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """What a service process can be told."""
     parser.add_argument("service", choices=sorted(BY_NAME), help="which service to run")
-    parser.add_argument("--robot", default="robot1", help="name of the robot whose streams it serves")
-    parser.add_argument("--connect", default=os.environ.get("PSG_CONNECT", "tcp/127.0.0.1:7447"), help="Zenoh router")
+    parser.add_argument("--robot", default=DEFAULT_ROBOT, help="name of the robot whose streams it serves")
+    parser.add_argument("--connect", default=connect_in_force(), help="Zenoh router")
     parser.add_argument("--instance", default="", help="name of this process; default: a random one")
     parser.add_argument("--config", default="", help="TOML file with a section per service")
     parser.add_argument("--set", action="append", default=[], metavar="SERVICE.FIELD=VALUE", help="one setting")
     parser.add_argument("--log-level", default="info", choices=("debug", "info", "warning", "error"))
     parser.add_argument("--parent", type=int, default=0, help="end when this process is gone")
-
-
-def resolved_config(service: Service, config_path: str, settings: list[str]) -> Any:
-    """The service's config from all layers. Raises ConfigError."""
-    file, given = read_file(config_path), from_arguments(settings)
-    check_sections(file, list(BY_NAME))
-    check_sections(given, list(BY_NAME))
-    return resolve(service.config, service.name, merge(file, from_environment(os.environ), given))
 
 
 async def serve(arguments: argparse.Namespace, instance: str) -> None:

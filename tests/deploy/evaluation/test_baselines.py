@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 from scipy.spatial.distance import jensenshannon
 
 from prior_sg.deploy.evaluation.baselines import argmax, clio, common, hovsg, hydra
-from prior_sg.deploy.evaluation.metrics import GroundTruth, evaluate
+from prior_sg.deploy.evaluation.metrics import evaluate
+from prior_sg.deploy.truth import GroundTruth
 from prior_sg.schemas.features import Pyramid, TextEmbeddings
 from prior_sg.schemas.frames import Intrinsics
 from prior_sg.schemas.places import VoxelMap
