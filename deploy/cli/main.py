@@ -23,7 +23,7 @@ from prior_sg.deploy.settings import DEFAULT_ROBOT, DEMO_ENVIRONMENT, DEMO_TASK,
 
 if TYPE_CHECKING:
     from prior_sg.schemas.status import ServiceStatus, TopicCount
-    from prior_sg.services.runtime.client import Client
+    from prior_sg.services.runtime.client import BusClient
 
 console = Console(highlight=False)
 
@@ -209,11 +209,11 @@ def _add_tools(command: Command) -> None:
     )
 
 
-def _client(connect: str) -> "Client":
-    from prior_sg.services.runtime.client import Client
+def _client(connect: str) -> "BusClient":
+    from prior_sg.services.runtime.client import BusClient
     from prior_sg.services.runtime.zenoh_bus import ZenohBus
 
-    return Client(ZenohBus(connect, wait_s=2.0))
+    return BusClient(ZenohBus(connect, wait_s=2.0))
 
 
 def _names(text: str) -> list[str]:

@@ -8,9 +8,10 @@ import msgspec
 
 from prior_sg.schemas.codec import Message
 from prior_sg.schemas.topics import Query, Topic
+from prior_sg.services.errors import PriorSgError
 
 
-class ServiceError(RuntimeError):
+class ServiceError(PriorSgError):
     """A service cannot run as it is configured; the message is one sentence that says what to do."""
 
 

@@ -16,6 +16,7 @@ from prior_sg.schemas.frames import Intrinsics
 from prior_sg.services.geometry import pose_from_quaternion
 from prior_sg.services.ingest.core.selection import BadFrame, Correction, RawFrame
 from prior_sg.services.ingest.sources.images import ImageError, image_size
+from prior_sg.services.runtime.service import ServiceError
 
 UP = (0.0, 0.0, 1.0)
 CAMERA, REGIONS = "camera.json", "regions.json"
@@ -23,7 +24,7 @@ MILLIMETRE = 0.001
 DEPTH_MAX = 65535
 
 
-class SourceError(RuntimeError):
+class SourceError(ServiceError):
     """A source cannot be opened; the text is one sentence for the user."""
 
 
