@@ -134,7 +134,7 @@ class Client:
         """As `task`, with all that came of it. `waiting` is told why there is no prior yet, `on_prior` the prior."""
         environment = environment or self.scene().environment
         if not environment:
-            raise TaskError(f"{self.robot} has no environment yet; name one")
+            raise TaskError(f"{self.robot} has no environment yet; name one (--environment) with the task")
         task = Task(
             robot=self.robot,
             stamp_ns=time.time_ns(),

@@ -234,9 +234,9 @@ class Scene:
         """
         frame = _package("pandas", "Scene.to_pandas").DataFrame
         tables = {
-            name: frame.from_records(
-                [_flat(row) for row in _rows(table)], columns=list(_columns(table))
-            ).set_index("id")
+            name: frame.from_records([_flat(row) for row in _rows(table)], columns=list(_columns(table))).set_index(
+                "id"
+            )
             for name, table in (("places", self.places), ("regions", self.regions), ("objects", self.objects))
         }
         tables["places"]["probability"] = self._label_probabilities()

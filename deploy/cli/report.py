@@ -9,6 +9,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
+from prior_sg.deploy.errors import UserError
 from prior_sg.deploy.evaluation.metrics import evaluate
 from prior_sg.deploy.evaluation.object_metrics import NO_DETECTOR, OBJECT_SHARES, object_scores
 from prior_sg.deploy.inspecting.replay import Log, message_differences, undisturbed
@@ -27,7 +28,7 @@ SUFFIXES = {"json": (".json",), "spark-dsg": (".json", ".sparkdsg"), "png": (".p
 MAIN_METRICS = ("f1_s", "f1_g", "miou_s", "miou_g", "miou_s_penalised", "accuracy")
 
 
-class ExportError(Exception):
+class ExportError(UserError):
     """The file cannot be written as asked; the message says what to do."""
 
 

@@ -12,6 +12,7 @@ from rich.box import SIMPLE
 from rich.console import Console
 from rich.table import Table
 
+from prior_sg.deploy.cli.shared import add_settings
 from prior_sg.deploy.evaluation.kinds import BASELINES, ORACLES, OURS, SWEEPS
 from prior_sg.deploy.settings import DEMO_TASK, Layers, settings_layers
 
@@ -60,8 +61,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, default=Path("out/eval"), help="folder for results and the cache")
     parser.add_argument("--json", action="store_true", help="print JSON instead of tables")
     parser.add_argument("--html", action="store_true", help="write report.html with tables, pictures and plots")
-    parser.add_argument("--config", default="", help="TOML file with a section per service")
-    parser.add_argument("--set", action="append", default=[], metavar="SERVICE.FIELD=VALUE", help="one setting")
+    add_settings(parser)
 
 
 def run(arguments: argparse.Namespace, console: Console) -> int:

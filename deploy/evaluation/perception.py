@@ -15,6 +15,7 @@ from typing import Any
 
 import msgspec
 
+from prior_sg.deploy.errors import UserError
 from prior_sg.deploy.settings import Layers
 from prior_sg.deploy.truth import GroundTruth
 from prior_sg.schemas.codec import decode, encode
@@ -37,7 +38,7 @@ Report = Callable[[str, int, int], None]  # what is being done, steps done, step
 TextOf = Callable[[Sequence[Sequence[str]]], TextEmbeddings]
 
 
-class EvaluationError(RuntimeError):
+class EvaluationError(UserError):
     """An evaluation cannot run; the message is one sentence that says what to do."""
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TaskID, TextColumn, TimeElapsedColumn
 
+from prior_sg.deploy.errors import UserError
 from prior_sg.deploy.running.inprocess import InProcess
 from prior_sg.deploy.running.recorder import Recorder, Settling
 from prior_sg.deploy.running.supervisor import Supervisor
@@ -37,7 +38,7 @@ POLL_S = 0.1
 STALL_AFTER_S = 120.0
 
 
-class RunError(Exception):
+class RunError(UserError):
     """The run cannot go on; the message says what to do."""
 
 

@@ -9,10 +9,10 @@ import signal
 import sys
 import time
 import uuid
+from collections.abc import Iterator
 
 from prior_sg.deploy.settings import DEFAULT_ROBOT, connect_in_force, resolved_config
-from prior_sg.services.ingest.sources import SourceError
-from prior_sg.services.registry import BY_NAME
+from prior_sg.services.runtime import extras
 from prior_sg.services.runtime.bus import BusError
 from prior_sg.services.runtime.config import ConfigError
 from prior_sg.services.runtime.host.host import Host
@@ -23,13 +23,25 @@ from prior_sg.services.runtime.zenoh_bus import ZenohBus
 
 log = logging.getLogger(__name__)
 PARENT_CHECK_S = 1.0
-HOPELESS = (ConfigError, BusError, ServiceError, SourceError, LogError)  # their messages say what to do
+HOPELESS = (ConfigError, BusError, ServiceError, LogError)  # their messages say what to do
 EXIT_HOPELESS = 2  # starting again would fail again
+
+
+class ServiceNames:
+    """The names of all services, looked up when somebody asks: services need packages that clients do without."""
+
+    def __iter__(self) -> Iterator[str]:
+        from prior_sg.services.registry import BY_NAME
+
+        return iter(sorted(BY_NAME))
+
+    def __contains__(self, name: object) -> bool:
+        return name in list(self)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """What a service process can be told."""
-    parser.add_argument("service", choices=sorted(BY_NAME), help="which service to run")
+    parser.add_argument("service", choices=ServiceNames(), help="which service to run")
     parser.add_argument("--robot", default=DEFAULT_ROBOT, help="name of the robot whose streams it serves")
     parser.add_argument("--connect", default=connect_in_force(), help="Zenoh router")
     parser.add_argument("--instance", default="", help="name of this process; default: a random one")
@@ -41,6 +53,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 async def serve(arguments: argparse.Namespace, instance: str) -> None:
     """Run until a signal, or until the parent is gone."""
+    from prior_sg.services.registry import BY_NAME
+
     service = BY_NAME[arguments.service]
     cfg = resolved_config(service, arguments.config, arguments.set)
     bus = await asyncio.to_thread(ZenohBus, arguments.connect)
@@ -76,7 +90,10 @@ def run(arguments: argparse.Namespace) -> int:
     except HOPELESS as error:
         log.error(str(error))
         return EXIT_HOPELESS
-    except Exception:
+    except Exception as error:
+        if isinstance(error, ModuleNotFoundError) and (advice := extras.advice(error)) is not None:
+            log.error(advice)
+            return EXIT_HOPELESS
         log.exception("the service failed")
         return 1
     log.info("stopped")

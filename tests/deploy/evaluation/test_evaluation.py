@@ -20,7 +20,7 @@ from prior_sg.deploy.evaluation.page import page, reliability_points, true_scene
 from prior_sg.deploy.evaluation.perception import CODE, Cache, EvaluationError, Perception, code_digest, source_digest
 from prior_sg.deploy.evaluation.plots import line_plot
 from prior_sg.deploy.running.job import Counts, Result
-from prior_sg.deploy.truth import GroundTruth
+from prior_sg.deploy.truth import GroundTruth, TrueObject, read_objects
 from prior_sg.schemas.codec import encode
 from prior_sg.schemas.places import VoxelMap
 from prior_sg.schemas.priors import ObjectPrior
@@ -105,9 +105,9 @@ def test_the_object_oracle_counts_the_boxes_that_were_seen(case, tmp_path):
         {"label": "bed", "min_m": [6.0, 1.0, 2.5], "max_m": [7.0, 3.0, 2.7]},  # nothing was seen there
         {"label": "lamp", "min_m": [5.0, 1.0, 0.5], "max_m": [7.0, 3.0, 0.7]},  # not in the prior
     ]
-    assert oracles.read_objects(tmp_path) == ()
+    assert read_objects(tmp_path) == ()
     (tmp_path / "objects.json").write_text(json.dumps({"objects": boxes}))
-    objects = oracles.read_objects(tmp_path)
+    objects = read_objects(tmp_path)
     occupied = np.array([[5, 5, 3], [30, 10, 3]], np.int16)
     voxels = replace_struct(case.perception.voxels, occupied=occupied)
     found = oracles.seen_objects(objects, case.prior, voxels)
@@ -122,7 +122,7 @@ def test_the_object_oracle_counts_the_boxes_that_were_seen(case, tmp_path):
 
 def with_detections(case, detector="segments"):
     """A bed and an oven, seen eight times; the ground truth has the bed, and another that was never seen."""
-    boxes = [oracles.TrueObject("bed", *BED[:2]), oracles.TrueObject("bed", BED[0] + 9, BED[1] + 9)]
+    boxes = [TrueObject("bed", *BED[:2]), TrueObject("bed", BED[0] + 9, BED[1] + 9)]
     seen = tuple(
         sight(frame, pose, [BED, OVEN] if detector != "none" else [], detector=detector)
         for frame, pose in enumerate(around())

@@ -1,0 +1,139 @@
+"""Commands for services that stay, and for what is done to them while they run."""
+
+import argparse
+import time
+from pathlib import Path
+
+from prior_sg.deploy.cli.jobs import add_run_options, settings_of
+from prior_sg.deploy.cli.shared import Commands, add_bus, console, names_in, open_client
+from prior_sg.deploy.errors import UserError
+from prior_sg.deploy.running import serve
+from prior_sg.services.errors import PriorSgError
+
+
+def add_commands(commands: Commands) -> None:
+    """`up`, `serve`, `task` and `pose-update`."""
+    up = commands.add(
+        "up",
+        cmd_up,
+        "start services and a router, until Ctrl-C",
+        "prior-sg up segmenter scene_store",
+        needs="map",
+    )
+    up.add_argument("services", nargs="*", help="services to start; default: all")
+    up.add_argument("--source", default="", help="what ingest reads; default: nothing")
+    up.add_argument("--out", type=Path, default=Path("out/up"), help="folder for the database and logs")
+    up.add_argument("--no-router", action="store_true", help="use the router at --connect instead of starting one")
+    add_run_options(up)
+
+    one = commands.add(
+        "serve",
+        serve.run,
+        "run one service in this process (what containers do)",
+        "prior-sg serve segmenter",
+        needs="map",
+    )
+    serve.add_arguments(one)
+
+    task = commands.add("task", cmd_task, "give a robot another task, live", 'prior-sg task "serve drinks to guests"')
+    task.add_argument("task", help="the task in plain words")
+    task.add_argument("--environment", default="", help="the environment; default: the one in force")
+    task.add_argument("--regions", default="", help="fixed region names, separated by commas")
+    task.add_argument("--timeout", type=float, default=60.0, help="seconds to wait for the new regions")
+    add_bus(task)
+
+    poses = commands.add(
+        "pose-update",
+        cmd_pose_update,
+        "correct the poses of keyframes, as after a loop closure",
+        "prior-sg pose-update optimised/trajectory.csv",
+        needs="map",
+    )
+    poses.add_argument(
+        "file", type=Path, help="CSV with the columns frame, stamp_ns, x_m y_m z_m qx qy qz qw: world_from_camera"
+    )
+    poses.add_argument("--timeout", type=float, default=60.0, help="seconds to wait for the corrected map")
+    add_bus(poses)
+
+
+def cmd_up(arguments: argparse.Namespace) -> int:
+    """Services and a router until Ctrl-C."""
+    from prior_sg.deploy.running.job import make_folder
+    from prior_sg.deploy.running.supervisor import Supervisor
+    from prior_sg.deploy.settings import check_settings
+    from prior_sg.deploy.truth import truth_of
+    from prior_sg.services.registry import BY_NAME, SERVICES
+    from prior_sg.services.runtime.zenoh_bus import open_router
+
+    names = arguments.services or [service.name for service in SERVICES]
+    for name in names:
+        if name not in BY_NAME:
+            raise UserError(f"there is no service {name!r}; known: {', '.join(BY_NAME)}")
+    make_folder(arguments.out)
+    settings = [f"scene_store.path={arguments.out / 'scene.sqlite'}", f"ingest.speed={arguments.speed}"]
+    if arguments.source:
+        truth_of(arguments.source)  # finds out at once whether the source is of a known layout
+        settings.append(f"ingest.source={arguments.source}")
+    settings += settings_of(arguments)
+    check_settings(arguments.config, settings)
+    if arguments.no_router:
+        open_client(arguments.connect).bus.close()  # finds out at once whether a router is there
+    stop_router = (lambda: None) if arguments.no_router else open_router(arguments.connect)
+    supervisor = Supervisor(arguments.connect, arguments.robot, arguments.out / "logs", settings, arguments.config)
+    try:
+        for name in sorted(names, key=lambda name: name == "ingest"):
+            supervisor.start(name, arguments.workers if BY_NAME[name].job is not None else 1)
+        console.print(f"router {arguments.connect}; logs in {supervisor.log_folder}; Ctrl-C stops")
+        while True:
+            for event in supervisor.check():
+                console.print(event)
+            time.sleep(0.2)
+    except KeyboardInterrupt:
+        console.print("stopping")
+        return 0
+    finally:
+        supervisor.stop()
+        stop_router()
+
+
+def cmd_task(arguments: argparse.Namespace) -> int:
+    """Switch the task and wait for the new regions."""
+    from prior_sg.deploy.api.client import Client
+    from prior_sg.deploy.cli import report
+
+    with Client(arguments.connect, arguments.robot) as client, console.status("asking for the prior") as status:
+        try:
+            switch = client.switch(
+                arguments.task,
+                arguments.environment,
+                names_in(arguments.regions),
+                arguments.timeout,
+                waiting=status.update,
+                on_prior=lambda prior: console.print(f"prior: {prior.provenance.note}"),
+            )
+        except PriorSgError as error:
+            raise UserError(str(error)) from error
+    console.print(report.region_table(switch.scene.message))
+    console.print(f"regions for {arguments.task!r} after {switch.seconds:.2f} s")
+    return 0
+
+
+def cmd_pose_update(arguments: argparse.Namespace) -> int:
+    """Post corrected poses and wait until the map stands corrected."""
+    from prior_sg.deploy.api.client import Client
+    from prior_sg.services.ingest.sources.dataset import read_corrections
+
+    try:
+        poses = {
+            frame_id: pose
+            for correction in read_corrections(arguments.file)
+            for frame_id, pose in zip(correction.frame_ids.tolist(), correction.world_from_camera, strict=True)
+        }
+        if not poses:
+            raise UserError(f"{arguments.file} holds no poses")
+        with Client(arguments.connect, arguments.robot) as client:
+            seconds = client.correct_poses(poses, arguments.timeout)
+    except PriorSgError as error:
+        raise UserError(str(error)) from error
+    console.print(f"{len(poses)} poses taken by the map of {arguments.robot} in {seconds:.2f} s")
+    return 0
