@@ -12,6 +12,7 @@ import numpy as np
 
 from prior_sg.schemas.frames import Keyframe
 from prior_sg.services.registry import BY_NAME
+from prior_sg.services.runtime.runner import Runner
 from prior_sg.services.runtime.service import Identity
 
 PLACE_STAGES = {  # functions of the place graph whose time makes a stage
@@ -44,21 +45,24 @@ def place_bench(keyframes: list[Keyframe]) -> tuple[dict, dict]:
     return metrics, {"keyframes": len(keyframes), "image": "640x480", "voxel_m": 0.2, "clock": "processor time"}
 
 
+def _place_graph(**settings: Any) -> Runner:
+    service = BY_NAME["place_graph"]
+    return Runner(service, service.config(**settings), Identity("bench", "b", 1))
+
+
 def _lap_ms(keyframes: list[Keyframe], voxel_m: float) -> tuple[list[float], dict[str, float]]:
     """Milliseconds of each keyframe, and of each stage on average."""
-    service = BY_NAME["place_graph"]
-    cfg: Any = service.config(voxel_m=voxel_m)
-    state: Any = service.init(cfg, Identity("bench", "b", 1))
+    runner = _place_graph(voxel_m=voxel_m)
     spent: list[float] = []
     profile = cProfile.Profile(time.process_time)
     for keyframe in keyframes:
         started_s = time.process_time()
-        list(service.step(state, keyframe, cfg))
+        runner.feed(keyframe)
         spent.append(1e3 * (time.process_time() - started_s))
-    state = service.init(cfg, Identity("bench", "b", 1))
+    runner = _place_graph(voxel_m=voxel_m)
     profile.enable()
     for keyframe in keyframes:
-        list(service.step(state, keyframe, cfg))
+        runner.feed(keyframe)
     profile.disable()
     seconds: dict[str, float] = {}
     for (file, _, function), (*_, cumulative, _) in pstats.Stats(profile).stats.items():  # type: ignore[attr-defined]
@@ -78,9 +82,7 @@ def _bare(name: str) -> str:
 
 def _growth(keyframes: list[Keyframe]) -> dict[str, float]:
     """Time of a lap on a large map over that of the same lap on a small one, keyframe by keyframe."""
-    service = BY_NAME["place_graph"]
-    cfg: Any = service.config(voxel_m=0.2, min_component_size=1)
-    state: Any = service.init(cfg, Identity("bench", "b", 1))
+    runner = _place_graph(voxel_m=0.2, min_component_size=1)
     laps: list[list[float]] = []
     sizes: list[int] = []
     while not sizes or sizes[-1] < MANY_PLACES:
@@ -91,15 +93,15 @@ def _growth(keyframes: list[Keyframe]) -> dict[str, float]:
             pose[:2, 3] += LAP_M * np.array(divmod(len(laps), 8))
             moved = msgspec.structs.replace(keyframe, frame_id=number, stamp_ns=number * 10**11, world_from_camera=pose)
             started_s = time.process_time()
-            list(service.step(state, moved, cfg))
+            runner.feed(moved)
             spent.append(time.process_time() - started_s)
         laps.append(spent)
-        sizes.append(len(state.graph.places))
+        sizes.append(len(runner.state.graph.places))
     few, many = (np.median(laps[part], axis=0) for part in (slice(0, 5), slice(-5, None)))
     return {
         "growth": float(np.median(many / few)),
         "growth_total": float(many.sum() / few.sum()),
         "growth_places_small": float(sizes[0]),
         "growth_places_large": float(sizes[-1]),
-        "map_mb_at_10000": state.grid.size_bytes / 1e6,
+        "map_mb_at_10000": runner.state.grid.size_bytes / 1e6,
     }

@@ -22,6 +22,7 @@ from prior_sg.schemas.scene import Scene, SceneRequest
 from prior_sg.schemas.topics import SCENE
 from prior_sg.services.registry import BY_NAME
 from prior_sg.services.runtime.record import attachments
+from prior_sg.services.runtime.runner import Runner
 
 SUFFIXES = {"json": (".json",), "spark-dsg": (".json", ".sparkdsg"), "png": (".png",)}
 MAIN_METRICS = ("f1_s", "f1_g", "miou_s", "miou_g", "miou_s_penalised", "accuracy")
@@ -126,21 +127,9 @@ def picture_of_places(path: Path) -> Path:
 def scene_in(database: Path, robot: str) -> Scene:
     """The scene of one robot in a database file of the store, which may be in use."""
     store = BY_NAME["scene_store"]
-    cfg = store.config(path=str(database))
-    return _scene_of(cfg, robot)
-
-
-def _scene_of(cfg: Any, robot: str) -> Scene:
-    from prior_sg.services.runtime.service import Identity
-
-    store = BY_NAME["scene_store"]
-    state = store.init(cfg, Identity("*", "reader", 0))
-    try:
-        scene = store.answers[SCENE](state, SceneRequest(robot=robot), cfg)
-        assert isinstance(scene, Scene)
+    with Runner(store, store.config(path=str(database))) as runner:
+        scene: Scene = runner.answer(SCENE, SceneRequest(robot=robot))
         return scene
-    finally:
-        store.close(state)
 
 
 def final_scene_difference(log: Log, path: Path) -> str:
@@ -149,11 +138,8 @@ def final_scene_difference(log: Log, path: Path) -> str:
     if saved is None:
         return "the log holds no final scene (it was not written by `run` or `demo`)"
     recorded = decode(Scene, saved)
-    state = undisturbed(log)
-    try:
-        again = log.service.answers[SCENE](state, SceneRequest(robot=recorded.robot), None)
-    finally:
-        log.service.close(state)
+    with undisturbed(log) as store:
+        again: Scene = store.answer(SCENE, SceneRequest(robot=recorded.robot))
     if encode(again) == encode(recorded):
         return ""
     return "final scene: " + "; ".join(message_differences(recorded, again) or ["bytes differ below the tolerance"])

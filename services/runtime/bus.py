@@ -13,12 +13,13 @@ from fnmatch import fnmatchcase
 from typing import Protocol
 
 from prior_sg.schemas.topics import Topic
+from prior_sg.services.errors import PriorSgError
 
 HEADER = struct.Struct("<Qq")
 WRITER = re.compile(r"[\w.:-]+(/[\w.:-]+)*")
 
 
-class BusError(Exception):
+class BusError(PriorSgError):
     """The bus cannot do what was asked; the message says what to do."""
 
 

@@ -35,6 +35,7 @@ from mcap.writer import MCAP0_MAGIC, Writer
 from prior_sg.schemas.codec import DecodeError, schema_name
 from prior_sg.schemas.migrations import current
 from prior_sg.schemas.topics import TOPICS, Topic
+from prior_sg.services.errors import PriorSgError
 
 CHUNK_BYTES = 1 << 20
 FLUSH_NS = 1_000_000_000  # of received time: what a killed process can lose
@@ -44,7 +45,7 @@ DAMAGE = (McapError, ValueError, struct.error, zstandard.ZstdError, RuntimeError
 logger = logging.getLogger(__name__)
 
 
-class LogError(RuntimeError):
+class LogError(PriorSgError):
     """A log cannot be written or read; the text is one sentence for the user."""
 
 

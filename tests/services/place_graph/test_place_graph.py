@@ -17,7 +17,7 @@ from scipy.sparse.csgraph import connected_components
 from prior_sg.schemas.codec import encode
 from prior_sg.schemas.frames import ArchiveReply, Intrinsics, Keyframe, PoseUpdate
 from prior_sg.schemas.places import MapRequest, PlaceDelta, SnapshotRequest
-from prior_sg.schemas.topics import PLACE_DELTA, PLACE_SNAPSHOT, VOXEL_MAP
+from prior_sg.schemas.topics import ARCHIVE, PLACE_DELTA, PLACE_SNAPSHOT, VOXEL_MAP
 from prior_sg.services import images
 from prior_sg.services.geometry import inside_polygon, pose_from_quaternion
 from prior_sg.services.place_graph import service
@@ -37,7 +37,8 @@ from prior_sg.services.place_graph.core.volume.grid import (
     VoxelGrid,
 )
 from prior_sg.services.runtime.config import resolve
-from prior_sg.services.runtime.service import Ask, Identity
+from prior_sg.services.runtime.runner import Runner
+from prior_sg.services.runtime.service import Identity
 from tests.help.paths import SHARED_DATA
 
 DATA = SHARED_DATA
@@ -127,12 +128,9 @@ def start(cfg: core.Config = CFG) -> core.State:
 
 
 def play(state: core.State, frames: list[Keyframe], cfg: core.Config = CFG) -> list[PlaceDelta]:
-    deltas = []
-    for frame in frames:
-        for topic, delta in (output for output in service.step(state, frame, cfg) if not isinstance(output, Ask)):
-            assert topic is PLACE_DELTA
-            deltas.append(delta)
-    return deltas
+    published = Runner(service.SERVICE, cfg, state=state).feed(*frames)
+    assert all(topic is PLACE_DELTA for topic, _ in published)
+    return [delta for _, delta in published]
 
 
 @pytest.fixture(scope="module")
@@ -844,20 +842,16 @@ def test_rooms_of_a_home_are_joined_by_their_doorways_only():
 
 def test_a_process_that_joins_in_mid_stream_fetches_the_missed_keyframes_page_by_page():
     frames = ROOM_WALK
-    state = service.init(CFG, Identity("r", "p", 2))
     archive, asked = {frame.frame_id: frame for frame in frames}, []
 
-    def feed(message):
-        for output in list(service.step(state, message, CFG)):
-            if isinstance(output, Ask):
-                request = output.request
-                asked.append((request.first_frame_id, request.end_frame_id))
-                wanted = range(request.first_frame_id, request.end_frame_id)
-                page = [archive[number] for number in sorted(archive) if number in wanted][:2]
-                feed(ArchiveReply(robot="r", oldest_frame_id=0, keyframes=page))
+    def page_of(request):
+        asked.append((request.first_frame_id, request.end_frame_id))
+        wanted = range(request.first_frame_id, request.end_frame_id)
+        page = [archive[number] for number in sorted(archive) if number in wanted][:2]
+        return ArchiveReply(robot="r", oldest_frame_id=0, keyframes=page)
 
-    for frame in frames[4:]:
-        feed(frame)
+    runner = Runner(service.SERVICE, CFG, Identity("r", "p", 2), {ARCHIVE: page_of})
+    runner.feed(*frames[4:])
     last = frames[4].frame_id
     assert asked[0] == (0, last) and [end for _, end in asked] == [last] * len(asked) and len(asked) == 3
-    assert sorted(state.seen) == sorted(archive)
+    assert sorted(runner.state.seen) == sorted(archive)

@@ -4,12 +4,9 @@ label."""
 import msgspec
 import numpy as np
 
-from prior_sg.schemas.codec import decode, encode
 from prior_sg.schemas.topics import BACKFILL, REGION_DELTA, TEXT
-from prior_sg.services.runtime.service import Ask
 from prior_sg.services.segmenter.core.evidence.handover import SpacesConfig
 from prior_sg.services.segmenter.core.state import Config
-from prior_sg.services.segmenter.service import SERVICE
 from tests.help.world import SPACE, place_delta, prior, task, text, walk
 from tests.services.segmenter.test_update import ROOMS, TICK, Run, finished, world
 
@@ -33,18 +30,19 @@ class TwoSpaces(Run):
         super().__init__(**kwargs)
         self.wishes, self.asked_spaces, self.silent = [], [], set()
 
+    def answer(self, query, request):
+        if query is not TEXT:
+            return None
+        self.asked_spaces.append(request.space)
+        return None if request.space in self.silent else self.text(request)
+
     def feed(self, *messages, answer_text=True):
-        for message in messages:
-            for output in list(SERVICE.step(self.state, decode(type(message), encode(message)), self.cfg)):
-                if isinstance(output, Ask) and output.query is TEXT:
-                    self.asked_spaces.append(output.request.space)
-                    if output.request.space not in self.silent:
-                        self.feed(self.text(output.request))
-                elif not isinstance(output, Ask) and output[0] is BACKFILL:
-                    self.wishes.append(output[1])
-                elif not isinstance(output, Ask) and output[0] is REGION_DELTA:
-                    self.deltas.append(output[1])
-                    self.reader.apply(output[1])
+        for topic, message in self.runner.feed(*messages):
+            if topic is BACKFILL:
+                self.wishes.append(message)
+            elif topic is REGION_DELTA:
+                self.deltas.append(message)
+                self.reader.apply(message)
         return self
 
     def text(self, request):

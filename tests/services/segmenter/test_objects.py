@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 
 from prior_sg.schemas.codec import decode, encode
-from prior_sg.schemas.features import TextRequest
 from prior_sg.schemas.frames import PoseUpdate
 from prior_sg.schemas.objects import Detections, ObjectDelta
 from prior_sg.schemas.places import SnapshotRequest
 from prior_sg.schemas.priors import ObjectPrior, RegionPrior
 from prior_sg.schemas.status import Tick
-from prior_sg.schemas.topics import OBJECT_SNAPSHOT
+from prior_sg.schemas.topics import OBJECT_SNAPSHOT, TEXT
 from prior_sg.services.geometry import inverse, transform
-from prior_sg.services.runtime.service import Ask, Identity
+from prior_sg.services.runtime.runner import Runner
+from prior_sg.services.runtime.service import Identity
 from prior_sg.services.segmenter.core.experts.context import ObjectView
 from prior_sg.services.segmenter.core.objects import names as naming
 from prior_sg.services.segmenter.core.objects import tracks as objects
@@ -375,16 +375,17 @@ class Run:
 
     def __init__(self, cfg=None):
         self.cfg = cfg or Config()
-        self.state = SERVICE.init(self.cfg, Identity(ROBOT, "i", 1))
+        self.runner = Runner(SERVICE, self.cfg, Identity(ROBOT, "i", 1), {TEXT: self.answer}, wire=True)
+        self.state = self.runner.state
         self.deltas, self.objects = [], {}
 
+    def answer(self, request):
+        return text(EYE[: len(request.concepts)], space=request.space)
+
     def feed(self, *messages):
-        for message in messages:
-            for output in list(SERVICE.step(self.state, message, self.cfg)):
-                if isinstance(output, Ask) and isinstance(output.request, TextRequest):
-                    self.feed(text(EYE[: len(output.request.concepts)], space=output.request.space))
-                elif not isinstance(output, Ask) and isinstance(output[1], ObjectDelta):
-                    self.take(decode(ObjectDelta, encode(output[1])))
+        for _, message in self.runner.feed(*messages):
+            if isinstance(message, ObjectDelta):
+                self.take(message)
         return self
 
     def take(self, delta):

@@ -1,5 +1,7 @@
 """The whole segmenter on a small world: right regions, lasting ids, task switch, deltas, questions, replay."""
 
+from functools import partial
+
 import msgspec
 import numpy as np
 import pytest
@@ -21,6 +23,7 @@ from prior_sg.schemas.topics import (
     TASK_IN_FORCE,
     TEXT,
 )
+from prior_sg.services.runtime.runner import Runner
 from prior_sg.services.runtime.service import Ask, Identity
 from prior_sg.services.segmenter.core import inference, report
 from prior_sg.services.segmenter.core import update as core
@@ -56,24 +59,27 @@ class Run:
     """One segmenter, its outputs, and a reader of its deltas. Text requests are answered like rooms' basis vectors."""
 
     def __init__(self, cfg=CFG, concepts=None):
-        self.cfg, self.state = cfg, SERVICE.init(cfg, Identity(ROBOT, "i", 1))
+        answers = {query: partial(self.answer, query) for query in SERVICE.asks}
+        self.runner = Runner(SERVICE, cfg, Identity(ROBOT, "i", 1), answers, wire=True)
+        self.cfg, self.state = cfg, self.runner.state
         self.concepts = np.eye(3) if concepts is None else concepts
         self.deltas, self.asked, self.reader = [], [], Reader()
-        self.asked_task = 0
+        self.asked_task, self.answer_text = 0, True
+
+    def answer(self, query, request):
+        if query is TASK_IN_FORCE:
+            self.asked_task += 1
+            return None
+        self.asked.append(Ask(query, request))
+        return text(self.concepts[: len(request.concepts)]) if query is TEXT and self.answer_text else None
 
     def feed(self, *messages, answer_text=True):
-        for message in messages:
-            for output in list(SERVICE.step(self.state, decode(type(message), encode(message)), self.cfg)):
-                if isinstance(output, Ask) and output.query is TASK_IN_FORCE:
-                    self.asked_task += 1
-                elif isinstance(output, Ask):
-                    self.asked.append(output)
-                    if output.query is TEXT and answer_text:
-                        self.feed(text(self.concepts[: len(output.request.concepts)]))
-                elif output[0] is not BACKFILL:  # which tests/test_segmenter_spaces.py is about
-                    assert output[0] is REGION_DELTA
-                    self.deltas.append(output[1])
-                    self.reader.apply(output[1])
+        self.answer_text = answer_text
+        for topic, message in self.runner.feed(*messages):
+            if topic is not BACKFILL:  # which test_handover.py is about
+                assert topic is REGION_DELTA
+                self.deltas.append(message)
+                self.reader.apply(message)
         return self
 
     def labels(self):
