@@ -121,14 +121,14 @@ class LogWriter:
     def flush(self) -> None:
         """Hand all messages so far to the operating system: they survive the end of this process."""
         with self._disk_errors():
-            self._writer.flush()
+            self._writer.flush()  # type: ignore[no-untyped-call]
             self._end = self._file.tell()
 
     def close(self) -> None:
         """Write the index and close the file; closing twice does nothing."""
         if not self._file.closed:
             with self._disk_errors(), self._file:
-                self._writer.finish()
+                self._writer.finish()  # type: ignore[no-untyped-call]
 
     def __enter__(self) -> "LogWriter":
         return self
