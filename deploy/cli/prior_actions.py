@@ -17,8 +17,9 @@ from prior_sg.deploy.settings import resolved_config
 from prior_sg.schemas.codec import DecodeError, decode
 from prior_sg.schemas.priors import ObjectPrior, Prior, PriorRevision, Provenance, Task
 from prior_sg.schemas.topics import PRIOR, PRIOR_REVISION
-from prior_sg.services.prior_gateway.core.compose import Config, Library, NoPrior
-from prior_sg.services.prior_gateway.outside.archive import PREFERRED, Archive
+from prior_sg.services.prior_gateway.core.compose import Library, NoPrior
+from prior_sg.services.prior_gateway.core.config import Config
+from prior_sg.services.prior_gateway.outside.archive import PREFERRED, PriorShelf
 from prior_sg.services.prior_gateway.outside.library import environments, load
 from prior_sg.services.prior_gateway.outside.signing import Signer
 from prior_sg.services.registry import BY_NAME
@@ -50,7 +51,7 @@ def find(what: str, cfg: Config) -> Prior:
     """The prior in a file, or the kept one of a digest. Raises PriorError."""
     if Path(what).is_file():
         return read(Path(what))
-    found = {entry.prior.digest(): entry.prior for _, entry in Archive(cfg.archive).all()}
+    found = {entry.prior.digest(): entry.prior for _, entry in PriorShelf(cfg.archive).all()}
     fitting = [digest for digest in found if len(what) >= 4 and digest.startswith(what)]
     if len(fitting) != 1:
         raise PriorError(
@@ -64,7 +65,9 @@ def wanted(arguments: argparse.Namespace, cfg: Config) -> Prior:
     if arguments.what:
         return find(arguments.what, cfg)
     task = task_of(arguments)
-    kept = [(name == PREFERRED, entry.prior) for name, entry in Archive(cfg.archive).all() if entry.prior.answers(task)]
+    kept = [
+        (name == PREFERRED, entry.prior) for name, entry in PriorShelf(cfg.archive).all() if entry.prior.answers(task)
+    ]
     if kept:
         return max(kept, key=lambda pair: pair[0])[1]
     try:
@@ -139,7 +142,7 @@ def bring(arguments: argparse.Namespace, console: Console) -> int:
         raise PriorError(f"{arguments.file}: {said}; prior_gateway.require_signature lets no such prior in")
     if not cfg.archive:
         raise PriorError("there is no archive to import into; set prior_gateway.archive to a folder")
-    Archive(cfg.archive).put(prior, PREFERRED, verdict=said)
+    PriorShelf(cfg.archive).put(prior, PREFERRED, verdict=said)
     console.print(f"prior {prior.digest()} ({said}) answers {prior.task!r} in {prior.environment!r} from now on")
     return 0
 
@@ -152,7 +155,7 @@ def list_all(arguments: argparse.Namespace, console: Console) -> int:
             table.add_row(listing.name, task, ", ".join(regions))
     console.print(table)
     cfg = settings(arguments)
-    kept = list(Archive(cfg.archive).all())
+    kept = list(PriorShelf(cfg.archive).all())
     if kept:
         table = Table(title=f"kept in {cfg.archive}")
         table.add_column("digest", no_wrap=True)

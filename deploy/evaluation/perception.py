@@ -24,7 +24,7 @@ from prior_sg.schemas.frames import Keyframe
 from prior_sg.schemas.objects import Detections
 from prior_sg.schemas.places import MapRequest, PlaceDelta, SnapshotRequest, VoxelMap
 from prior_sg.schemas.topics import DETECTIONS, KEYFRAME, PLACE_SNAPSHOT, PYRAMID, TEXT, VOXEL_MAP
-from prior_sg.services.feature_pyramid.detectors.base import prompted
+from prior_sg.services.feature_pyramid.detectors.load import is_prompted
 from prior_sg.services.ingest.sources import Source, open_source
 from prior_sg.services.registry import BY_NAME
 from prior_sg.services.runtime.config import resolve
@@ -96,7 +96,7 @@ class Perceiver:
         """
         source = open_source(path)
         cfg = self._config("feature_pyramid", features)
-        if not cfg.detector_prompts and prompted(cfg):
+        if not cfg.detector_prompts and is_prompted(cfg):
             cfg = msgspec.structs.replace(cfg, detector_prompts=sought)
         seconds: dict[str, float] = {}
         snapshot, voxels = self._kept("places", path, None, lambda: self._places(source), seconds)
