@@ -98,17 +98,20 @@ def _keyframes(source: Source, quality: int | None, coarser: Coarser | None) -> 
     for frame in source:
         if not isinstance(frame, RawFrame):
             raise PackError(f"frame {frame.frame_id} of {source.path} cannot be packed: {frame.reason}")
-        frame = frame if coarser is None else coarser.of(frame)
-        yield Keyframe(
-            robot=ROBOT,
-            frame_id=frame.frame_id,
-            stamp_ns=frame.stamp_ns,
-            intrinsics=frame.intrinsics,
-            world_from_camera=frame.world_from_camera,
-            color=bare_jpeg(frame.color) if quality is None else _recompressed(frame.color, quality),
-            depth=smallest_png(frame.depth),
-            depth_scale_m=frame.depth_scale_m,
-        )
+        yield _keyframe(frame if coarser is None else coarser.of(frame), quality)
+
+
+def _keyframe(frame: RawFrame, quality: int | None) -> Keyframe:
+    return Keyframe(
+        robot=ROBOT,
+        frame_id=frame.frame_id,
+        stamp_ns=frame.stamp_ns,
+        intrinsics=frame.intrinsics,
+        world_from_camera=frame.world_from_camera,
+        color=bare_jpeg(frame.color) if quality is None else _recompressed(frame.color, quality),
+        depth=smallest_png(frame.depth),
+        depth_scale_m=frame.depth_scale_m,
+    )
 
 
 def bare_jpeg(jpeg: bytes) -> bytes:
