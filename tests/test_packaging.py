@@ -26,6 +26,7 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 def wheel(tmp_path_factory):
     """Built from a copy: what earlier builds left behind would go into it."""
     source, folder = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("wheel")
+    built = shutil.ignore_patterns("*.egg-info", "*.nb[ci]")
     for name in (*FOLDERS, "src"):
         shutil.copytree(
             ROOT / name, source / name, symlinks=True, ignore=shutil.ignore_patterns("*.egg-info", "*.nb[ci]")
@@ -99,7 +100,7 @@ def with_core_only(*arguments):
     ],
 )
 def test_a_missing_extra_is_one_sentence(arguments, extra):
-    done = with_core_only(*arguments.split())
+    done = with_core_only(*arguments)
     assert done.returncode == 1
     assert done.stderr.count("\n") == 1
     assert f"run `pip install 'prior-sg[{extra}]'`" in done.stderr
