@@ -28,9 +28,7 @@ def wheel(tmp_path_factory):
     source, folder = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("wheel")
     built = shutil.ignore_patterns("*.egg-info", "*.nb[ci]")
     for name in (*FOLDERS, "src"):
-        shutil.copytree(
-            ROOT / name, source / name, symlinks=True, ignore=shutil.ignore_patterns("*.egg-info", "*.nb[ci]")
-        )
+        shutil.copytree(ROOT / name, source / name, symlinks=True, ignore=built)
     for name in ("pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, source / name)
     command = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation", "--no-index"]
