@@ -3,7 +3,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 LLM := .venv-llm
 LLM_PORT ?= 18080
-WORKERS ?= 2 # processes that run tests
+WORKERS ?= 2
 
 .PHONY: demo test test-llm check bench clean
 .DEFAULT_GOAL := demo
@@ -13,9 +13,9 @@ demo: $(VENV)/installed
 
 test: check
 	$(BIN)/coverage erase
-	$(BIN)/coverage run --parallel-mode -m pytest -n $(WORKERS) --dist loadfile
+	PSG_TEST_COVERAGE=1 $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
 	$(BIN)/coverage combine --quiet
-	$(BIN)/coverage report --include='services/*/*.py,schemas/*.py' --omit='services/*/service.py,services/runtime/*'
+	$(BIN)/coverage report --include='services/**/*.py,schemas/*.py' --omit='services/*/service.py,services/runtime/**'
 
 # A real language model of 270 M parameters behind a server on loopback. Building the server takes many minutes, once.
 test-llm: $(VENV)/installed-dev $(LLM)/installed
