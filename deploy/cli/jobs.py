@@ -5,7 +5,7 @@ from pathlib import Path
 
 from prior_sg.deploy.cli.shared import Commands, add_bus, add_settings, console, names_in
 from prior_sg.deploy.errors import UserError
-from prior_sg.deploy.sample import SAMPLE
+from prior_sg.deploy.sample import COARSE, SAMPLE
 from prior_sg.deploy.settings import DEMO_ENVIRONMENT, DEMO_TASK
 
 
@@ -91,6 +91,8 @@ def cmd_demo(arguments: argparse.Namespace) -> int:
     from prior_sg.deploy.truth import truth_of
 
     arguments.source, arguments.environment = str(SAMPLE), DEMO_ENVIRONMENT
+    if SAMPLE == COARSE:
+        console.print("sample: the coarse one of the package; a checkout has the full one, which scores higher")
     if not (arguments.regions or arguments.open) and arguments.task == DEMO_TASK:
         truth = truth_of(arguments.source) or {"regions": []}
         arguments.regions = ",".join(dict.fromkeys(region["label"] for region in truth["regions"]))

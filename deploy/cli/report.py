@@ -14,13 +14,14 @@ from prior_sg.deploy.evaluation.metrics import evaluate
 from prior_sg.deploy.evaluation.object_metrics import NO_DETECTOR, OBJECT_SHARES, object_scores
 from prior_sg.deploy.inspecting.replay import Log, message_differences, undisturbed
 from prior_sg.deploy.running.job import Result
-from prior_sg.deploy.showing.export import map_png, places_png, scene_json, spark_dsg_graph
+from prior_sg.deploy.showing.export import map_png, places_png, scene_json
 from prior_sg.deploy.truth import GroundTruth, TrueObject
 from prior_sg.schemas.codec import decode, encode
 from prior_sg.schemas.places import VoxelMap
 from prior_sg.schemas.scene import Scene, SceneRequest
 from prior_sg.schemas.topics import SCENE
 from prior_sg.services.registry import BY_NAME
+from prior_sg.services.runtime import extras
 from prior_sg.services.runtime.record import attachments
 from prior_sg.services.runtime.runner import Runner
 
@@ -71,9 +72,15 @@ def write(
     )
     if metrics := compare(result, truth, objects, console):
         (out / "metrics.json").write_text(json.dumps(metrics, indent=1))
-    for kind, name in (("json", "scene.json"), ("spark-dsg", "dsg.json"), ("png", "map.png")):
+    files = {"scene.json": "json", "dsg.json": "spark-dsg", "map.png": "png"}
+    try:
+        extras.require("dsg", "dsg.json")
+    except extras.ExtraMissing as error:
+        console.print(f"without dsg.json: {error}")
+        del files["dsg.json"]
+    for name, kind in files.items():
         export(scene, result.voxels, kind, out / name, truth)
-    names = ", ".join(("scene.json", "dsg.json", "map.png", "map-3d.png", result.log_path.name))
+    names = ", ".join((*files, "map-3d.png", result.log_path.name))
     console.print(f"written to {out}: {names} ({result.seconds:.0f} s)")
 
 
@@ -113,6 +120,8 @@ def _write(scene: Scene, voxels: VoxelMap | None, kind: str, path: Path, truth: 
     if kind == "json":
         path.write_text(json.dumps(scene_json(scene), indent=1))
     elif kind == "spark-dsg":
+        from prior_sg.deploy.showing.dsg import spark_dsg_graph
+
         spark_dsg_graph(scene).save(str(path))
     else:
         map_png(scene, voxels, path, GroundTruth.from_json(truth) if truth else None)

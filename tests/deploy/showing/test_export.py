@@ -9,13 +9,12 @@ import pytest
 import spark_dsg
 from scipy.spatial.transform import Rotation
 
+from prior_sg.deploy.showing.dsg import save_spark_dsg, spark_dsg_graph
 from prior_sg.deploy.showing.export import (
     map_png,
     places_png,
     save_json,
-    save_spark_dsg,
     scene_json,
-    spark_dsg_graph,
     zones,
 )
 from prior_sg.deploy.showing.map import FREE, PALETTE, UNLABELLED, WALL, label_colors

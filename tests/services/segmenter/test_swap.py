@@ -6,8 +6,8 @@ import gco
 import numpy as np
 import pytest
 
-from prior_sg.services.segmenter.core.energy import swap
-from prior_sg.services.segmenter.core.energy.maxflow import CUTS, binary_minimum
+from prior_sg.services.segmenter.core.energy import maxflow, swap
+from prior_sg.services.segmenter.core.energy.maxflow import CUTS, NoSuchLibrary, binary_minimum, min_cut_in_use
 from prior_sg.services.segmenter.core.energy.solver import Settings
 from tests.help.fields import all_energies, best_swap, random_field
 
@@ -83,6 +83,41 @@ def test_min_cut_libraries_agree(seed):
         cost_of(cut(*costs, field.edges, field.weights), *costs, field.edges, field.weights) for cut in CUTS.values()
     ]
     assert found[1] == pytest.approx(found[0], rel=1e-6)
+
+
+@pytest.mark.parametrize("metric", [False, True])
+def test_scipy_cuts_lead_to_energies_as_low_as_pymaxflow_and_gco(metric):
+    """Every cut goes to the library, none to compiled code."""
+    for seed in range(4):
+        field = random_field(seed, places=300, labels=6, degree=6, metric=metric)
+        start = field.unary.argmin(axis=1)
+        ours = [
+            swap.energy(field, swap.minimise(field, start, Settings(compiled_up_to=0, min_cut=name))) for name in CUTS
+        ]
+        assert ours[1] == pytest.approx(ours[0], rel=1e-6)
+        assert ours[1] < 1.003 * swap.energy(field, gco_swap(field, start))
+
+
+def test_scipy_rounds_by_less_than_it_says():
+    """Costs over nine decades: the excess over the least sum stays below total (n + m) / 2^30."""
+    rng = np.random.default_rng(3)
+    field = random_field(3, places=400, labels=2, degree=6)
+    costs = [rng.uniform(0, 1, 400) * 10.0 ** rng.integers(-6, 4, 400) for _ in range(2)]
+    lean = costs[1] - costs[0]
+    total = min(lean[lean > 0].sum(), -lean[lean < 0].sum())
+    exact, rounded = (
+        cost_of(CUTS[name](*costs, field.edges, field.weights), *costs, field.edges, field.weights)
+        for name in ("pymaxflow", "scipy")
+    )
+    assert exact - 1e-9 <= rounded <= exact + total * (400 + len(field.edges)) / 2**30
+
+
+def test_without_pymaxflow_scipy_cuts_and_says_so(monkeypatch):
+    assert min_cut_in_use("auto") == "pymaxflow"
+    monkeypatch.setattr(maxflow, "library", None)
+    assert min_cut_in_use("auto") == min_cut_in_use("scipy") == "scipy"
+    with pytest.raises(NoSuchLibrary, match=r"pip install 'prior-sg\[fast-cut\]'"):
+        min_cut_in_use("pymaxflow")
 
 
 def test_the_global_optimum_of_small_fields(capsys):
