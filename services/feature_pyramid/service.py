@@ -18,7 +18,7 @@ from prior_sg.services import intent
 from prior_sg.services.feature_pyramid.core.crops import Config, Selection, coarse_surface, select_crops
 from prior_sg.services.feature_pyramid.detectors.base import Detector, Found, Shot, lift, load_detector, object_crops
 from prior_sg.services.feature_pyramid.encoders.base import Encoder, Options, load_encoder, space_of
-from prior_sg.services.intent import Vocabulary
+from prior_sg.services.intent import Intent
 from prior_sg.services.runtime.service import Ask, Identity, Output, Service
 
 QUESTIONS = {TaskRequest: TASK_IN_FORCE, PriorRequest: PRIORS}
@@ -43,7 +43,7 @@ class Worker:
     instance: str
     encoder: Encoder
     detector: Detector
-    vocabulary: Vocabulary = field(default_factory=Vocabulary)
+    vocabulary: Intent = field(default_factory=Intent)
     broken: int = 0
     reader: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(1, thread_name_prefix="reader"))
     views: dict[tuple[str, int], Future[View]] = field(default_factory=dict)  # by robot and frame
