@@ -119,6 +119,15 @@ def apply(graph: PlaceGraph, delta: PlaceDelta, replaces: bool) -> Step:
     return Step(after, previous, moved, touched, upserted=rows, removed=np.flatnonzero(~kept))
 
 
+def with_neighbours(graph: PlaceGraph, mask: np.ndarray) -> np.ndarray:
+    """Mask (place,) grown by one edge."""
+    grown = mask.copy()
+    if mask.any():
+        grown[graph.edges[mask[graph.edges[:, 0]], 1]] = True
+        grown[graph.edges[mask[graph.edges[:, 1]], 0]] = True
+    return grown
+
+
 def _join_edges(
     graph: PlaceGraph, after: PlaceGraph, delta: PlaceDelta, merged: list[tuple[int, int]], replaces: bool
 ) -> np.ndarray:

@@ -18,16 +18,16 @@ OBJECT_REACH_M = 1.5  # an object stands in a region when one of its places is a
 SIDE_BY_SIDE_M = 1.0  # edges across a border whose middles are closer than this lead through the same opening
 
 
-def components(labels: np.ndarray, edges: np.ndarray) -> np.ndarray:
+def numbered(labels: np.ndarray, edges: np.ndarray) -> np.ndarray:
     """Component number (place,) of each place in the graph of same-label edges (eq. connected_components).
 
     Numbers count from 0 in the order of each component's first place.
     """
-    return _components(labels, edges)
+    return _numbered(labels, edges)
 
 
 @njit(cache=True, nogil=True)
-def _components(labels, edges):  # noqa: ANN001, ANN202
+def _numbered(labels, edges):  # noqa: ANN001, ANN202
     """Union by the smaller row, which is then the component's first place."""
     parent = np.arange(len(labels))
     for edge in range(len(edges)):
@@ -55,7 +55,7 @@ def _components(labels, edges):  # noqa: ANN001, ANN202
 def track(component: np.ndarray, previous: np.ndarray, next_id: int) -> tuple[np.ndarray, int]:
     """Region id (place,) of each place, and the next unused id.
 
-    `component` (place,) from `components`, places in the order of their ids; `previous` (place,) holds the region ids
+    `component` (place,) from `numbered`, places in the order of their ids; `previous` (place,) holds the region ids
     before, NO_REGION for new places. An id follows the component that keeps most of its places (a split: the larger
     part), and a component that several ids would follow takes the one that brings most places (a merge); ties go to the
     older id and to the component of the older place. Components without an heir get new ids, in order.
