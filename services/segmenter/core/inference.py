@@ -11,7 +11,8 @@ from scipy.spatial import cKDTree
 from prior_sg.services.segmenter.core.appearance import adaptation, smoothing
 from prior_sg.services.segmenter.core.appearance.label_bias import label_bias
 from prior_sg.services.segmenter.core.config import Config
-from prior_sg.services.segmenter.core.energy import posteriors, swap
+from prior_sg.services.segmenter.core.energy import posteriors
+from prior_sg.services.segmenter.core.energy.mrf import Field
 from prior_sg.services.segmenter.core.experts import REGISTRY, Vote
 from prior_sg.services.segmenter.core.experts.context import Context, ObjectView, standardised
 from prior_sg.services.segmenter.core.map import inclination
@@ -84,7 +85,7 @@ def adapt(state: State, idle: bool, cfg: Config) -> None:
 
 def _visual_labels(state: State, own: np.ndarray, rows: np.ndarray, cfg: Config) -> np.ndarray:
     """The label (row,) that each of some places looks most like, from the own similarities (place, label) of all."""
-    trust, near = state.seen.evidence.trust[state.map.places.slots], state.map.graph.adjacency
+    trust, near = state.seen.evidence.trust[state.map.places.slots], state.map.graph.arcs
     around = smoothing.shared(own, trust, near, state.map.weights, rows=rows, cfg=cfg.sharing)
     scores = state.aim.aligned.text.temperature * around
     return np.argmax(scores + _bias(state, scores, cfg), axis=1)
@@ -107,7 +108,7 @@ def compare(state: State) -> None:
 
 def share(state: State, cfg: Config) -> None:
     """Average similarity around the places whose own, or whose edges, changed."""
-    places, near = state.map.places, state.map.graph.adjacency
+    places, near = state.map.places, state.map.graph.arcs
     rows = smoothing.reached(near, places.unshared, cfg.sharing.steps)
     trust = state.seen.evidence.trust[places.slots]
     places.similarity[rows] = smoothing.shared(
@@ -166,9 +167,9 @@ def evaluate_experts(state: State, idle: bool, cfg: Config) -> None:
     places.doubtful[rows], places.unbelieved[rows], places.unsettled[changed] = False, True, True
 
 
-def field_of(state: State) -> swap.Field:
+def field_of(state: State) -> Field:
     """The Markov random field over the place graph (eqs. mrf_energy, pairwise_potential)."""
-    return swap.Field(state.map.places.unary, state.map.graph.edges, state.map.weights, state.aim.aligned.pairwise)
+    return Field(state.map.places.unary, state.map.graph.edges, state.map.weights, state.aim.aligned.pairwise)
 
 
 def settle(state: State, cfg: Config, *, hurried: bool) -> None:
@@ -196,6 +197,6 @@ def settle(state: State, cfg: Config, *, hurried: bool) -> None:
 def believe(state: State, cfg: Config) -> None:
     """Posteriors of the places whose costs, or whose neighbours' labels, changed."""
     places, rows = state.map.places, np.flatnonzero(state.map.places.unbelieved)
-    costs = posteriors.conditional_costs(field_of(state), state.map.graph.adjacency, places.labels, rows)
+    costs = posteriors.conditional_costs(field_of(state), state.map.graph.arcs, places.labels, rows)
     places.posteriors[rows] = posteriors.posteriors(costs, cfg.temperature)
     state.regions.disturb(places.regions[rows])

@@ -15,7 +15,8 @@ from prior_sg.schemas.regions import (
     RegionEvent,
 )
 from prior_sg.services.segmenter.core.config import Config
-from prior_sg.services.segmenter.core.energy import posteriors, swap
+from prior_sg.services.segmenter.core.energy import posteriors
+from prior_sg.services.segmenter.core.energy.mrf import energy
 from prior_sg.services.segmenter.core.inference import field_of, votes
 from prior_sg.services.segmenter.core.map.table import UNLABELLED
 from prior_sg.services.segmenter.core.regions import components, ledger
@@ -49,7 +50,7 @@ def _head(state: State) -> RegionDelta:
         environment=aligned.prior.environment,
         task=aligned.prior.task,
         space=state.seen.spaces.force if len(state.seen.archive) else "",
-        energy=swap.energy(field_of(state), state.map.places.labels),
+        energy=energy(field_of(state), state.map.places.labels),
     )
 
 
@@ -134,7 +135,7 @@ def explain(state: State, request: PosteriorRequest, cfg: Config) -> PosteriorRe
     row = int(state.map.graph.rows(np.array([request.place_id]))[0])
     if row < 0 or state.aim.in_force is None or state.map.places.labels[row] == UNLABELLED:
         return PosteriorReply(robot=state.robot, place_id=request.place_id, found=False)
-    places, names, near = state.map.places, state.aim.in_force.labels, state.map.graph.adjacency
+    places, names, near = state.map.places, state.aim.in_force.labels, state.map.graph.arcs
     rows, slot = np.array([row]), int(places.slots[row])
     answers = votes(state, rows, cfg)
     unary = sum(-cfg.experts[name] * sure[0] * log[0] for name, (log, sure) in answers.items())

@@ -7,7 +7,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull
 
 from prior_sg.services.segmenter.core.experts.context import ObjectView
-from prior_sg.services.segmenter.core.map.received import PlaceGraph, apply
+from prior_sg.services.segmenter.core.map.received import ReceivedGraph, apply
 from prior_sg.services.segmenter.core.regions.components import (
     NO_REGION,
     border,
@@ -129,7 +129,7 @@ def two_rooms():
     right = [(1.0, y, 1.0) for y in (0.0, 5.0, 6.0)]
     edges = np.array([(0, 3), (1, 4), (2, 5), (0, 1), (1, 2), (3, 4), (4, 5)])
     clearances = np.array([0.4, 0.9, 1.1, 1.0, 1.0, 1.0, 1.0], np.float32)
-    return apply(PlaceGraph(), place_delta(np.array(left + right), edges, clearances_m=clearances), False).graph
+    return apply(ReceivedGraph(), place_delta(np.array(left + right), edges, clearances_m=clearances), False).graph
 
 
 def test_border_by_hand():

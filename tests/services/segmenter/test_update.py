@@ -27,7 +27,8 @@ from prior_sg.services.segmenter.core.aim import region_concepts
 from prior_sg.services.segmenter.core.appearance.adaptation import Adaptation, AdaptationConfig
 from prior_sg.services.segmenter.core.appearance.label_bias import BalanceConfig
 from prior_sg.services.segmenter.core.config import Config
-from prior_sg.services.segmenter.core.energy import swap
+from prior_sg.services.segmenter.core.energy.mrf import energy
+from prior_sg.services.segmenter.core.energy.solver import minimise
 from prior_sg.services.segmenter.core.experts.context import ObjectView
 from prior_sg.services.segmenter.core.map.place_map import edge_weights
 from prior_sg.services.segmenter.service import SERVICE
@@ -318,13 +319,13 @@ def test_a_spent_budget_leaves_a_valid_labelling_and_an_idle_tick_finishes():
         assert state.labelling.dirty or not state.labelling.solver.pending
         waited |= state.labelling.solver.pending > 0
     assert waited
-    hurried = swap.energy(inference.field_of(run.state), run.state.map.places.labels)
+    hurried = energy(inference.field_of(run.state), run.state.map.places.labels)
     run.feed(TICK, TICK)
     assert not (run.state.labelling.dirty or run.state.labelling.solver.pending)
     field = inference.field_of(run.state)
-    energy = swap.energy(field, run.state.map.places.labels)
-    assert energy <= hurried + 1e-9
-    assert swap.energy(field, swap.minimise(field, run.state.map.places.labels)) == pytest.approx(energy)
+    settled = energy(field, run.state.map.places.labels)
+    assert settled <= hurried + 1e-9
+    assert energy(field, minimise(field, run.state.map.places.labels)) == pytest.approx(settled)
     assert sorted(region.label for region in run.reader.regions.values()) == sorted(ROOMS)
 
 
@@ -335,8 +336,8 @@ def test_places_may_leave_at_either_end_of_the_list(end):
     run.feed(no_places(revision=1, removed_ids=np.array(gone)), TICK)
     assert set(run.reader.beliefs) == set(range(len(positions))) - set(gone)
     field = inference.field_of(run.state)
-    fresh = swap.minimise(field, run.state.map.places.labels)
-    assert swap.energy(field, fresh) == pytest.approx(swap.energy(field, run.state.map.places.labels))
+    fresh = minimise(field, run.state.map.places.labels)
+    assert energy(field, fresh) == pytest.approx(energy(field, run.state.map.places.labels))
 
 
 def test_a_merge_tells_the_new_region_of_every_place():

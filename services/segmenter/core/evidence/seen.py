@@ -8,6 +8,7 @@ import numpy as np
 from prior_sg.schemas.features import Pyramid
 from prior_sg.services.segmenter.core.config import Config
 from prior_sg.services.segmenter.core.evidence import handover, kernel
+from prior_sg.services.segmenter.core.evidence.archive import FrameArchive, integrate_all
 from prior_sg.services.segmenter.core.evidence.handover import Spaces
 
 RESTING_TICKS = 2  # without a pyramid, after which the map rests
@@ -19,7 +20,7 @@ class Seen:
 
     spaces: Spaces
     query_radius_m: float  # r_Q with which the evidence was integrated
-    archive: kernel.Archive = field(default_factory=kernel.Archive)
+    archive: FrameArchive = field(default_factory=FrameArchive)
     evidence: kernel.Evidence = field(default_factory=kernel.Evidence)
     ignored_pyramids: int = 0  # repeated, or not of this space
 
@@ -46,7 +47,7 @@ class Seen:
         self.evidence.add(place_ids.tolist())
         slots = self.evidence.of(place_ids.tolist())
         targets = kernel.Targets(slots, positions_m)
-        kernel.integrate_all(self.evidence, self.archive, targets, self.query_radius_m, cfg.kernel)
+        integrate_all(self.evidence, self.archive, targets, self.query_radius_m, cfg.kernel)
         return slots
 
     def move(self, poses: Mapping[int, np.ndarray], positions_m: np.ndarray, cfg: Config) -> np.ndarray:
@@ -61,7 +62,7 @@ class Seen:
     def succeed(self, name: str, targets: kernel.Targets, cfg: Config) -> bool:
         """Put another space in force if its frames cover the targets; otherwise it is tried again when it has grown."""
         evidence, archive = self.evidence.blank(), self.spaces.rivals[name].archive
-        kernel.integrate_all(evidence, archive, targets, self.query_radius_m, cfg.kernel)
+        integrate_all(evidence, archive, targets, self.query_radius_m, cfg.kernel)
         if not handover.covers(evidence, self.evidence, targets.slots, cfg.spaces):
             handover.refuse(self.spaces, name)
             return False

@@ -9,7 +9,7 @@ from prior_sg.schemas.places import PlaceDelta
 from prior_sg.services.deltas import Follower
 from prior_sg.services.segmenter.core.config import Config
 from prior_sg.services.segmenter.core.map import inclination
-from prior_sg.services.segmenter.core.map.received import PlaceGraph, Step, apply, with_neighbours
+from prior_sg.services.segmenter.core.map.received import ReceivedGraph, Step, apply, with_neighbours
 from prior_sg.services.segmenter.core.map.table import Places
 
 
@@ -28,7 +28,7 @@ class PlaceMap:
 
     follower: Follower[PlaceDelta] = field(default_factory=Follower)
     epoch: int = -1  # of the graph's writer
-    graph: PlaceGraph = field(default_factory=PlaceGraph)
+    graph: ReceivedGraph = field(default_factory=ReceivedGraph)
     weights: np.ndarray = field(default_factory=lambda: np.zeros(0))  # (edge,) w_dist
     places: Places = field(default_factory=Places.none)
     asked_snapshot: bool = False
@@ -66,7 +66,7 @@ class PlaceMap:
         self.places = self.places.relabelled(labels)
 
 
-def edge_weights(graph: PlaceGraph, cfg: Config) -> np.ndarray:
+def edge_weights(graph: ReceivedGraph, cfg: Config) -> np.ndarray:
     """w_dist (edge,) of eq. pairwise_potential: falls with length, then scaled symmetrically.
 
     With w and the sums of w at both ends, d_u and d_v, the weight is edge_sum w / sqrt(d_u d_v): a place is held by its

@@ -9,7 +9,8 @@ from prior_sg.schemas.objects import Detections, ObjectDelta
 from prior_sg.schemas.priors import Prior
 from prior_sg.services.segmenter.core.experts.context import ObjectView
 from prior_sg.services.segmenter.core.objects import tracks
-from prior_sg.services.segmenter.core.objects.names import Named, ObjectLedger
+from prior_sg.services.segmenter.core.objects.ledger import ObjectLedger
+from prior_sg.services.segmenter.core.objects.names import Named
 from prior_sg.services.segmenter.core.objects.tracks import TrackingConfig, Tracks
 
 

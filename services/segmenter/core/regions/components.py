@@ -10,7 +10,7 @@ from scipy.spatial import ConvexHull, cKDTree
 
 from prior_sg.schemas.regions import RegionEvent, Transition
 from prior_sg.services.segmenter.core.experts.context import ObjectView
-from prior_sg.services.segmenter.core.map.received import PlaceGraph
+from prior_sg.services.segmenter.core.map.received import ReceivedGraph
 
 NO_REGION = -1
 HULL_CORNERS = 8  # of the polygon that stands for a sphere in a hull
@@ -155,7 +155,7 @@ class Border(NamedTuple):
     transitions: dict[int, list[Transition]]
 
 
-def border(graph: PlaceGraph, region_of: np.ndarray, ids: set[int], door_clearance_m: float) -> Border:
+def border(graph: ReceivedGraph, region_of: np.ndarray, ids: set[int], door_clearance_m: float) -> Border:
     """Neighbours and transitions of the regions `ids`; `region_of` (place,).
 
     Edges across a border that lie side by side are one way. It counts as a door where even the widest of them has at
