@@ -1,5 +1,6 @@
 """The whole method in the calling process: frames in, a scene graph out, no bus, no processes, no threads of ours."""
 
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
@@ -37,6 +38,7 @@ from prior_sg.schemas.topics import (
 from prior_sg.services.ingest.core.selection import BadFrame, Correction, RawFrame
 from prior_sg.services.ingest.sources import Source, SourceError, open_source
 from prior_sg.services.registry import SERVICES
+from prior_sg.services.runtime import extras
 from prior_sg.services.runtime.client import NoPriorError
 from prior_sg.services.runtime.config import ConfigError, check_sections, resolve
 from prior_sg.services.runtime.runner import Pipeline, Published, Runner
@@ -241,7 +243,13 @@ class Mapper:
         place_graph = self._pipeline.of("place_graph")
         voxels: VoxelMap = place_graph.answer(VOXEL_MAP, MapRequest(robot=self.robot))
         scene.to_json(folder / "scene.json")
-        export.save_spark_dsg(scene.message, folder / "dsg.json")
+        try:
+            extras.require("dsg", "dsg.json")
+            from prior_sg.deploy.showing.dsg import save_spark_dsg
+
+            save_spark_dsg(scene.message, folder / "dsg.json")
+        except extras.ExtraMissing as error:
+            warnings.warn(f"saved without dsg.json: {error}", stacklevel=3)
         export.map_png(scene.message, voxels, folder / "map.png")
         export.places_png(scene.message, voxels, folder / "map-3d.png")
 
@@ -268,7 +276,7 @@ def _pipeline(robot: str, settings: Mapping[str, Any]) -> Pipeline:
     return Pipeline([_runner(service, robot, configs[service.name]) for service in SERVICES])
 
 
-def _runner(service: Service, robot: str, cfg: Any) -> Runner:
+def _runner(service: Service[Any, Any], robot: str, cfg: Any) -> Runner:
     identity = Identity(robot if service.scope == "robot" else "*", service.name, 1)
     answers = {errand: ERRANDS[errand.request] for errand in service.errands if errand.request in ERRANDS}
     return Runner(service, cfg, identity, dict[Any, Any](answers), wire=True)

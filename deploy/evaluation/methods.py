@@ -22,10 +22,11 @@ from prior_sg.schemas.topics import DETECTIONS, PLACE_DELTA, PRIOR, PYRAMID, SCE
 from prior_sg.services.registry import BY_NAME
 from prior_sg.services.runtime.runner import Pipeline, Runner
 from prior_sg.services.runtime.service import Identity
+from prior_sg.services.segmenter.core.aim import region_concepts
+from prior_sg.services.segmenter.core.config import Config
 from prior_sg.services.segmenter.core.experts import REGISTRY
 from prior_sg.services.segmenter.core.inference import see_objects
-from prior_sg.services.segmenter.core.state import Config, State
-from prior_sg.services.segmenter.core.update import region_concepts
+from prior_sg.services.segmenter.core.state import State
 
 NEVER_M, ANY_SCALE = 1e6, 1e9
 
@@ -205,11 +206,11 @@ def _true_pyramids(case: Case, object_phrases: int) -> list[Pyramid]:
 def _see_truth(case: Case, state: State, object_phrases: int) -> None:
     """Observed places inside a true region are as if its text had been seen there."""
     labels = {region.id: region.label for region in case.truth.regions}
-    concepts, evidence = _concepts(case, object_phrases), state.evidence
-    slots = evidence.of(state.graph.ids.tolist())
-    for slot, region in zip(slots.tolist(), case.truth.region_of(state.graph.positions_m).tolist(), strict=True):
-        if evidence.frames[slot] and labels.get(region) in concepts:
-            evidence.sums[slot] = concepts[labels[region]]
+    concepts, graph = _concepts(case, object_phrases), state.map.graph
+    names = [labels.get(region, "") for region in case.truth.region_of(graph.positions_m).tolist()]
+    rows = [row for row, name in enumerate(names) if name in concepts]
+    if rows:
+        state.seen.pretend(graph.ids[rows], np.array([concepts[names[row]] for row in rows]))
 
 
 def _see_true_objects(case: Case, state: State, config: Config) -> None:

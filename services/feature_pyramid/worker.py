@@ -18,7 +18,7 @@ from prior_sg.services.feature_pyramid.core.upright import quarter_turns, turned
 from prior_sg.services.feature_pyramid.decode import BrokenImage, blank, read_color, read_depth
 from prior_sg.services.feature_pyramid.detectors.base import Detector, Found, Shot
 from prior_sg.services.feature_pyramid.encoders.base import Encoder
-from prior_sg.services.intent import Vocabulary
+from prior_sg.services.intent import Intent
 
 
 class View(NamedTuple):
@@ -40,7 +40,7 @@ class Worker:
     instance: str
     encoder: Encoder
     detector: Detector
-    vocabulary: Vocabulary = field(default_factory=Vocabulary)
+    vocabulary: Intent = field(default_factory=Intent)
     broken: int = 0
     reader: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(1, thread_name_prefix="reader"))
     views: dict[tuple[str, int], Future[View]] = field(default_factory=dict)  # by robot and frame

@@ -31,8 +31,9 @@ from prior_sg.schemas.topics import (
 )
 from prior_sg.services.runtime.service import Ask, Identity, Output, Service, ServiceError
 from prior_sg.services.segmenter.core import report, update
+from prior_sg.services.segmenter.core.config import Config
 from prior_sg.services.segmenter.core.energy.maxflow import NoSuchLibrary, min_cut_in_use
-from prior_sg.services.segmenter.core.state import Config, State, empty
+from prior_sg.services.segmenter.core.state import State, empty
 
 log = logging.getLogger(__name__)
 QUESTIONS = {
@@ -66,7 +67,7 @@ def answer_snapshot(state: State, request: SnapshotRequest, cfg: Config) -> Regi
 
 def answer_objects(state: State, request: SnapshotRequest, cfg: Config) -> ObjectDelta:
     """All objects published so far."""
-    return state.object_ledger.snapshot(state.robot, state.epoch)
+    return state.objects.ledger.snapshot(state.robot, state.epoch)
 
 
 def answer_posterior(state: State, request: PosteriorRequest, cfg: Config) -> PosteriorReply:

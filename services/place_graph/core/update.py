@@ -14,6 +14,7 @@ import numpy as np
 from prior_sg.schemas.frames import Keyframe, PoseUpdate
 from prior_sg.schemas.places import PlaceDelta, VoxelMap
 from prior_sg.services import images
+from prior_sg.services.deltas import PoseCorrections
 from prior_sg.services.place_graph.core.archive import Archive, Kept, moved
 from prior_sg.services.place_graph.core.config import Config
 from prior_sg.services.place_graph.core.ground import GroundGraph, GroundRules
@@ -42,8 +43,7 @@ class State:
     track: Track = field(default_factory=Track)
     cameras_m: dict[int, tuple[float, float, float]] = field(default_factory=dict)  # by frame id, of those fused
     seen: set[int] = field(default_factory=set)  # frame ids of all keyframes, also the refused
-    corrected: dict[int, np.ndarray] = field(default_factory=dict)  # newest pose given to a frame by an update
-    updates: dict[int, int] = field(default_factory=dict)  # newest revision of pose updates, by epoch
+    corrections: PoseCorrections = field(default_factory=PoseCorrections)
     rejected: int = 0  # keyframes that could not be used
     joined_frame_id: int = 0  # first keyframe heard live; earlier ones come from the archive
     revision: int = -1
@@ -91,12 +91,12 @@ def integrate(state: State, keyframe: Keyframe, cfg: Config) -> PlaceDelta:
     A keyframe that cannot be used leaves the map as it is; the delta's `event` says why. One whose pose has jumped is
     kept, for a pose update or the keyframes that follow may show where it was taken.
     """
-    keyframe = moved(keyframe, state.corrected.get(keyframe.frame_id, keyframe.world_from_camera))
+    keyframe = moved(keyframe, state.corrections.pose(keyframe.frame_id, keyframe.world_from_camera))
     try:
         depth_m = _usable_depth(keyframe, cfg)
     except images.ImageFault as fault:
         return reject(state, keyframe, str(fault), cfg)
-    jump_m = 0.0 if keyframe.frame_id in state.corrected else state.track.jump_m(keyframe, cfg.bounds)
+    jump_m = 0.0 if keyframe.frame_id in state.corrections else state.track.jump_m(keyframe, cfg.bounds)
     if jump_m and (reason := _distrust(state, keyframe, depth_m, jump_m, cfg)):
         state.archive.put(keyframe, fused=False)
         return reject(state, keyframe, reason, cfg)
@@ -117,11 +117,9 @@ def correct(state: State, update: PoseUpdate, cfg: Config) -> PlaceDelta | None:
     None when the update has been seen before. Keyframes that are still to come are moved when they come; those that
     the archive no longer holds stay where they are, which the delta's `event` says.
     """
-    if update.revision <= state.updates.get(update.epoch, -1):
+    poses = state.corrections.take(update)
+    if poses is None:
         return None
-    state.updates[update.epoch] = update.revision
-    poses = dict(zip(update.frame_ids.tolist(), np.array(update.world_from_camera), strict=True))
-    state.corrected.update(poses)
     changed = [np.empty((0, 3), np.int64)]
     moved_ids, lost = [], 0
     for frame_id, pose in sorted(poses.items()):

@@ -25,8 +25,8 @@ from prior_sg.schemas.codec import encode
 from prior_sg.schemas.places import VoxelMap
 from prior_sg.schemas.priors import ObjectPrior
 from prior_sg.schemas.topics import PLACE_DELTA
+from prior_sg.services.segmenter.core.config import Config
 from prior_sg.services.segmenter.core.experts import REGISTRY
-from prior_sg.services.segmenter.core.state import Config
 from tests.help.paths import SAMPLE
 from tests.help.world import DIM, ROBOT, ROOM_M, SPACE, place_delta, place_grid, prior, text, walk
 from tests.services.segmenter.test_objects import BED, OVEN, sight

@@ -426,7 +426,7 @@ def test_a_keyframe_made_ready_before_the_prior_changed_is_looked_at_again():
 
 
 def test_the_newest_task_and_the_newest_prior_for_it_count():
-    known = intent.Vocabulary()
+    known = intent.Intent()
     home = prior(["kitchen"])
     first, second = (
         task(robot="ada", stamp_ns=stamp, environment="e", task=name) for stamp, name in ((5, "a"), (7, "b"))
@@ -446,7 +446,7 @@ def test_the_newest_task_and_the_newest_prior_for_it_count():
 
 
 def test_priors_that_answer_a_task_are_remembered_longest_and_asked_for_again():
-    known, home = intent.Vocabulary(), prior(["kitchen"])
+    known, home = intent.Intent(), prior(["kitchen"])
     intent.hear(known, task(robot="ada", environment=home.environment, task=home.task))
     assert len(list(intent.questions(known, "ada"))) == len(list(intent.questions(known, "ada"))) == 1
     intent.hear(known, home)

@@ -10,8 +10,8 @@ from prior_sg.services.prior_gateway.core import learning
 from prior_sg.services.runtime.runner import Runner
 from prior_sg.services.runtime.service import Identity
 from prior_sg.services.segmenter.core import prior_evidence
+from prior_sg.services.segmenter.core.config import Config
 from prior_sg.services.segmenter.core.experts.context import ObjectView
-from prior_sg.services.segmenter.core.state import Config
 from prior_sg.services.segmenter.service import SERVICE
 from tests.help.world import ROBOT, place_delta, place_grid, prior, task, text, walk
 
@@ -92,7 +92,9 @@ def seen_with(weight: float) -> PriorEvidence:
     runner = segmenter(cfg)
     runner.feed(place_delta(positions, edges), task(), prior(ROOMS), *walk(3), TICK)
     state = runner.state
-    state.objects = ObjectView(np.array([1]), np.array([[2.0, 2.0, 0.5]]), np.array([[0.9, 0.1]]), np.array([weight]))
+    state.objects.view = ObjectView(
+        np.array([1]), np.array([[2.0, 2.0, 0.5]]), np.array([[0.9, 0.1]]), np.array([weight])
+    )
     return decode(PriorEvidence, encode(prior_evidence.evidence(state, cfg)))
 
 

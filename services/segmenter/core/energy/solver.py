@@ -7,8 +7,9 @@
 The caller says which places changed (`dirty`: those with another unary cost, other edges, other weights or a
 neighbour that is gone; new places too), or leaves it to the solver, which then compares the field with the last one.
 Row numbers may change between updates: `previous` says which row each place had (-1: a new place), as
-`graph.Step.previous` does. A place without a label yet has label -1; labels may be others than the solver's last. The
-solver keeps references to the field's arrays, not copies: where they are changed in place, `dirty` must be given.
+`map.received.Step.previous` does. A place without a label yet has label -1; labels may be others than the solver's
+last. The solver keeps references to the field's arrays, not copies: where they are changed in place, `dirty` must be
+given.
 
 The change is solved as a local problem with fixed surroundings, which grows while labels at its border change:
 
@@ -201,6 +202,17 @@ class Solver:
             )
             if self._propose(rows, self.settings.round_trips, expired):
                 self._unproposed = self._unproposed[:0]
+
+
+def minimise(field: Field, labels: np.ndarray, settings: Settings | None = None) -> np.ndarray:
+    """Labels (place,) from which no alpha-beta-swap lowers the energy; it is at most that of `labels`.
+
+    Message passing proposes a labelling for the whole field, which replaces `labels` wherever that lowers the energy;
+    then swaps run until none is left that gains. (An idle `Solver` goes on from there.)
+    """
+    solver = Solver(msgspec.structs.replace(settings or Settings(), worn_share=np.inf))
+    solver.take(field, labels)
+    return solver.drain()
 
 
 @njit(cache=True, nogil=True)
