@@ -5,23 +5,23 @@ and the Voronoi diagram around changed voxels, extract places there again, give 
 Or its 2D places, pieces of ground, which need the map only.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
 from prior_sg.schemas.frames import Keyframe, PoseUpdate
 from prior_sg.schemas.places import PlaceDelta, VoxelMap
 from prior_sg.services import images
-from prior_sg.services.place_graph.core.archive import Archive, Kept, moved
+from prior_sg.services.place_graph.core.archive import DepthArchive, Kept, moved
+from prior_sg.services.place_graph.core.columns import CameraColumns, GroundColumns, Heading, no_ground, place_delta
 from prior_sg.services.place_graph.core.config import Config
 from prior_sg.services.place_graph.core.ground import GroundGraph, GroundRules
-from prior_sg.services.place_graph.core.ledger import Published
+from prior_sg.services.place_graph.core.ledger import PlaceLedger
 from prior_sg.services.place_graph.core.openings import Openings
 from prior_sg.services.place_graph.core.skeleton import distance, places
 from prior_sg.services.place_graph.core.skeleton.graph import Changes, PlaceGraph, Rules
-from prior_sg.services.place_graph.core.trajectory import Track
+from prior_sg.services.place_graph.core.trajectory import Trajectory
 from prior_sg.services.place_graph.core.volume import tsdf
 from prior_sg.services.place_graph.core.volume.grid import BLOCK, FREE, OCCUPIED, Box, VoxelGrid
 
@@ -35,11 +35,11 @@ class State:
     robot: str
     epoch: int
     graph: PlaceGraph
-    archive: Archive
+    archive: DepthArchive
     openings: Openings
     grid: VoxelGrid = field(default_factory=VoxelGrid)
-    published: Published = field(default_factory=Published)
-    track: Track = field(default_factory=Track)
+    ledger: PlaceLedger = field(default_factory=PlaceLedger)
+    trajectory: Trajectory = field(default_factory=Trajectory)
     cameras_m: dict[int, tuple[float, float, float]] = field(default_factory=dict)  # by frame id, of those fused
     seen: set[int] = field(default_factory=set)  # frame ids of all keyframes, also the refused
     corrected: dict[int, np.ndarray] = field(default_factory=dict)  # newest pose given to a frame by an update
@@ -54,7 +54,7 @@ class State:
 def empty(robot: str, epoch: int, cfg: Config) -> State:
     """A map without observations."""
     openings = Openings(int(1.5 * cfg.cell_voxels))
-    return State(robot, epoch, _no_places(cfg), Archive(cfg.archive_mb * 1e6), openings)
+    return State(robot, epoch, _no_places(cfg), DepthArchive(cfg.archive_mb * 1e6), openings)
 
 
 def _no_places(cfg: Config) -> PlaceGraph:
@@ -96,7 +96,7 @@ def integrate(state: State, keyframe: Keyframe, cfg: Config) -> PlaceDelta:
         depth_m = _usable_depth(keyframe, cfg)
     except images.ImageFault as fault:
         return reject(state, keyframe, str(fault), cfg)
-    jump_m = 0.0 if keyframe.frame_id in state.corrected else state.track.jump_m(keyframe, cfg.bounds)
+    jump_m = 0.0 if keyframe.frame_id in state.corrected else state.trajectory.jump_m(keyframe, cfg.bounds)
     if jump_m and (reason := _distrust(state, keyframe, depth_m, jump_m, cfg)):
         state.archive.put(keyframe, fused=False)
         return reject(state, keyframe, reason, cfg)
@@ -105,7 +105,7 @@ def integrate(state: State, keyframe: Keyframe, cfg: Config) -> PlaceDelta:
     if jump_m:
         event = f"believed again at keyframe {keyframe.frame_id}: the pose stays where it jumped to and fits the map"
         changed += _fuse_doubted(state, cfg)
-    state.track.believe(keyframe)
+    state.trajectory.believe(keyframe)
     changes = refresh(state, np.concatenate(changed), cfg)
     _leave_behind(state, keyframe, cfg)
     return _publish(state, keyframe, changes, cfg, event)
@@ -171,18 +171,12 @@ def refresh(state: State, changed: np.ndarray, cfg: Config) -> Changes:
 
 def snapshot(state: State, cfg: Config) -> PlaceDelta:
     """Everything published so far as one delta, ids ascending, at the last revision."""
-    fields = state.published.snapshot(cfg.voxel_m) | state.openings.all(cfg.voxel_m)
-    if isinstance(state.graph, GroundGraph):
-        fields |= state.graph.tell(state.published.places, cfg.voxel_m)
-    return PlaceDelta(
-        robot=state.robot,
-        epoch=state.epoch,
-        revision=state.revision,
-        stamp_ns=state.stamp_ns,
-        frame_id=state.frame_id,
-        snapshot=True,
-        **_cameras(state, sorted(state.cameras_m)),
-        **fields,
+    return place_delta(
+        Heading(state.robot, state.epoch, state.revision, state.stamp_ns, state.frame_id, snapshot=True),
+        state.ledger.snapshot(cfg.voxel_m),
+        state.openings.snapshot(cfg.voxel_m),
+        _shapes(state, state.ledger.places, cfg),
+        _cameras(state, sorted(state.cameras_m)),
     )
 
 
@@ -204,8 +198,8 @@ def _distrust(state: State, keyframe: Keyframe, depth_m: np.ndarray, jump_m: flo
     """Why a keyframe whose pose has jumped cannot be believed; empty when it can."""
     reason = f"its pose jumps by {jump_m:.2f} m"
     view = tsdf.View(depth_m, keyframe.intrinsics, keyframe.world_from_camera)
-    state.track.doubt(keyframe, cfg.bounds, tsdf.contradiction(state.grid, view, cfg.fusion))
-    latest = state.track.contradictions[-cfg.relocalised_after :]
+    state.trajectory.doubt(keyframe, cfg.bounds, tsdf.contradiction(state.grid, view, cfg.fusion))
+    latest = state.trajectory.contradictions[-cfg.relocalised_after :]
     if len(latest) < cfg.relocalised_after:
         return reason
     share = float(np.mean(latest))
@@ -216,7 +210,7 @@ def _order(state: State, keyframe: Keyframe) -> str:
     """What to say of a keyframe that is late; the map does not mind the order."""
     if state.joined_frame_id and keyframe.frame_id < state.joined_frame_id:
         return ""  # fetched from the archive
-    late_s = (state.track.newest_ns - keyframe.stamp_ns) / 1e9
+    late_s = (state.trajectory.newest_ns - keyframe.stamp_ns) / 1e9
     return f"keyframe {keyframe.frame_id} is out of order by {late_s:.3f} s; fused all the same" if late_s > 0 else ""
 
 
@@ -229,18 +223,18 @@ def _fuse_kept(state: State, keyframe: Keyframe, depth_m: np.ndarray, cfg: Confi
 
 def _fuse_doubted(state: State, cfg: Config) -> Iterator[np.ndarray]:
     """Fuse the keyframes of a jump that has turned out to be right."""
-    for frame_id in state.track.astray_ids():
+    for frame_id in state.trajectory.astray_ids():
         kept = state.archive.get(frame_id)
         if kept is not None and not kept.fused:
-            state.track.correct(kept.keyframe)
+            state.trajectory.correct(kept.keyframe)
             yield _fuse_kept(state, kept.keyframe, images.depth_of(kept.keyframe, cfg.max_principal_offset), cfg)
 
 
 def _reconsidered(state: State, cfg: Config) -> Iterator[np.ndarray]:
     """Fuse keyframes that were refused beside wrong poses and fit the corrected ones."""
     for keyframe in list(state.archive.unfused()):
-        if not state.track.jump_m(keyframe, cfg.bounds):
-            state.track.believe(keyframe)
+        if not state.trajectory.jump_m(keyframe, cfg.bounds):
+            state.trajectory.believe(keyframe)
             yield _fuse_kept(state, keyframe, images.depth_of(keyframe, cfg.max_principal_offset), cfg)
 
 
@@ -253,7 +247,7 @@ def _move(state: State, kept: Kept, world_from_camera: np.ndarray, cfg: Config) 
     if kept.fused:
         yield fuse(state, kept.keyframe, depth_m, cfg, tsdf.REMOVE)
     yield _fuse_kept(state, there, depth_m, cfg)
-    state.track.correct(there)
+    state.trajectory.correct(there)
 
 
 def _leave_behind(state: State, keyframe: Keyframe, cfg: Config) -> None:
@@ -332,29 +326,26 @@ def _delta(
     moved_ids: Sequence[int] = (),
 ) -> PlaceDelta:
     state.revision += 1
-    fields = state.published.update(state.graph, changes, cfg.voxel_m, cfg.min_component_size, cfg.min_diff_m)
-    shown = state.published.places
-    gone = (*fields["removed_ids"].tolist(), *fields["merged_ids"][:, 0].tolist())
-    looked_at = changes.opened.union(fields["place_ids"].tolist(), gone)
-    fields |= state.openings.tell(looked_at, shown, cfg.voxel_m, cfg.frontier_min_area_m2)
-    if isinstance(state.graph, GroundGraph):
-        fields |= state.graph.tell(shown.keys() & changes.touched.union(fields["place_ids"].tolist()), cfg.voxel_m)
+    graph = state.ledger.update(state.graph, changes, cfg.voxel_m, cfg.min_component_size, cfg.min_diff_m)
+    shown, told_ids = state.ledger.places, graph.places.place_ids.tolist()
+    looked_at = changes.opened.union(told_ids, graph.gone.place_ids)
+    openings = state.openings.update(looked_at, shown, cfg.voxel_m, cfg.frontier_min_area_m2)
     state.openings.forget(i for i in changes.touched if i not in state.graph.places)
-    return PlaceDelta(
-        robot=state.robot,
-        epoch=state.epoch,
-        revision=state.revision,
-        stamp_ns=stamp_ns,
-        frame_id=state.frame_id,
-        camera_m=camera_m,
-        event=event,
-        **_cameras(state, moved_ids),
-        **fields,
+    return place_delta(
+        Heading(state.robot, state.epoch, state.revision, stamp_ns, state.frame_id, camera_m=camera_m, event=event),
+        graph,
+        openings,
+        _shapes(state, shown.keys() & changes.touched.union(told_ids), cfg),
+        _cameras(state, moved_ids),
     )
 
 
-def _cameras(state: State, frame_ids: Sequence[int]) -> dict[str, Any]:
-    return {
-        "past_frame_ids": np.array(frame_ids, np.int64),
-        "past_cameras_m": np.array([state.cameras_m[i] for i in frame_ids], np.float32).reshape(-1, 3),
-    }
+def _shapes(state: State, ids: Iterable[int], cfg: Config) -> GroundColumns:
+    return state.graph.shapes(ids, cfg.voxel_m) if isinstance(state.graph, GroundGraph) else no_ground()
+
+
+def _cameras(state: State, frame_ids: Sequence[int]) -> CameraColumns:
+    return CameraColumns(
+        past_frame_ids=np.array(frame_ids, np.int64),
+        past_cameras_m=np.array([state.cameras_m[i] for i in frame_ids], np.float32).reshape(-1, 3),
+    )

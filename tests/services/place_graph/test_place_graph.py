@@ -566,15 +566,15 @@ def test_memory_is_bounded_and_places_of_dropped_space_stay_until_seen_again(roo
     assert max(sizes) <= 3.0e6 and state.graph.frozen
     one, _ = room
     told = ask(state)
-    assert len(told.place_ids) > 4 * len(one.published.places) and parts(told) == 6
+    assert len(told.place_ids) > 4 * len(one.ledger.places) and parts(told) == 6
     frozen = set(state.graph.frozen)
-    assert {p for i, p in state.published.places.items() if i in frozen} <= set(state.published.places.values())
+    assert {p for i, p in state.ledger.places.items() if i in frozen} <= set(state.ledger.places.values())
     first = {i for i, x in zip(told.place_ids.tolist(), told.positions_m[:, 0].tolist(), strict=True) if x < 6}
     assert first & frozen
     play(state, shifted(ROOM_WALK, 0.0, 1000), small)  # back at the first room: the same places under the same ids
     again = ask(state)
     now = {i for i, x in zip(again.place_ids.tolist(), again.positions_m[:, 0].tolist(), strict=True) if x < 6}
-    assert len(first & now) >= 0.7 * len(now) and len(now) == len(one.published.places)
+    assert len(first & now) >= 0.7 * len(now) and len(now) == len(one.ledger.places)
     assert not {i for i in now if i in state.graph.frozen}
 
 
