@@ -1,9 +1,13 @@
-"""Settings of the place graph, under Hydra's names where Hydra has them (pure)."""
+"""Settings of the place graph, under Hydra's names where Hydra has them, and the rules they make in voxels (pure)."""
 
 from typing import Any, ClassVar, Literal
 
 import msgspec
 
+from prior_sg.services.place_graph.core.ground import GroundRules
+from prior_sg.services.place_graph.core.skeleton.distance import FieldRules
+from prior_sg.services.place_graph.core.skeleton.graph import GraphRules
+from prior_sg.services.place_graph.core.skeleton.places import ExtractionRules
 from prior_sg.services.place_graph.core.trajectory import Bounds
 from prior_sg.services.place_graph.core.volume import tsdf
 
@@ -163,6 +167,55 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
             max_range_m=self.max_range_m,
             max_weight=self.max_weight,
             constant_weight=self.use_constant_weight,
+        )
+
+    @property
+    def field_rules(self) -> FieldRules:
+        """How far distances reach and what is on the diagram."""
+        return FieldRules(
+            max_distance=self.voxels(self.max_distance_m),
+            voronoi_min_distance=self.voxels(max(self.voronoi_min_distance_m, self.min_distance_m)),
+            parent_l1=self.parent_l1_separation,
+            parent_cos=self.parent_cos_angle_separation,
+        )
+
+    @property
+    def extraction_rules(self) -> ExtractionRules:
+        """What becomes a place."""
+        return ExtractionRules(
+            cell=self.cell_voxels,
+            min_radius=self.voxels(self.min_node_distance_m),
+            merge=self.voxels(self.node_merge_distance_m),
+            widest=self.merge_policy == "distance",
+        )
+
+    @property
+    def graph_rules(self) -> GraphRules:
+        """What makes places one and what joins them."""
+        return GraphRules(
+            cell=self.cell_voxels,
+            merge=self.voxels(self.node_merge_distance_m),
+            edge=self.voxels(self.min_edge_distance_m),
+            reach=self.voxels(self.freespace_max_length_m) if self.add_freespace_edges else 0.0,
+            free=self.voxels(self.freespace_min_clearance_m),
+            check=self.freespace_num_nodes_to_check,
+            find=self.freespace_num_neighbors_to_find,
+            overlap=self.voxels(self.overlap_min_clearance_m),
+            overlap_check=self.overlap_num_neighbors_to_check if self.add_overlap_edges else 0,
+        )
+
+    @property
+    def ground_rules(self) -> GroundRules:
+        """What is ground and how it is divided."""
+        return GroundRules(
+            clearance=round(self.voxels(self.surface_min_clearance_m)),
+            step=max(1, round(self.voxels(self.surface_max_step_m))),
+            slope=self.surface_max_slope,
+            piece=self.voxels(self.pure_final_place_size_m),
+            points=self.min_final_place_points,
+            cluster=round(self.min_cluster_area_m2 / self.voxel_m**2),
+            overlap=self.voxels(self.place_overlap_threshold_m),
+            rise=self.voxels(self.place_max_neighbor_z_diff_m),
         )
 
     @property

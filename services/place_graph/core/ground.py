@@ -17,7 +17,7 @@ import numpy as np
 from numba import njit
 
 from prior_sg.services.place_graph.core.columns import GroundColumns
-from prior_sg.services.place_graph.core.skeleton.graph import Changes, Place, PlaceGraph, Rules, Voxel
+from prior_sg.services.place_graph.core.skeleton.graph import Changes, GraphRules, Place, PlaceGraph, Voxel
 from prior_sg.services.place_graph.core.volume.grid import FREE, OCCUPIED, Box, VoxelGrid
 
 TILE_PIECES = 4  # side of a tile in pieces of the final size
@@ -57,7 +57,7 @@ class GroundGraph(PlaceGraph):
     """Places on the ground with lasting ids, and the edges between them."""
 
     def __init__(self, rules: GroundRules) -> None:
-        super().__init__(Rules(cell=max(1, round(rules.piece)), merge=rules.piece, edge=0, reach=0, free=0))
+        super().__init__(GraphRules(cell=max(1, round(rules.piece)), merge=rules.piece, edge=0, reach=0, free=0))
         self.ground = rules
         self.pieces: dict[int, Piece] = {}
 
