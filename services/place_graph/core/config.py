@@ -4,6 +4,7 @@ from typing import Any, ClassVar, Literal
 
 import msgspec
 
+from prior_sg.services.images import MAX_PRINCIPAL_OFFSET
 from prior_sg.services.place_graph.core.ground import GroundRules
 from prior_sg.services.place_graph.core.skeleton.distance import FieldRules
 from prior_sg.services.place_graph.core.skeleton.graph import GraphRules
@@ -140,7 +141,7 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
     relocalised_after: int = 5  # keyframes that go on from a jump before it is believed ...
     max_contradiction: float = 0.4  # ... unless more of their depth contradicts the map: 0.1 to 0.33 with true poses of
     # the development sequences, above 0.58 half a metre beside them
-    max_principal_offset: float = 0.2  # share of the image by which the principal point may be off its middle
+    max_principal_offset: float = MAX_PRINCIPAL_OFFSET  # share by which the principal point may be off the middle
 
     def __post_init__(self) -> None:
         if not 0 < self.voxel_m <= min(self.truncation_m, self.compression_distance_m):
