@@ -1,28 +1,33 @@
 """The place graph: time per keyframe, split by stage, against the size of the map, and memory."""
 
 import cProfile
-import pstats
 import resource
 import time
-from pathlib import Path
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import msgspec
 import numpy as np
 
 from prior_sg.schemas.frames import Keyframe
+from prior_sg.services import images
+from prior_sg.services.place_graph.core.ledger import PlaceLedger
+from prior_sg.services.place_graph.core.openings import Openings
+from prior_sg.services.place_graph.core.skeleton import distance, places
+from prior_sg.services.place_graph.core.skeleton.graph import PlaceGraph
+from prior_sg.services.place_graph.core.volume import tsdf
 from prior_sg.services.registry import BY_NAME
 from prior_sg.services.runtime.runner import Runner
 from prior_sg.services.runtime.service import Identity
 
-PLACE_STAGES = {  # functions of the place graph whose time makes a stage
-    "decode": ("images.depth_of",),
-    "fuse": ("tsdf.integrate",),
-    "distances": ("distance.refresh",),
-    "places": ("places.extract",),
-    "edges": ("graph.PlaceGraph.update",),
-    "frontiers": ("frontiers.Openings.renew",),
-    "publish": ("published.Published.update",),
+PLACE_STAGES: dict[str, Callable[..., Any]] = {  # the function of the place graph whose time makes a stage
+    "decode": images.depth_of,
+    "fuse": tsdf.integrate,
+    "distances": distance.refresh,
+    "places": places.extract,
+    "edges": PlaceGraph.update,
+    "frontiers": Openings.renew,
+    "publish": PlaceLedger.update,
 }
 LAP_M, MANY_PLACES = 25.6, 10_000  # a lap of the sample lies so far beside the one before, in whole blocks of voxels
 
@@ -64,20 +69,17 @@ def _lap_ms(keyframes: list[Keyframe], voxel_m: float) -> tuple[list[float], dic
     for keyframe in keyframes:
         runner.feed(keyframe)
     profile.disable()
-    seconds: dict[str, float] = {}
-    for (file, _, function), (*_, cumulative, _) in pstats.Stats(profile).stats.items():  # type: ignore[attr-defined]
-        seconds[f"{Path(file).stem}.{function}"] = cumulative
-    stages = {
-        f"stage_ms_{stage}": 1e3 * sum(seconds.get(_bare(name), 0.0) for name in names) / len(keyframes)
-        for stage, names in PLACE_STAGES.items()
-    }
-    return spent, stages
+    spent_s = stages_s(profile, PLACE_STAGES)
+    return spent, {f"stage_ms_{stage}": 1e3 * seconds / len(keyframes) for stage, seconds in spent_s.items()}
 
 
-def _bare(name: str) -> str:
-    """Module and function, without the class: what the profiler knows."""
-    module, *_, function = name.split(".")
-    return f"{module}.{function}"
+def stages_s(profile: cProfile.Profile, stages: Mapping[str, Callable[..., Any]]) -> dict[str, float]:
+    """Seconds that each stage's function took, what it calls included. Raises RuntimeError if one was never called."""
+    called = {entry.code: entry.totaltime for entry in profile.getstats()}
+    missing = [stage for stage, function in stages.items() if function.__code__ not in called]
+    if missing:
+        raise RuntimeError(f"the place graph never calls the functions of these stages: {', '.join(missing)}")
+    return {stage: called[function.__code__] for stage, function in stages.items()}
 
 
 def _growth(keyframes: list[Keyframe]) -> dict[str, float]:
