@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 from rich.table import Table
 
-from prior_sg.deploy.cli import priors
+from prior_sg.deploy.cli import packing, priors
+from prior_sg.deploy.cli.source_options import add_source_options, read_options, source_settings
 from prior_sg.deploy.evaluation import command as evaluation
 from prior_sg.deploy.running import serve
 from prior_sg.deploy.sample import SAMPLE
@@ -74,7 +75,7 @@ def _add_run_options(parser: argparse.ArgumentParser) -> None:
 def _settings(arguments: argparse.Namespace) -> list[str]:
     """Settings that run options stand for, then those given by --set."""
     places = [f"place_graph.places={arguments.places}"] if arguments.places else []
-    return [*places, *_encoder_settings(arguments.encoder), *arguments.set]
+    return [*places, *_encoder_settings(arguments.encoder), *source_settings(arguments), *arguments.set]
 
 
 Command = Callable[[str, str, str], argparse.ArgumentParser]
@@ -124,6 +125,7 @@ def _add_jobs(command: Command) -> None:
     run.add_argument("--out", type=Path, default=Path("out/run"), help="folder for the results")
     run.add_argument("--in-process", action="store_true", help="all services in this process, for debugging")
     _add_run_options(run)
+    add_source_options(run)
 
 
 def _add_live(command: Command) -> None:
@@ -134,6 +136,7 @@ def _add_live(command: Command) -> None:
     up.add_argument("--out", type=Path, default=Path("out/up"), help="folder for the database and logs")
     up.add_argument("--no-router", action="store_true", help="use the router at --connect instead of starting one")
     _add_run_options(up)
+    add_source_options(up)
 
     one = command("serve", "run one service in this process (what containers do)", "prior-sg serve segmenter")
     serve.add_arguments(one)
@@ -172,6 +175,12 @@ def _add_tools(command: Command) -> None:
     explain.add_argument("--log", type=Path, help="ask the segmenter at the end of this log, not the running one")
     explain.add_argument("--json", action="store_true", help="print JSON")
     _add_bus(explain)
+
+    packing.add_arguments(
+        command(
+            "pack", "write a source, read and put right, as one log", "prior-sg pack recordings/home home.mcap --rate 5"
+        )
+    )
 
     record = command("record", "record all topics into a log, until Ctrl-C", "prior-sg record out/log.mcap")
     record.add_argument("log", type=Path)
@@ -256,7 +265,9 @@ def cmd_run(arguments: argparse.Namespace) -> int:
 
     if not Path(arguments.source).exists():
         raise UserError(f"{arguments.source} does not exist")
-    truth = report.truth_of(arguments.source)  # also finds out at once whether the source is of a known layout
+    truth = report.truth_of(
+        arguments.source, read_options(arguments)
+    )  # also finds out at once whether the source is of a known layout
     job = Job(
         source=arguments.source,
         out=arguments.out,
@@ -294,7 +305,9 @@ def cmd_up(arguments: argparse.Namespace) -> int:
     make_folder(arguments.out)
     settings = [f"scene_store.path={arguments.out / 'scene.sqlite'}", f"ingest.speed={arguments.speed}"]
     if arguments.source:
-        report.truth_of(arguments.source)  # finds out at once whether the source is of a known layout
+        report.truth_of(
+            arguments.source, read_options(arguments)
+        )  # finds out at once whether the source is of a known layout
         settings.append(f"ingest.source={arguments.source}")
     settings += _settings(arguments)
     check_settings(arguments.config, settings)
@@ -475,6 +488,11 @@ def cmd_explain(arguments: argparse.Namespace) -> int:
     return 0
 
 
+def cmd_pack(arguments: argparse.Namespace) -> int:
+    """Write a source as one log."""
+    return packing.run(arguments, console)
+
+
 def cmd_record(arguments: argparse.Namespace) -> int:
     """Record until Ctrl-C or the given time."""
     from prior_sg.deploy.running.recorder import Recorder
@@ -644,7 +662,15 @@ def main(argv: list[str] | None = None) -> int:
     except BrokenPipeError:  # the reader of a pipe has left
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
-    except (UserError, priors.PriorError, RunError, ExportError, ChildFailed, *serve.HOPELESS) as error:
+    except (
+        UserError,
+        priors.PriorError,
+        packing.PackError,
+        RunError,
+        ExportError,
+        ChildFailed,
+        *serve.HOPELESS,
+    ) as error:
         print(f"prior-sg: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
