@@ -10,6 +10,8 @@ the boundary and nowhere else.
 """
 
 import struct
+import threading
+from collections.abc import Iterator
 from functools import cache
 from typing import Annotated, Any, ClassVar, TypeVar, get_args, get_origin, get_type_hints
 
@@ -38,6 +40,17 @@ class DecodeError(ValueError):
     """The payload is not a valid message of the expected type."""
 
 
+class Refused(bytes):
+    """In place of a payload that must not be decoded: empty, and `reason` says why in one sentence."""
+
+    reason: str
+
+    def __new__(cls, reason: str) -> "Refused":
+        refused = super().__new__(cls)
+        refused.reason = reason
+        return refused
+
+
 class Shape:
     """What an array field must look like: dtype, dimensions (names or lengths), and whether it must be finite."""
 
@@ -63,7 +76,8 @@ class Shape:
 
 
 class Message(msgspec.Struct, frozen=True, kw_only=True, eq=False):
-    """Base of everything that crosses the bus. New fields get defaults; fields never change name or type."""
+    """Base of everything that crosses the bus. New fields get defaults; what else changes is a new `VERSION`, see
+    schemas/migrations.py."""
 
     VERSION: ClassVar[int] = 1
 
@@ -101,6 +115,18 @@ def _array_fields(message_type: type[Message]) -> tuple[tuple[str, Shape], ...]:
 def schema_name(message_type: type[Message]) -> str:
     """Name and version that travel in the sample's encoding, for example `PlaceDelta/1`."""
     return f"{message_type.__name__}/{message_type.VERSION}"
+
+
+def message_types(base: type[Message] = Message) -> Iterator[type[Message]]:
+    """Every message type that is defined so far."""
+    for kind in base.__subclasses__():
+        yield kind
+        yield from message_types(kind)
+
+
+def versions() -> dict[str, int]:
+    """Version by name of the message types that are beyond the first."""
+    return {kind.__name__: kind.VERSION for kind in message_types() if kind.VERSION > 1}
 
 
 def _pack_array(array: np.ndarray) -> msgspec.msgpack.Ext:
@@ -153,9 +179,26 @@ def _ext_hook(code: int, data: memoryview) -> Any:
 _encoder = msgspec.msgpack.Encoder(enc_hook=_enc_hook)
 
 
-@cache
-def _decoder(message_type: type) -> msgspec.msgpack.Decoder:
-    return msgspec.msgpack.Decoder(message_type, dec_hook=_dec_hook, ext_hook=_ext_hook)
+_decoders: dict[Any, msgspec.msgpack.Decoder] = {}
+_building = threading.Lock()  # msgspec's descriptions of types, which decoders share, are not safe to build at once
+
+
+def _decoder(message_type: Any) -> msgspec.msgpack.Decoder:
+    found = _decoders.get(message_type)
+    if found is None:
+        with _building:
+            found = _decoders.get(message_type)
+            if found is None:
+                found = msgspec.msgpack.Decoder(message_type, dec_hook=_dec_hook, ext_hook=_ext_hook)
+                _decoders[message_type] = found
+    return found
+
+
+def prepare() -> None:
+    """Build now what decoding needs of every message type defined so far, those inside others included."""
+    for kind in message_types():
+        _array_fields(kind)
+        _decoder(kind)
 
 
 def encode(message: Message) -> bytes:
@@ -165,10 +208,26 @@ def encode(message: Message) -> bytes:
 
 def decode(message_type: type[M], payload: bytes | memoryview) -> M:
     """The message in `payload`, validated; its arrays point into `payload`. Raises DecodeError."""
+    if isinstance(payload, Refused):
+        raise DecodeError(payload.reason)
     try:
         return _decoder(message_type).decode(payload)
     except (msgspec.MsgspecError, ValueError, TypeError, OverflowError, RecursionError) as error:
         raise DecodeError(f"{schema_name(message_type)}: {error}") from error
+
+
+def decode_plain(payload: bytes | memoryview, schema: str) -> dict[str, Any]:
+    """The fields in `payload` by name, whatever they are; its arrays point into it. Raises DecodeError, which names
+    `schema`."""
+    try:
+        return _decoder(dict[str, Any]).decode(payload)
+    except (msgspec.MsgspecError, ValueError, TypeError, OverflowError, RecursionError) as error:
+        raise DecodeError(f"{schema}: {error}") from error
+
+
+def encode_plain(fields: dict[str, Any]) -> bytes:
+    """MessagePack of fields by name, arrays as in a message."""
+    return _encoder.encode(fields)
 
 
 def copied(message: M) -> M:

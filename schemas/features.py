@@ -7,6 +7,8 @@ import numpy as np
 from prior_sg.schemas.codec import Message, Shape
 from prior_sg.schemas.frames import Intrinsics, Pose, check_pose
 
+DEFAULT_SPACE = "conse/efficientnet-lite2/minilm-l6-v2"  # embedding space of encoders and readers told of no other
+
 
 class Pyramid(Message, frozen=True, kw_only=True):
     """The encoded crops of one keyframe, with all that integration needs: camera, pose and a coarse depth surface."""

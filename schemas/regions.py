@@ -7,6 +7,7 @@ import numpy as np
 
 from prior_sg.schemas.codec import Message, Shape
 
+NO_REGION = -1  # in place of a region id: not labelled yet
 _NO_IDS = msgspec.field(default_factory=lambda: np.zeros(0, np.int64))
 
 
@@ -70,7 +71,7 @@ class RegionDelta(Message, frozen=True, kw_only=True):
     regions: list[Region]
     removed_ids: Annotated[np.ndarray, Shape("int64", "removed")]
     place_ids: Annotated[np.ndarray, Shape("int64", "place")]
-    place_regions: Annotated[np.ndarray, Shape("int64", "place")]  # region id of each place
+    place_regions: Annotated[np.ndarray, Shape("int64", "place")]  # region id of each place, NO_REGION = none yet
     posteriors: Annotated[np.ndarray, Shape("float16", "place", "label")]
     unknown: Annotated[np.ndarray, Shape("float16", "place")]  # mass outside the prior's regions, or unobserved
     removed_place_ids: Annotated[np.ndarray, Shape("int64", "removed_place")]
@@ -126,7 +127,7 @@ class PosteriorReply(Message, frozen=True, kw_only=True):
     frames: int = 0  # keyframes that saw the place
     trust: float = 0.0  # sum of their trust
     position_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    region: int = -1
+    region: int = NO_REGION
     pull: list[float] = []  # one per label: pairwise cost against the neighbours
     neighbours: list[NeighbourPull] = []
     unknown: float = 1.0

@@ -48,7 +48,7 @@ class Scene(Message, frozen=True, kw_only=True):
     positions_m: Annotated[np.ndarray, Shape("float32", "place", 3)]
     radii_m: Annotated[np.ndarray, Shape("float32", "place")]
     basis_points: Annotated[np.ndarray, Shape("int16", "place")]
-    place_regions: Annotated[np.ndarray, Shape("int64", "place")]  # -1 = not labelled yet
+    place_regions: Annotated[np.ndarray, Shape("int64", "place")]  # NO_REGION = not labelled yet
     posteriors: Annotated[np.ndarray, Shape("float16", "place", "label")]
     unknown: Annotated[np.ndarray, Shape("float16", "place")]
     edges: Annotated[np.ndarray, Shape("int64", "edge", 2)]

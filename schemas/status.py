@@ -25,7 +25,9 @@ class Consumed(Message, frozen=True, kw_only=True):
 
 
 class Started(Message, frozen=True, kw_only=True):
-    """Opens a journal: everything replay needs to build the same state."""
+    """Opens a journal: everything replay needs to build the same state. It never goes beyond version 1: it tells those
+    of the messages that its journal holds `inline`.
+    """
 
     robot: str
     service: str
@@ -33,6 +35,7 @@ class Started(Message, frozen=True, kw_only=True):
     epoch: int
     config: bytes  # the resolved config as JSON
     reads: list[str] = []  # names of the topics it reads
+    versions: dict[str, int] = {}  # of messages, by name, where it is not 1
 
 
 class Tick(Message, frozen=True, kw_only=True):

@@ -8,10 +8,11 @@ Delivery is one word:
 - `job`: each message goes to one worker of a pool, at least once; results are idempotent.
 """
 
+import re
 from dataclasses import dataclass
 from typing import Literal
 
-from prior_sg.schemas.codec import Message
+from prior_sg.schemas.codec import Message, prepare
 from prior_sg.schemas.features import Backfill, Pyramid, TextEmbeddings, TextRequest
 from prior_sg.schemas.frames import ArchiveReply, ArchiveRequest, CameraState, IngestState, Keyframe, PoseUpdate
 from prior_sg.schemas.objects import Detections, ObjectDelta
@@ -30,6 +31,8 @@ from prior_sg.schemas.priors import (
 from prior_sg.schemas.regions import PosteriorReply, PosteriorRequest, RegionDelta
 from prior_sg.schemas.scene import Scene, SceneRequest, SceneRevision
 from prior_sg.schemas.status import Consumed, ServiceStatus, StatusRequest
+
+prepare()  # every process imports this table before it opens a bus, whose threads then find all decoders built
 
 ROOT = "psg"
 Delivery = Literal["latest", "every", "job"]
@@ -119,6 +122,14 @@ TOPICS = (
     JOURNAL,
 )
 
+_TOPIC_OF = {topic.type: topic for topic in TOPICS if topic.delivery != "job"}
+
+
+def topic_of(message_type: type[Message]) -> Topic | None:
+    """The topic on which messages of this type are published; None of those that are only asked, answered or fed."""
+    return _TOPIC_OF.get(message_type)
+
+
 ARCHIVE = Query("ARCHIVE", ArchiveRequest, ArchiveReply, f"{ROOT}/{{robot}}/ask/keyframes")
 PLACE_SNAPSHOT = Query("PLACE_SNAPSHOT", SnapshotRequest, PlaceDelta, f"{ROOT}/{{robot}}/ask/places")
 VOXEL_MAP = Query("VOXEL_MAP", MapRequest, VoxelMap, f"{ROOT}/{{robot}}/ask/voxels")
@@ -154,6 +165,19 @@ def alive_key(service: str, instance: str) -> str:
 def status_key(service: str, instance: str) -> str:
     """Where one process answers STATUS."""
     return f"{STATUS.key}/{service}/{instance}"
+
+
+_FIELD = re.compile(r"\\{\w+\\}")  # as `re.escape` leaves it
+_CALLS: tuple[tuple[re.Pattern[str], type[Message], type[Message] | None], ...] = (
+    *((re.compile(_FIELD.sub(".+", re.escape(q.key))), q.request, q.reply) for q in QUERIES),
+    (re.compile(f"{STATUS.key}/.+"), STATUS.request, STATUS.reply),
+    *((re.compile(f"{topic.key}/run/.+"), topic.type, None) for topic in TOPICS if topic.delivery == "job"),
+)
+
+
+def called_with(key: str) -> tuple[type[Message] | None, type[Message] | None]:
+    """Types of request and reply of a call on this key or key expression; None = not a message of the table."""
+    return next(((request, reply) for pattern, request, reply in _CALLS if pattern.fullmatch(key)), (None, None))
 
 
 def worker_keys(job: Topic, worker: str, group: str = "") -> tuple[str, str]:

@@ -17,9 +17,10 @@ import zenoh
 from rich.console import Console
 
 from prior_sg.deploy.cli import report
-from prior_sg.deploy.cli.main import SAMPLE, main
+from prior_sg.deploy.cli.main import main
 from prior_sg.deploy.inspecting.replay import compare, open_log
 from prior_sg.deploy.running.job import Job, run
+from prior_sg.deploy.sample import SAMPLE
 from prior_sg.schemas.codec import DecodeError, decode
 from prior_sg.schemas.topics import (
     BACKFILL,

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from prior_sg.deploy.running.supervisor import Supervisor
+from prior_sg.deploy.settings import DEMO_ENVIRONMENT, DEMO_TASK
 from prior_sg.schemas.codec import decode
 from prior_sg.schemas.features import Pyramid
 from prior_sg.schemas.frames import IngestState, Keyframe
@@ -197,7 +198,5 @@ def _start(supervisor: Supervisor, client: Client) -> None:
         if time.monotonic() > end_s:
             raise RuntimeError(f"the services did not start within {TIMEOUT_S:.0f} s")
         time.sleep(POLL_S)
-    client.give_task(
-        Task(robot=ROBOT, stamp_ns=1, environment="residential home", task="real-estate listing"), TIMEOUT_S
-    )
+    client.give_task(Task(robot=ROBOT, stamp_ns=1, environment=DEMO_ENVIRONMENT, task=DEMO_TASK), TIMEOUT_S)
     supervisor.start("ingest")

@@ -25,12 +25,14 @@ from prior_sg.schemas.features import Pyramid
 from prior_sg.schemas.frames import Keyframe
 from prior_sg.schemas.topics import ENCODE, PYRAMID
 from prior_sg.services.feature_pyramid.core import crops as core
+from prior_sg.services.feature_pyramid.core.config import Config
+from prior_sg.services.feature_pyramid.decode import read_color, read_depth
 from prior_sg.services.feature_pyramid.encoders.base import Options, load_encoder
 from prior_sg.services.feature_pyramid.encoders.conse import classifier_file, resized
 from prior_sg.services.feature_pyramid.encoders.onnx_session import Session
-from prior_sg.services.feature_pyramid.service import read_color, read_depth
 from prior_sg.services.runtime.bus import Sample
-from prior_sg.services.runtime.jobs.dispatcher import Ended, JobPool
+from prior_sg.services.runtime.jobs.board import Ended
+from prior_sg.services.runtime.jobs.pool import JobPool
 from prior_sg.services.runtime.zenoh_bus import ZenohBus, free_endpoint, open_router
 
 BATCHES = (1, 4, 16)
@@ -115,7 +117,7 @@ def numbered(keyframes: list[Keyframe]) -> Iterator[Keyframe]:
 def sample_crops(keyframes: list[Keyframe], count: int, side_px: int) -> np.ndarray:
     """Crops as the network sees them: uint8 (count, side, side, 3)."""
     crops: list[np.ndarray] = []
-    cfg = core.Config(smallest_crop_px=core.PUBLISHED_CROP_PX)
+    cfg = Config(smallest_crop_px=core.PUBLISHED_CROP_PX)
     for frame in keyframes:
         selection = core.select_crops(read_depth(frame), frame.intrinsics, cfg)
         crops += [resized(crop, side_px) for crop in selection.crops.cut(read_color(frame))]
@@ -151,7 +153,7 @@ def pool_rate(running: Pool, frames: Iterator[Keyframe], count: int) -> float:
 
 def features(keyframes: list[Keyframe]) -> tuple[dict, dict]:
     """The pool against the bare model, and ONNX Runtime against PyTorch, all on every core of this machine."""
-    cfg, cores = core.Config(), os.cpu_count() or 1
+    cfg, cores = Config(), os.cpu_count() or 1
     encoders = {
         runtime: load_encoder(cfg.space, Options(threads=cores, runtime=runtime)) for runtime in ("onnx", "torch")
     }

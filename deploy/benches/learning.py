@@ -14,11 +14,12 @@ import numpy as np
 from prior_sg.deploy.benches import homes
 from prior_sg.deploy.benches.homes import ROBOT, WIDTH, Home, Sight
 from prior_sg.deploy.evaluation.metrics import Overlap, scores_of
+from prior_sg.deploy.settings import DEMO_ENVIRONMENT, DEMO_TASK
 from prior_sg.schemas.features import TextRequest
 from prior_sg.schemas.priors import Prior, PriorEvidence, Task
 from prior_sg.schemas.status import Tick
-from prior_sg.services.prior_gateway.core import compose as gateway
 from prior_sg.services.prior_gateway.core import learning
+from prior_sg.services.prior_gateway.core.config import Config as GatewayConfig
 from prior_sg.services.prior_gateway.outside import library
 from prior_sg.services.segmenter.core import inference, prior_evidence, update
 from prior_sg.services.segmenter.core.regions.components import components
@@ -61,8 +62,8 @@ def learning_bench(worlds: int = WORLDS) -> tuple[dict[str, Any], dict[str, Any]
 
 def prior_in_hand() -> Prior:
     """The library's, for fixed regions."""
-    task = Task(robot=ROBOT, stamp_ns=1, environment="residential home", task="real-estate listing", regions=REGIONS)
-    return library.load().answer(task, gateway.Config())
+    task = Task(robot=ROBOT, stamp_ns=1, environment=DEMO_ENVIRONMENT, task=DEMO_TASK, regions=REGIONS)
+    return library.load().answer(task, GatewayConfig())
 
 
 class World:

@@ -16,6 +16,7 @@ from prior_sg.deploy.benches.learning import learning_bench
 from prior_sg.deploy.benches.places import place_bench
 from prior_sg.deploy.benches.swap import swap_bench
 from prior_sg.deploy.sample import SAMPLE
+from prior_sg.deploy.settings import DEMO_ENVIRONMENT, DEMO_TASK
 from prior_sg.schemas.frames import Keyframe
 from prior_sg.schemas.priors import PriorRequest, Task
 from prior_sg.schemas.topics import PRIORS, TEXT, Query
@@ -97,7 +98,7 @@ class Pipeline:
 def e2e() -> tuple[dict, dict]:
     """Keyframe in hand → region delta that follows from it, encoder time excluded, without transport."""
     pipeline, keyframes = Pipeline(), _sample_keyframes()
-    request = PriorRequest(environment="residential home", task="real-estate listing")
+    request = PriorRequest(environment=DEMO_ENVIRONMENT, task=DEMO_TASK)
     prior = pipeline.answer("prior_gateway", PRIORS, request).priors[0]
     pipeline.step("segmenter", Task(robot="bench", stamp_ns=0, environment=request.environment, task=request.task))
     pipeline.step("segmenter", prior)

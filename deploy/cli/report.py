@@ -9,17 +9,17 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from prior_sg.deploy.evaluation.metrics import GroundTruth, evaluate
+from prior_sg.deploy.errors import UserError
+from prior_sg.deploy.evaluation.metrics import evaluate
 from prior_sg.deploy.evaluation.object_metrics import NO_DETECTOR, OBJECT_SHARES, object_scores
-from prior_sg.deploy.evaluation.oracles import TrueObject
 from prior_sg.deploy.inspecting.replay import Log, message_differences, undisturbed
 from prior_sg.deploy.running.job import Result
 from prior_sg.deploy.showing.export import map_png, places_png, scene_json, spark_dsg_graph
+from prior_sg.deploy.truth import GroundTruth, TrueObject
 from prior_sg.schemas.codec import decode, encode
 from prior_sg.schemas.places import VoxelMap
 from prior_sg.schemas.scene import Scene, SceneRequest
 from prior_sg.schemas.topics import SCENE
-from prior_sg.services.ingest.sources import ReadOptions, open_source
 from prior_sg.services.registry import BY_NAME
 from prior_sg.services.runtime.record import attachments
 
@@ -27,13 +27,8 @@ SUFFIXES = {"json": (".json",), "spark-dsg": (".json", ".sparkdsg"), "png": (".p
 MAIN_METRICS = ("f1_s", "f1_g", "miou_s", "miou_g", "miou_s_penalised", "accuracy")
 
 
-class ExportError(Exception):
+class ExportError(UserError):
     """The file cannot be written as asked; the message says what to do."""
-
-
-def truth_of(source: str, options: ReadOptions | None = None) -> dict[str, Any] | None:
-    """The content of the source's regions.json, or None when it has no ground truth. Raises SourceError."""
-    return open_source(source, options=options).ground_truth
 
 
 def region_table(scene: Scene) -> Table:

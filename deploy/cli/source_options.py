@@ -2,11 +2,12 @@
 
 import argparse
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-from prior_sg.deploy.running.serve import resolved_config
-from prior_sg.services.ingest.core.options import ReadOptions
-from prior_sg.services.ingest.sources import LAYOUT_NAMES
-from prior_sg.services.registry import BY_NAME
+from prior_sg.deploy.settings import resolved_config
+
+if TYPE_CHECKING:
+    from prior_sg.services.ingest.core.options import ReadOptions
 
 GROUP = "how the source is read, where its files do not say or say it wrongly"
 
@@ -30,7 +31,10 @@ class Option:
 
 OPTIONS = (
     Option(
-        "--layout", "layout", "NAME", "layout of the folder; default: recognised by its files", choices=LAYOUT_NAMES
+        "--layout",
+        "layout",
+        "NAME",
+        "layout, as docs/sources.md names it; default: recognised by its files",
     ),
     Option("--rate", "rate_hz", "HZ", "frames per second, in place of the source's stamps"),
     Option("--stamp-unit", "stamp_unit", "UNIT", "unit of written stamps", choices=("s", "ms", "us", "ns")),
@@ -91,8 +95,10 @@ def source_settings(arguments: argparse.Namespace) -> list[str]:
     return [f"ingest.{option.setting}={_value(option, text)}" for option, text in given if text is not None]
 
 
-def read_options(arguments: argparse.Namespace) -> ReadOptions:
+def read_options(arguments: argparse.Namespace) -> "ReadOptions":
     """What the options, `--config` and `--set` say, for a command that reads a source itself. Raises ConfigError."""
+    from prior_sg.services.registry import BY_NAME
+
     config, settings = getattr(arguments, "config", "") or "", getattr(arguments, "set", None) or []
     return resolved_config(BY_NAME["ingest"], config, [*source_settings(arguments), *settings])
 

@@ -3,8 +3,7 @@
 import argparse
 import json
 import math
-import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,15 +12,16 @@ from rich.box import SIMPLE
 from rich.console import Console
 from rich.table import Table
 
+from prior_sg.deploy.cli.shared import add_settings
+from prior_sg.deploy.evaluation.kinds import BASELINES, ORACLES, OURS, SWEEPS
+from prior_sg.deploy.settings import DEMO_TASK, Layers, settings_layers
+
 if TYPE_CHECKING:
     from prior_sg.deploy.evaluation.methods import Method
-    from prior_sg.deploy.evaluation.perception import Layers, Report
+    from prior_sg.deploy.evaluation.perception import Report
     from prior_sg.deploy.evaluation.runner import Dataset, Results
 
-DEFAULT_TASK = "real-estate listing"
 TABLE_COLUMNS = 100  # narrower terminals wrap lines, which is better than cells cut short
-SWEEP_KINDS = ("crop", "encoder", "radius")
-ORACLE_KINDS = ("features", "places", "objects", "prior")
 SHOWN = {  # keys with their column titles
     "f1_s": "F1_S",
     "f1_g": "F1_G",
@@ -45,11 +45,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         required=True,
         help="what kind of place it is, in plain words: of all datasets, or of the dataset NAME; may be repeated",
     )
-    parser.add_argument("--task", default=DEFAULT_TASK, help="what the robot is to do (default: %(default)s)")
-    parser.add_argument("--methods", default="ours", help="of ours, clio, hovsg, hydra, argmax (default: %(default)s)")
+    parser.add_argument("--task", default=DEMO_TASK, help="what the robot is to do (default: %(default)s)")
+    parser.add_argument("--methods", default=OURS, help=f"of {', '.join((OURS, *BASELINES))} (default: %(default)s)")
     parser.add_argument("--ablate", action="store_true", help="ours with experts and parts taken away, too")
-    parser.add_argument("--oracle", default="", help=f"ours with a part made perfect: {', '.join(ORACLE_KINDS)}")
-    parser.add_argument("--sweep", default="", help=f"ours over values of a setting: {', '.join(SWEEP_KINDS)}")
+    parser.add_argument("--oracle", default="", help=f"ours with a part made perfect: {', '.join(ORACLES)}")
+    parser.add_argument("--sweep", default="", help=f"ours over values of a setting: {', '.join(SWEEPS)}")
     parser.add_argument(
         "--priors",
         type=int,
@@ -61,8 +61,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, default=Path("out/eval"), help="folder for results and the cache")
     parser.add_argument("--json", action="store_true", help="print JSON instead of tables")
     parser.add_argument("--html", action="store_true", help="write report.html with tables, pictures and plots")
-    parser.add_argument("--config", default="", help="TOML file with a section per service")
-    parser.add_argument("--set", action="append", default=[], metavar="SERVICE.FIELD=VALUE", help="one setting")
+    add_settings(parser)
 
 
 def run(arguments: argparse.Namespace, console: Console) -> int:
@@ -93,18 +92,7 @@ def run(arguments: argparse.Namespace, console: Console) -> int:
     return 0
 
 
-def settings_layers(config: str, settings: list[str]) -> "Layers":
-    """Settings of all services: file, environment, command line. Raises ConfigError."""
-    from prior_sg.services.registry import BY_NAME
-    from prior_sg.services.runtime.config import check_sections, from_arguments, from_environment, merge, read_file
-
-    file, given = read_file(config), from_arguments(settings)
-    check_sections(file, list(BY_NAME))
-    check_sections(given, list(BY_NAME))
-    return merge(file, from_environment(os.environ), given)
-
-
-def chosen_methods(arguments: argparse.Namespace, layers: "Layers") -> "list[Method]":
+def chosen_methods(arguments: argparse.Namespace, layers: Layers) -> "list[Method]":
     """In the order of the tables. Raises EvaluationError for a name that does not exist."""
     from prior_sg.deploy.evaluation import methods
     from prior_sg.services.registry import BY_NAME
@@ -113,21 +101,21 @@ def chosen_methods(arguments: argparse.Namespace, layers: "Layers") -> "list[Met
     config: Any = resolve(BY_NAME["segmenter"].config, "segmenter", layers)
     chosen = []
     for name in _names(arguments.methods):
-        own = name == methods.OURS
+        own = name == OURS
         chosen.append(methods.ours(config) if own else methods.baseline(name, config.object_phrases))
     chosen += methods.ablations(config) if arguments.ablate else []
-    chosen += [methods.oracle(config, kind) for kind in _known(arguments.oracle, ORACLE_KINDS, "--oracle")]
-    for kind in _known(arguments.sweep, SWEEP_KINDS, "--sweep"):
+    chosen += [methods.oracle(config, kind) for kind in _known(arguments.oracle, ORACLES, "--oracle")]
+    for kind in _known(arguments.sweep, SWEEPS, "--sweep"):
         chosen += methods.sweep(config, kind)
     return chosen
 
 
 def chosen_datasets(paths: Sequence[Path], environments: Sequence[str], task: str) -> "list[Dataset]":
     """Datasets with truth and prior; the vocabulary is the ground truth's. Raises EvaluationError or SourceError."""
-    from prior_sg.deploy.evaluation.oracles import read_objects
     from prior_sg.deploy.evaluation.perception import EvaluationError, ground_truth, sequence_name
     from prior_sg.deploy.evaluation.priors import library_prior
     from prior_sg.deploy.evaluation.runner import Dataset
+    from prior_sg.deploy.truth import read_objects
 
     named = dict(text.split("=", 1) for text in environments if "=" in text)
     general = [text for text in environments if "=" not in text]
@@ -210,7 +198,7 @@ def _names(text: str) -> list[str]:
     return list(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
 
 
-def _known(text: str, kinds: Sequence[str], option: str) -> list[str]:
+def _known(text: str, kinds: Collection[str], option: str) -> list[str]:
     from prior_sg.deploy.evaluation.perception import EvaluationError
 
     unknown = [name for name in _names(text) if name not in kinds]

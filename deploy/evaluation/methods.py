@@ -1,12 +1,8 @@
-"""The methods that are compared: ours, its ablations and sweeps, and the baselines of the source checkout."""
+"""The methods that are compared: ours, its ablations and sweeps, and the baselines."""
 
-import importlib
-import importlib.util
 import itertools
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from types import ModuleType
 from typing import Any
 
@@ -14,8 +10,9 @@ import msgspec
 import numpy as np
 
 from prior_sg.deploy.evaluation import oracles, priors
-from prior_sg.deploy.evaluation.metrics import GroundTruth
+from prior_sg.deploy.evaluation.kinds import BASELINES, ORACLES, OURS, SWEEPS
 from prior_sg.deploy.evaluation.perception import ROBOT, EvaluationError, Perception
+from prior_sg.deploy.truth import GroundTruth, TrueObject
 from prior_sg.schemas.codec import Message
 from prior_sg.schemas.features import Pyramid, TextEmbeddings, TextRequest
 from prior_sg.schemas.objects import Detections, ObjectDelta
@@ -32,16 +29,7 @@ from prior_sg.services.segmenter.core.inference import see_objects
 from prior_sg.services.segmenter.core.state import Config, State
 from prior_sg.services.segmenter.core.update import region_concepts
 
-OURS = "ours"
-BASELINES = ("clio", "hovsg", "hydra", "argmax")
-BASELINE_FOLDER = Path(__file__).parent / "baselines"
-BASELINE_PACKAGE = "prior_sg_baselines"
 NEVER_M, ANY_SCALE = 1e6, 1e9
-SWEEPS: dict[str, tuple[Any, ...]] = {
-    "crop": (112, 224, 448),
-    "encoder": tuple(f"conse/efficientnet-lite{size}/minilm-l6-v2" for size in (0, 1, 2)),
-    "radius": (0.375, 0.75, 1.5, 3.0),
-}
 
 
 @dataclass(frozen=True)
@@ -51,7 +39,7 @@ class Case:
     perception: Perception
     prior: Prior
     truth: GroundTruth
-    objects: tuple[oracles.TrueObject, ...] = ()  # empty where the ground truth names none
+    objects: tuple[TrueObject, ...] = ()  # empty where the ground truth names none
 
 
 @dataclass(frozen=True)
@@ -191,24 +179,18 @@ def raw_similarity(text: TextEmbeddings) -> TextEmbeddings:
 
 
 def oracle(config: Config, name: str) -> Method:
-    """Our method with one part replaced by the truth."""
-    if name == "prior":
-        variant = Variant(config, prior=lambda case: priors.counted(case.prior, case.truth, case.perception.places))
-        about = "existence and adjacency counted from the ground truth"
-    elif name == "features":
-        variant = Variant(config, pyramids=lambda case: _true_pyramids(case, config.object_phrases))
-        about = "crops carry the text embedding of the true region that most of their points lie in"
-    elif name == "objects":
-        variant = Variant(
+    """Our method with one part replaced by the truth; `name` is one of ORACLES."""
+    variants = {
+        "features": Variant(config, pyramids=lambda case: _true_pyramids(case, config.object_phrases)),
+        "places": Variant(config, seen=lambda case, state: _see_truth(case, state, config.object_phrases)),
+        "objects": Variant(
             config,
             detections=lambda case: () if case.objects else case.perception.detections,
             seen=lambda case, state: _see_true_objects(case, state, config),
-        )
-        about = "the objects are those of the ground truth that the robot has seen; as ours where it names none"
-    else:
-        variant = Variant(config, seen=lambda case, state: _see_truth(case, state, config.object_phrases))
-        about = "places carry the text embedding of their true region"
-    return Method(f"oracle {name}", variant.run, about, "oracle")
+        ),
+        "prior": Variant(config, prior=lambda case: priors.counted(case.prior, case.truth, case.perception.places)),
+    }
+    return Method(f"oracle {name}", variants[name].run, ORACLES[name], "oracle")
 
 
 def _concepts(case: Case, object_phrases: int) -> dict[str, np.ndarray]:
@@ -248,16 +230,14 @@ def sweep(config: Config, kind: str) -> list[Method]:
     return rows
 
 
-def baseline(name: str, object_phrases: int = 0, folder: Path = BASELINE_FOLDER) -> Method:
-    """A method of the checkout's tests, with its tuned settings, on the same places, crops and concepts.
+def baseline(name: str, object_phrases: int = 0) -> Method:
+    """A method of others, with its tuned settings, on the same places, crops and concepts.
 
-    Baselines hold no beliefs, so their scenes have no posteriors. Raises EvaluationError outside a checkout.
+    Baselines hold no beliefs, so their scenes have no posteriors. Raises EvaluationError for a name that is not known.
     """
-    package = _baseline_package(folder)
-    if not (folder / f"{name}.py").exists():
-        raise EvaluationError(f"there is no method {name!r}: choose from {', '.join((OURS, *BASELINES))}")
-    module = importlib.import_module(f"{package.__name__}.{name}")
-    common = importlib.import_module(f"{package.__name__}.common")
+    from prior_sg.deploy.evaluation.baselines import common
+
+    module = _baseline_module(name)
 
     def run(case: Case) -> Scene:
         perception, prior = case.perception, case.prior
@@ -276,17 +256,10 @@ def baseline(name: str, object_phrases: int = 0, folder: Path = BASELINE_FOLDER)
     return Method(name, run, (module.__doc__ or "").strip().splitlines()[0])
 
 
-def _baseline_package(folder: Path) -> ModuleType:
-    """The folder as an importable package, without touching the import path."""
-    if BASELINE_PACKAGE in sys.modules:
-        return sys.modules[BASELINE_PACKAGE]
-    init = folder / "__init__.py"
-    if not init.exists():
-        raise EvaluationError("baselines live in tests/baselines of a source checkout; without one use --methods ours")
-    spec = importlib.util.spec_from_file_location(BASELINE_PACKAGE, init, submodule_search_locations=[str(folder)])
-    assert spec is not None
-    assert spec.loader is not None
-    package = importlib.util.module_from_spec(spec)
-    sys.modules[BASELINE_PACKAGE] = package
-    spec.loader.exec_module(package)
-    return package
+def _baseline_module(name: str) -> ModuleType:
+    from prior_sg.deploy.evaluation.baselines import argmax, clio, hovsg, hydra
+
+    modules = {"clio": clio, "hovsg": hovsg, "hydra": hydra, "argmax": argmax}
+    if name not in modules:
+        raise EvaluationError(f"there is no method {name!r}: choose from {', '.join((OURS, *BASELINES))}")
+    return modules[name]

@@ -15,17 +15,16 @@ confidence, weighted by volume; the confidence is a place's posterior of its own
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
 
+from prior_sg.deploy.truth import GroundTruth, voxel_owners
 from prior_sg.schemas.places import VoxelMap
+from prior_sg.schemas.regions import NO_REGION
 from prior_sg.schemas.scene import Scene
-from prior_sg.services.geometry import inside_polygon
 
-NO_REGION = -1
 BOUNDARY_TOLERANCE_M = 0.5  # about half a doorway
 CALIBRATION_BINS = 10
 SCORES = (
@@ -43,54 +42,6 @@ SCORES = (
     "boundary_f1",
     "ece",
 )
-
-
-@dataclass(frozen=True)
-class TrueRegion:
-    """One ground-truth region: a polygon on a floor."""
-
-    id: int
-    label: str
-    polygon_m: np.ndarray  # (corner, 2) x, y
-    z_min_m: float
-    z_max_m: float
-
-
-@dataclass(frozen=True)
-class GroundTruth:
-    """The regions of one sequence."""
-
-    regions: tuple[TrueRegion, ...]
-
-    @classmethod
-    def from_json(cls, data: dict[str, Any]) -> "GroundTruth":
-        """From the content of a `regions.json`. Raises ValueError when it is not one."""
-        try:
-            heights = {floor["id"]: (float(floor["z_min_m"]), float(floor["z_max_m"])) for floor in data["floors"]}
-            regions = [
-                TrueRegion(
-                    int(region["id"]),
-                    str(region["label"]),
-                    np.array(region["polygon_m"], float).reshape(-1, 2),
-                    *heights[region["floor"]],
-                )
-                for region in data["regions"]
-            ]
-        except (KeyError, TypeError, ValueError) as error:
-            raise ValueError(
-                f"regions.json is not in the documented layout ({type(error).__name__}: {error})"
-            ) from error
-        return cls(tuple(sorted(regions, key=lambda region: region.id)))
-
-    def region_of(self, positions_m: np.ndarray) -> np.ndarray:
-        """Id of the region that holds each position (n, 3), -1 = none; where polygons overlap, the smallest id."""
-        ids = np.full(len(positions_m), NO_REGION, np.int64)
-        for region in self.regions:
-            z_m = positions_m[:, 2]
-            inside = (z_m >= region.z_min_m) & (z_m < region.z_max_m)
-            inside &= inside_polygon(np.asarray(positions_m[:, :2], float), region.polygon_m)
-            ids[inside & (ids == NO_REGION)] = region.id
-        return ids
 
 
 @dataclass(frozen=True)
@@ -223,29 +174,6 @@ def reliability(scene: Scene, assignment: Assignment, truth: GroundTruth) -> Rel
     )
     some = np.maximum(volumes, 1)
     return Reliability(volumes, believed / some, found / some)
-
-
-def voxel_owners(voxels: np.ndarray, voxel_m: float, centers_m: np.ndarray, radii_m: np.ndarray) -> np.ndarray:
-    """Index of the sphere that owns each voxel (n, 3), -1 = outside all; the centre of voxel i is (i + 0.5) voxel_m."""
-    if not len(voxels):
-        return np.zeros(0, np.int64)
-    voxels = voxels.astype(np.int64)
-    low = voxels.min(axis=0)
-    shape = voxels.max(axis=0) - low + 1
-    best = np.zeros(shape)  # a sphere holds a voxel where its power distance is not positive
-    owner = np.full(shape, -1, np.int64)
-    axes = [(np.arange(count) + start + 0.5) * voxel_m for count, start in zip(shape, low, strict=True)]
-    for index, (center, radius) in enumerate(zip(centers_m.astype(float), radii_m.astype(float), strict=True)):
-        box = tuple(
-            slice(*np.searchsorted(axis, (at - radius - voxel_m, at + radius + voxel_m)))
-            for axis, at in zip(axes, center, strict=True)
-        )
-        x2, y2, z2 = ((axis[part] - at) ** 2 for axis, part, at in zip(axes, box, center, strict=True))
-        power = x2[:, None, None] + y2[:, None] + z2 - radius**2
-        nearer = (power < best[box]) | ((power == 0) & (owner[box] == -1))
-        best[box][nearer] = power[nearer]
-        owner[box][nearer] = index
-    return owner[tuple((voxels - low).T)]
 
 
 def _face_neighbours(voxels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

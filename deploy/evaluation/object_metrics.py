@@ -18,7 +18,7 @@ from collections.abc import Collection, Sequence
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from prior_sg.deploy.evaluation.oracles import TrueObject, in_view
+from prior_sg.deploy.truth import TrueObject, in_view
 from prior_sg.schemas.objects import SceneObject
 from prior_sg.schemas.places import VoxelMap
 

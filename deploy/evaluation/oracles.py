@@ -1,15 +1,10 @@
 """Perfect parts, for finding out how much of an error is whose: the true region's text instead of pixels, and the
 true objects instead of detected ones."""
 
-import json
-from collections.abc import Sequence
-from dataclasses import dataclass
-from pathlib import Path
-
 import msgspec
 import numpy as np
 
-from prior_sg.deploy.evaluation.metrics import GroundTruth
+from prior_sg.deploy.truth import GroundTruth, TrueObject, in_view
 from prior_sg.schemas.features import Pyramid
 from prior_sg.schemas.places import VoxelMap
 from prior_sg.schemas.priors import Prior
@@ -17,32 +12,6 @@ from prior_sg.services.geometry import transform
 from prior_sg.services.segmenter.core.experts.context import ObjectView
 
 NOISE = 0.5  # length of the noise added to the unit embedding of a region
-
-
-@dataclass(frozen=True)
-class TrueObject:
-    """One object of the ground truth: an axis-aligned box in the world."""
-
-    label: str
-    min_m: np.ndarray  # (3,)
-    max_m: np.ndarray  # (3,)
-
-
-def read_objects(path: Path) -> tuple[TrueObject, ...]:
-    """The objects of an `objects.json` in a dataset's folder; none where there is no such file."""
-    file = path / "objects.json"
-    if not file.exists():
-        return ()
-    boxes = json.loads(file.read_text())["objects"]
-    return tuple(TrueObject(str(b["label"]), np.array(b["min_m"], float), np.array(b["max_m"], float)) for b in boxes)
-
-
-def in_view(objects: Sequence[TrueObject], voxels: VoxelMap) -> np.ndarray:
-    """Which objects the robot has seen (n,): their box holds the centre of an occupied voxel, or nearly does."""
-    occupied_m = (voxels.occupied + 0.5) * voxels.voxel_m
-    margin_m = voxels.voxel_m / 2
-    inside = ((occupied_m >= item.min_m - margin_m) & (occupied_m <= item.max_m + margin_m) for item in objects)
-    return np.array([held.all(axis=1).any() for held in inside], bool)
 
 
 def seen_objects(objects: tuple[TrueObject, ...], prior: Prior, voxels: VoxelMap) -> ObjectView:

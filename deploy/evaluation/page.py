@@ -9,14 +9,16 @@ import cv2
 import msgspec
 import numpy as np
 
-from prior_sg.deploy.evaluation.methods import SWEEPS, Method
-from prior_sg.deploy.evaluation.metrics import NO_REGION, GroundTruth, Reliability
+from prior_sg.deploy.evaluation.kinds import SWEEPS
+from prior_sg.deploy.evaluation.methods import Method
+from prior_sg.deploy.evaluation.metrics import Reliability
 from prior_sg.deploy.evaluation.object_metrics import OBJECT_COUNTS, OBJECT_SCORES, TOLERANCE_M
 from prior_sg.deploy.evaluation.plots import Point, line_plot
 from prior_sg.deploy.evaluation.runner import KEYS, NO_LABEL, Dataset, Picture, Results
 from prior_sg.deploy.showing.map import draw_map
+from prior_sg.deploy.truth import GroundTruth
 from prior_sg.schemas.places import VoxelMap
-from prior_sg.schemas.regions import Region
+from prior_sg.schemas.regions import NO_REGION, Region
 from prior_sg.schemas.scene import Scene
 from prior_sg.services.segmenter.core.regions.components import footprint_m2
 

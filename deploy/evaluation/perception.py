@@ -15,28 +15,29 @@ from typing import Any
 
 import msgspec
 
-from prior_sg.deploy.evaluation.metrics import GroundTruth
+from prior_sg.deploy.errors import UserError
+from prior_sg.deploy.settings import Layers
+from prior_sg.deploy.truth import GroundTruth
 from prior_sg.schemas.codec import Message, decode, encode
 from prior_sg.schemas.features import Pyramid, TextEmbeddings, TextRequest
 from prior_sg.schemas.frames import Keyframe
 from prior_sg.schemas.objects import Detections
 from prior_sg.schemas.places import MapRequest, PlaceDelta, SnapshotRequest, VoxelMap
 from prior_sg.schemas.topics import DETECTIONS, KEYFRAME, PLACE_SNAPSHOT, PYRAMID, TEXT, VOXEL_MAP
-from prior_sg.services.feature_pyramid.detectors.base import prompted
+from prior_sg.services.feature_pyramid.detectors.load import is_prompted
 from prior_sg.services.ingest.sources import Source, open_source
 from prior_sg.services.registry import BY_NAME
 from prior_sg.services.runtime.config import resolve
 from prior_sg.services.runtime.service import Identity
 
 ROBOT = "eval"
-CODE = {"ingest": "core.py", "place_graph": "*.py", "feature_pyramid": "*.py"}  # what makes a perception
+CODE = {"ingest": "core/*.py", "place_graph": "**/*.py", "feature_pyramid": "**/*.py"}  # what makes a perception
 
-Layers = Mapping[str, Mapping[str, Any]]
 Report = Callable[[str, int, int], None]  # what is being done, steps done, steps in all (0 = unknown)
 TextOf = Callable[[Sequence[Sequence[str]]], TextEmbeddings]
 
 
-class EvaluationError(RuntimeError):
+class EvaluationError(UserError):
     """An evaluation cannot run; the message is one sentence that says what to do."""
 
 
@@ -95,7 +96,7 @@ class Perceiver:
         """
         source = open_source(path)
         cfg = self._config("feature_pyramid", features)
-        if not cfg.detector_prompts and prompted(cfg):
+        if not cfg.detector_prompts and is_prompted(cfg):
             cfg = msgspec.structs.replace(cfg, detector_prompts=sought)
         seconds: dict[str, float] = {}
         snapshot, voxels = self._kept("places", path, None, lambda: self._places(source), seconds)
@@ -213,5 +214,5 @@ def code_digest(service: str, files: str) -> str:
     folder = Path(__file__).parent.parent.parent / "services" / service
     digest = hashlib.blake2b(digest_size=16)
     for file in sorted(folder.glob(files)):
-        digest.update(file.name.encode() + file.read_bytes())
+        digest.update(str(file.relative_to(folder)).encode() + file.read_bytes())
     return digest.hexdigest()

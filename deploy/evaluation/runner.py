@@ -9,12 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from prior_sg.deploy.evaluation.methods import OURS, Case, Method
-from prior_sg.deploy.evaluation.metrics import SCORES, GroundTruth, Reliability, assign, evaluate, reliability
+from prior_sg.deploy.evaluation.kinds import OURS
+from prior_sg.deploy.evaluation.methods import Case, Method
+from prior_sg.deploy.evaluation.metrics import SCORES, Reliability, assign, evaluate, reliability
 from prior_sg.deploy.evaluation.object_metrics import NO_DETECTOR, OBJECT_SCORES, object_scores
-from prior_sg.deploy.evaluation.oracles import TrueObject
 from prior_sg.deploy.evaluation.perception import Perception, Report
 from prior_sg.deploy.evaluation.priors import variations
+from prior_sg.deploy.truth import GroundTruth, TrueObject
 from prior_sg.schemas.features import TextEmbeddings
 from prior_sg.schemas.places import VoxelMap
 from prior_sg.schemas.priors import Prior

@@ -1,5 +1,6 @@
 """Feeds a recorded log to one service again, in the order it consumed its inputs, and compares what comes out."""
 
+import logging
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -9,14 +10,17 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from prior_sg.schemas.codec import Message, copied, decode, encode
+from prior_sg.schemas.codec import DecodeError, Message, copied, decode, encode
 from prior_sg.schemas.frames import Keyframe
+from prior_sg.schemas.migrations import journalled
 from prior_sg.schemas.status import Consumed, Started, Tick
 from prior_sg.schemas.topics import JOURNAL, KEYFRAME, QUERIES, TOPICS, Topic
 from prior_sg.services.registry import BY_NAME
+from prior_sg.services.runtime import config
 from prior_sg.services.runtime.record import LogError, Logged, read_log
 from prior_sg.services.runtime.service import Ask, Identity, Service
 
+logger = logging.getLogger(__name__)
 TOPIC_BY_NAME = {topic.name: topic for topic in TOPICS}
 QUERY_BY_NAME = {query.name: query for query in QUERIES}
 
@@ -77,19 +81,28 @@ class Log:
             if logged.topic is KEYFRAME:
                 self.frames[decode(Keyframe, logged.payload).frame_id] = logged
         self.lives = lives(journal, service.name)
+        self._versions = {life.instance: life.started.versions for life in self.lives}
 
     def input(self, entry: Consumed) -> Message:
-        """The message a journal entry means. Raises LogError when the log does not hold it."""
+        """The message a journal entry means. Raises LogError when the log does not hold it, or this program cannot read
+        it."""
+        try:
+            return self._input(entry)
+        except DecodeError as error:
+            raise LogError(f"the journal of {entry.instance} cannot be replayed: {error}") from error
+
+    def _input(self, entry: Consumed) -> Message:
+        versions = self._versions.get(entry.instance, {})
         if entry.topic == "Tick":
-            return decode(Tick, entry.inline)
+            return journalled(Tick, entry.inline, versions)
         errands = {errand.name: errand for errand in self.service.errands}
         if question := QUERY_BY_NAME.get(entry.topic) or errands.get(entry.topic):
-            return decode(question.reply, entry.inline)
+            return journalled(question.reply, entry.inline, versions)
         topic = TOPIC_BY_NAME[entry.topic]
         if topic.delivery == "job":
             logged = self.frames.get(entry.frame_id)
         elif not entry.writer:
-            return decode(topic.type, entry.inline)
+            return journalled(topic.type, entry.inline, versions)
         else:
             logged = self.messages.get((entry.key, entry.writer, entry.sequence))
         if logged is None:
@@ -106,10 +119,22 @@ class Log:
         return outputs
 
 
+def recorded_config(log: Log, life: Life) -> Any:
+    """The config of one life, as a replay takes it; what has changed since in the settings is logged. Raises LogError
+    when a value no longer fits."""
+    try:
+        cfg, notes = config.recorded(log.service.config, life.service, life.started.config)
+    except config.ConfigError as error:
+        raise LogError(f"the journal of {life.instance} cannot be replayed: {error}") from error
+    for note in notes:
+        logger.warning("%s", note)
+    return log.service.replay_config(cfg)
+
+
 def replay_life(log: Log, life: Life) -> Iterator[tuple[Topic, Message]]:
     """The outputs of one life, made again from its recorded inputs and config."""
     service = log.service
-    cfg = service.replay_config(msgspec.json.decode(life.started.config, type=service.config))
+    cfg = recorded_config(log, life)
     state = service.init(cfg, Identity(life.started.robot, life.instance, life.started.epoch))
     try:
         for entry in life.inputs:
@@ -123,7 +148,7 @@ def replay_life(log: Log, life: Life) -> Iterator[tuple[Topic, Message]]:
 def final_state(log: Log, life: Life) -> tuple[Any, Any]:
     """State and config of one life after its recorded inputs; the caller closes the state."""
     service = log.service
-    cfg = service.replay_config(msgspec.json.decode(life.started.config, type=service.config))
+    cfg = recorded_config(log, life)
     state = service.init(cfg, Identity(life.started.robot, life.instance, life.started.epoch))
     for entry in life.inputs:
         for _ in service.step(state, log.input(entry), cfg):

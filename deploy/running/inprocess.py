@@ -8,8 +8,8 @@ from concurrent.futures import Future
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from prior_sg.deploy.running.serve import resolved_config
 from prior_sg.deploy.running.supervisor import ChildFailed
+from prior_sg.deploy.settings import resolved_config
 from prior_sg.services.registry import BY_NAME
 from prior_sg.services.runtime.bus import Hub, LocalBus
 from prior_sg.services.runtime.host.host import Host

@@ -12,10 +12,11 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TaskID, TextColumn, TimeElapsedColumn
 
+from prior_sg.deploy.errors import UserError
 from prior_sg.deploy.running.inprocess import InProcess
 from prior_sg.deploy.running.recorder import Recorder, Settling
-from prior_sg.deploy.running.serve import resolved_config
 from prior_sg.deploy.running.supervisor import Supervisor
+from prior_sg.deploy.settings import DEFAULT_CONNECT, DEFAULT_ROBOT, check_settings
 from prior_sg.schemas.codec import DecodeError, Message, decode, encode
 from prior_sg.schemas.features import Pyramid
 from prior_sg.schemas.frames import IngestState, Keyframe
@@ -37,7 +38,7 @@ POLL_S = 0.1
 STALL_AFTER_S = 120.0
 
 
-class RunError(Exception):
+class RunError(UserError):
     """The run cannot go on; the message says what to do."""
 
 
@@ -50,8 +51,8 @@ class Job:
     environment: str
     task: str
     regions: list[str] = field(default_factory=list)
-    robot: str = "robot1"
-    connect: str = "tcp/127.0.0.1:7447"
+    robot: str = DEFAULT_ROBOT
+    connect: str = DEFAULT_CONNECT
     workers: int = 1
     speed: float = 0.0  # 0 = as fast as the pipeline drains
     settings: list[str] = field(default_factory=list)
@@ -111,12 +112,6 @@ def make_folder(path: Path) -> None:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise RunError(f"cannot write to {path} ({error.strerror}); choose another folder with --out") from error
-
-
-def check_settings(config: str, settings: list[str]) -> None:
-    """Resolve the config of every service now, so that a wrong setting is told before anything starts."""
-    for service in SERVICES:
-        resolved_config(service, config, settings)
 
 
 def run(job: Job, console: Console) -> Result:

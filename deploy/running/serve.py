@@ -9,37 +9,41 @@ import signal
 import sys
 import time
 import uuid
-from typing import Any
+from collections.abc import Iterator
 
-from prior_sg.services.ingest.sources import SourceError
-from prior_sg.services.registry import BY_NAME
+from prior_sg.deploy.settings import DEFAULT_ROBOT, connect_in_force, resolved_config
+from prior_sg.services.runtime import extras
 from prior_sg.services.runtime.bus import BusError
-from prior_sg.services.runtime.config import (
-    ConfigError,
-    check_sections,
-    from_arguments,
-    from_environment,
-    merge,
-    read_file,
-    resolve,
-)
+from prior_sg.services.runtime.config import ConfigError
 from prior_sg.services.runtime.host.host import Host
 from prior_sg.services.runtime.logs import start_logging
 from prior_sg.services.runtime.record import LogError
-from prior_sg.services.runtime.service import Identity, Service, ServiceError
+from prior_sg.services.runtime.service import Identity, ServiceError
 from prior_sg.services.runtime.zenoh_bus import ZenohBus
 
 log = logging.getLogger(__name__)
 PARENT_CHECK_S = 1.0
-HOPELESS = (ConfigError, BusError, ServiceError, SourceError, LogError)  # their messages say what to do
+HOPELESS = (ConfigError, BusError, ServiceError, LogError)  # their messages say what to do
 EXIT_HOPELESS = 2  # starting again would fail again
+
+
+class ServiceNames:
+    """The names of all services, looked up when somebody asks: services need packages that clients do without."""
+
+    def __iter__(self) -> Iterator[str]:
+        from prior_sg.services.registry import BY_NAME
+
+        return iter(sorted(BY_NAME))
+
+    def __contains__(self, name: object) -> bool:
+        return name in list(self)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """What a service process can be told."""
-    parser.add_argument("service", choices=sorted(BY_NAME), help="which service to run")
-    parser.add_argument("--robot", default="robot1", help="name of the robot whose streams it serves")
-    parser.add_argument("--connect", default=os.environ.get("PSG_CONNECT", "tcp/127.0.0.1:7447"), help="Zenoh router")
+    parser.add_argument("service", choices=ServiceNames(), help="which service to run")
+    parser.add_argument("--robot", default=DEFAULT_ROBOT, help="name of the robot whose streams it serves")
+    parser.add_argument("--connect", default=connect_in_force(), help="Zenoh router")
     parser.add_argument("--instance", default="", help="name of this process; default: a random one")
     parser.add_argument("--config", default="", help="TOML file with a section per service")
     parser.add_argument("--set", action="append", default=[], metavar="SERVICE.FIELD=VALUE", help="one setting")
@@ -47,16 +51,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--parent", type=int, default=0, help="end when this process is gone")
 
 
-def resolved_config(service: Service, config_path: str, settings: list[str]) -> Any:
-    """The service's config from all layers. Raises ConfigError."""
-    file, given = read_file(config_path), from_arguments(settings)
-    check_sections(file, list(BY_NAME))
-    check_sections(given, list(BY_NAME))
-    return resolve(service.config, service.name, merge(file, from_environment(os.environ), given))
-
-
 async def serve(arguments: argparse.Namespace, instance: str) -> None:
     """Run until a signal, or until the parent is gone."""
+    from prior_sg.services.registry import BY_NAME
+
     service = BY_NAME[arguments.service]
     cfg = resolved_config(service, arguments.config, arguments.set)
     bus = await asyncio.to_thread(ZenohBus, arguments.connect)
@@ -92,7 +90,10 @@ def run(arguments: argparse.Namespace) -> int:
     except HOPELESS as error:
         log.error(str(error))
         return EXIT_HOPELESS
-    except Exception:
+    except Exception as error:
+        if isinstance(error, ModuleNotFoundError) and (advice := extras.advice(error)) is not None:
+            log.error(advice)
+            return EXIT_HOPELESS
         log.exception("the service failed")
         return 1
     log.info("stopped")

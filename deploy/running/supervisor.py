@@ -10,6 +10,7 @@ import uuid
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from prior_sg.deploy.errors import UserError
 from prior_sg.deploy.running.serve import EXIT_HOPELESS
 from prior_sg.services.registry import BY_NAME
 
@@ -21,7 +22,7 @@ STOP_TIMEOUT_S = 10.0
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
-class ChildFailed(Exception):
+class ChildFailed(UserError):
     """A service keeps dying; the message says where its log is."""
 
 

@@ -1,20 +1,23 @@
 """A source as one MCAP log of ours: what the sample's packer and `prior-sg pack` share."""
 
 import json
-from collections.abc import Iterable, Iterator
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
+from prior_sg.deploy.errors import UserError
+from prior_sg.deploy.truth import GroundTruth
 from prior_sg.schemas.codec import Message, encode
 from prior_sg.schemas.frames import Keyframe, PoseUpdate
 from prior_sg.schemas.topics import KEYFRAME, POSE_UPDATE, Topic
-from prior_sg.services.ingest.core.selection import Correction, RawFrame
-from prior_sg.services.ingest.sources import Source
+from prior_sg.services.ingest.core.selection import BadFrame, Correction, RawFrame
+from prior_sg.services.ingest.sources import ReadOptions, Source, open_source
 from prior_sg.services.ingest.sources.recording import ORIGIN, REGIONS, SOURCE_METADATA
 from prior_sg.services.runtime.record import LogWriter
 
 
-class PackError(RuntimeError):
+class PackError(UserError):
     """The source cannot be packed; the text is one sentence."""
 
 
@@ -63,3 +66,52 @@ def write_log(  # noqa: PLR0917
 
 def _topics(messages: Iterable[Message]) -> Iterator[tuple[Topic, Any]]:
     return ((KEYFRAME if isinstance(message, Keyframe) else POSE_UPDATE, message) for message in messages)
+
+
+def pack_source(  # noqa: PLR0917
+    path: str | Path,
+    log_path: Path,
+    options: ReadOptions | None = None,
+    robot: str = "robot1",
+    provenance: str = "",
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> tuple[Source, Counter[str]]:
+    """Write what a source gives to a log; the source, and how many frames were refused for which reason.
+
+    The log is complete or absent. Raises PackError, SourceError or LogError.
+    """
+    source = open_source(path, options=options)
+    refused: Counter[str] = Counter()
+    partial = log_path.with_name(f"{log_path.name}.partial")
+    try:
+        write_log(partial, source, _messages(source, robot, refused, progress), robot, provenance, _truth(source))
+        if refused.total() == source.total:
+            top = refused.most_common(1)
+            raise PackError(f"no frame of {path} can be packed: {top[0][0] if top else 'it holds none'}")
+        partial.replace(log_path)
+    finally:
+        partial.unlink(missing_ok=True)
+    return source, refused
+
+
+def _messages(
+    source: Source, robot: str, refused: Counter[str], progress: Callable[[int, int], None]
+) -> Iterator[Message]:
+    revision = 0
+    for event in source.events():
+        if isinstance(event, BadFrame):
+            refused[event.reason] += 1
+        elif isinstance(event, RawFrame):
+            progress(event.index + 1, source.total)
+            yield keyframe_of(event, robot, event.color, event.depth)
+        else:
+            yield pose_update_of(event, robot, revision)
+            revision += 1
+
+
+def _truth(source: Source) -> dict[str, Any] | None:
+    """The source's regions where they are ours; somebody else's file of that name stays behind."""
+    try:
+        return source.ground_truth if source.ground_truth and GroundTruth.from_json(source.ground_truth) else None
+    except ValueError:
+        return None

@@ -25,15 +25,14 @@ import msgspec
 import numpy as np
 import spark_dsg
 
-from prior_sg.deploy.evaluation.metrics import GroundTruth
 from prior_sg.deploy.showing.map import draw_map, label_colors
 from prior_sg.deploy.showing.places import draw_places
+from prior_sg.deploy.truth import GroundTruth
 from prior_sg.schemas.objects import SceneObject
 from prior_sg.schemas.places import VoxelMap
-from prior_sg.schemas.regions import Region
+from prior_sg.schemas.regions import NO_REGION, Region
 from prior_sg.schemas.scene import Scene
 
-NO_REGION = -1
 DECIMALS = 4  # a tenth of a millimetre, a hundredth of a percent
 OBJECT, PLACE, PLACE_2D, ROOM, BUILDING = "O", "p", "P", "R", "B"  # node prefixes of Spark-DSG
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from prior_sg.deploy.evaluation.metrics import voxel_owners
+from prior_sg.deploy.truth import voxel_owners
 from prior_sg.schemas.objects import SceneObject
 from prior_sg.schemas.places import VoxelMap
 from prior_sg.schemas.scene import Scene

@@ -24,7 +24,10 @@ class BusError(Exception):
 
 @dataclass(frozen=True)
 class Sample:
-    """One received sample, not decoded yet. `writer` is empty when the sender did not say who it is."""
+    """One received sample, not decoded yet. `writer` is empty when the sender did not say who it is.
+
+    The payload is of this program's version of the message; one that cannot be brought to it is refused when decoded.
+    """
 
     topic: Topic
     key: str

@@ -1,7 +1,7 @@
 """Configuration in layers: defaults in the code, then a TOML file, then the environment, then the command line."""
 
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -78,6 +78,30 @@ def resolve(config_type: type[C], section: str, layers: Mapping[str, Mapping[str
         return msgspec.convert(values, config_type, strict=False)
     except (msgspec.ValidationError, ValueError) as error:
         raise ConfigError(f"{section}: {error}") from error
+
+
+def recorded(config_type: type[C], section: str, data: bytes) -> tuple[C, list[str]]:
+    """The config that a journal holds as JSON, perhaps of another version: settings it lacks get their defaults, and
+    those this program does not have are left out. Also what became of each of them, one sentence each. Raises
+    ConfigError when a value no longer fits."""
+    try:
+        values = msgspec.json.decode(data, type=dict[str, Any])
+        notes = list(_kept(config_type, section, values))
+        return msgspec.json.decode(msgspec.json.encode(values), type=config_type), notes
+    except (msgspec.MsgspecError, ValueError) as error:
+        raise ConfigError(f"the recorded config of {section} does not fit this program: {error}") from error
+
+
+def _kept(config_type: type, section: str, values: dict[str, Any]) -> Iterator[str]:
+    """Leave only what the config has, in its groups too; yields a sentence for each setting that is gone or new."""
+    fields = {field.name: field.type for field in msgspec.structs.fields(config_type)}
+    for name in sorted(values.keys() - fields.keys()):
+        yield f"{section}.{name} = {values.pop(name)!r} was recorded, and is no setting any more: it is left out"
+    for name, kind in fields.items():
+        if name not in values:
+            yield f"{section}.{name} was not a setting yet: it gets its default"
+        elif _is_group(kind) and isinstance(values[name], dict):
+            yield from _kept(kind, f"{section}.{name}", values[name])
 
 
 def _checked(config_type: type, section: str, values: Mapping[str, Any]) -> dict[str, Any]:

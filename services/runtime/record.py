@@ -4,6 +4,8 @@ One channel per key and writer; the channel's metadata names our topic and the w
 An MCAP message carries the writer's sequence number and two times: `publish_time` is when the writer sent it,
 `log_time` when we received it. Messages lie in the file, and are read back, in the order in which they were added.
 
+Messages of an older version are read as ours; those of a newer one, or of another program, are refused.
+
 A log whose process was killed has no index at its end. It is read up to its last complete chunk.
 """
 
@@ -25,12 +27,13 @@ from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.reader import SeekingReader
-from mcap.records import Attachment, Channel, Chunk, ChunkIndex, Message, Metadata
+from mcap.records import Attachment, Channel, Chunk, ChunkIndex, Message, Metadata, Schema
 from mcap.stream_reader import breakup_chunk
 from mcap.summary import Summary
 from mcap.writer import MCAP0_MAGIC, Writer
 
-from prior_sg.schemas.codec import schema_name
+from prior_sg.schemas.codec import DecodeError, schema_name
+from prior_sg.schemas.migrations import current
 from prior_sg.schemas.topics import TOPICS, Topic
 
 CHUNK_BYTES = 1 << 20
@@ -170,16 +173,24 @@ def read_log(path: str | Path, topics: Collection[Topic] | None = None) -> Itera
     """Messages of a log in the order they were added, of all topics or the given ones. Raises LogError."""
     wanted = {topic.name: topic for topic in (TOPICS if topics is None else topics)}
     with _opened(path) as file:
-        for channel, message in _messages(file, path, set(wanted)):
+        for channel, schema, message in _messages(file, path, set(wanted)):
+            topic = wanted[channel.metadata["topic"]]
             yield Logged(
-                topic=wanted[channel.metadata["topic"]],
+                topic=topic,
                 key=channel.topic,
                 writer=channel.metadata.get("writer", ""),
                 sequence=message.sequence,
                 sent_ns=message.publish_time,
                 received_ns=message.log_time,
-                payload=message.data,
+                payload=_current(path, topic, message.data, schema),
             )
+
+
+def _current(path: str | Path, topic: Topic, payload: bytes, schema: str) -> bytes:
+    try:
+        return current(topic.type, payload, schema)
+    except DecodeError as error:
+        raise LogError(f"the log {path} cannot be read: {error}") from error
 
 
 def contents(path: str | Path) -> list[Content]:
@@ -190,7 +201,7 @@ def contents(path: str | Path) -> list[Content]:
             channels, counts = index.channels, Counter(index.statistics.channel_message_counts)
         else:
             channels, counts = {}, Counter()
-            for channel, _ in _messages(file, path, None):
+            for channel, _, _ in _messages(file, path, None):
                 channels[channel.id] = channel
                 counts[channel.id] += 1
     ours = ((channels[i], counts[i]) for i in sorted(channels) if "topic" in channels[i].metadata)
@@ -228,10 +239,12 @@ def _opened(path: str | Path) -> Iterator[BinaryIO]:
         raise LogError(f"the log {path} cannot be read: {error.strerror}") from error
 
 
-def _messages(file: BinaryIO, path: str | Path, wanted: set[str] | None) -> Iterator[tuple[Channel, Message]]:
-    """Messages with their channels, in file order; `wanted` names topics, None = all messages of any program."""
+def _messages(file: BinaryIO, path: str | Path, wanted: set[str] | None) -> Iterator[tuple[Channel, str, Message]]:
+    """Messages with their channels and schema names, in file order; `wanted` names topics, None = all messages of any
+    program."""
     index = _index(file)
     channels: dict[int, Channel] = {} if index is None else dict(index.channels)
+    schemas: dict[int, str] = {} if index is None else {i: schema.name for i, schema in index.schemas.items()}
     if index is None:
         logger.warning("the log %s was cut off: reading the part that is complete", path)
     for chunk in _records(file, Opcode.CHUNK) if index is None else _indexed_chunks(file, index, wanted):
@@ -244,10 +257,12 @@ def _messages(file: BinaryIO, path: str | Path, wanted: set[str] | None) -> Iter
         for record in records:
             if isinstance(record, Channel):
                 channels[record.id] = record
+            elif isinstance(record, Schema):
+                schemas[record.id] = record.name
             elif isinstance(record, Message):
                 channel = channels[record.channel_id]
                 if wanted is None or channel.metadata.get("topic") in wanted:
-                    yield channel, record
+                    yield channel, schemas.get(channel.schema_id, ""), record
 
 
 def _index(file: BinaryIO) -> Summary | None:

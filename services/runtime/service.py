@@ -2,12 +2,15 @@
 
 from collections.abc import Awaitable, Callable, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Generic, Literal, TypeVar
 
 import msgspec
 
 from prior_sg.schemas.codec import Message
 from prior_sg.schemas.topics import Query, Topic
+
+State = TypeVar("State")
+Config = TypeVar("Config", bound=msgspec.Struct)
 
 
 class ServiceError(RuntimeError):
@@ -24,7 +27,7 @@ class Identity:
 
 
 @dataclass(frozen=True)
-class Errand:
+class Errand(Generic[Config]):
     """Slow or outside work of a service, such as a call over the network, which must hold up neither its steps nor its
     answers. `open(cfg, identity)`, called once when the service starts and never in a replay, gives the coroutine
     function that does it: request in, reply out; it must not raise for what may happen in ordinary life.
@@ -33,7 +36,7 @@ class Errand:
     name: str
     request: type[Message]
     reply: type[Message]
-    open: Callable[[Any, Identity], Callable[[Any], Awaitable[Message]]]
+    open: Callable[[Config, Identity], Callable[[Any], Awaitable[Message]]]
     key: str = ""  # no key: nobody else can ask
 
 
@@ -47,37 +50,36 @@ class Ask:
 
 
 Output = tuple[Topic, Message] | Ask
-Step = Callable[[Any, Message, Any], Iterator[Output]]
 
 
 @dataclass(frozen=True)
-class Service:
-    """One service: what it reads, writes and answers, and the functions that do it.
+class Service(Generic[State, Config]):
+    """One service: what it reads, writes and answers, and the functions that do it, over its own state and config.
 
     `step(state, message, cfg)` takes one input and yields outputs; it may change `state` and does nothing else.
     Inputs are messages of `reads`, of `job`, replies to its questions and errands, and `Tick` every `tick_s` seconds.
     `answers` maps a query to `f(state, request, cfg) -> reply`, which must not change the state.
-    `drive`, for sources only, is a coroutine that feeds inputs from outside (see `Port` in the host).
+    `drive`, for sources only, is a coroutine that feeds inputs from outside (see host/port.py).
     """
 
     name: str
     purpose: str
     scope: Literal["robot", "fleet"]
-    config: type[msgspec.Struct]
-    init: Callable[[Any, Identity], Any]
-    step: Step
+    config: type[Config]
+    init: Callable[[Config, Identity], State]
+    step: Callable[[State, Message, Config], Iterator[Output]]
     reads: tuple[Topic, ...] = ()
     writes: tuple[Topic, ...] = ()
-    answers: Mapping[Query, Callable[[Any, Any, Any], Message]] = field(default_factory=dict)
+    answers: Mapping[Query, Callable[[State, Any, Config], Message]] = field(default_factory=dict)
     asks: tuple[Query, ...] = ()
-    errands: tuple[Errand, ...] = ()
+    errands: tuple[Errand[Config], ...] = ()
     job: Topic | None = None  # the pool this service works for
-    job_group: Callable[[Any], str] = lambda cfg: ""  # workers of one group do the same work
-    prepare: Callable[[Any, list[Message], Any], None] | None = None  # told of jobs that wait; must not block
-    job_limit: Callable[[Any], int] = lambda cfg: 0  # of jobs written: how many may wait before the oldest is skipped
+    job_group: Callable[[Config], str] = lambda cfg: ""  # workers of one group do the same work
+    prepare: Callable[[State, list[Message], Config], None] | None = None  # told of jobs that wait; must not block
+    job_limit: Callable[[Config], int] = lambda cfg: 0  # jobs written that may wait before the oldest is skipped
     tick_s: float | None = None
-    drive: Callable[[Any, Any], Awaitable[None]] | None = None
-    key_fields: Callable[[Any], dict[str, str]] = lambda cfg: {}  # config values that appear in keys of `answers`
-    close: Callable[[Any], None] = lambda state: None
+    drive: Callable[[Any, Config], Awaitable[None]] | None = None
+    key_fields: Callable[[Config], dict[str, str]] = lambda cfg: {}  # config values that appear in keys of `answers`
+    close: Callable[[State], None] = lambda state: None
     replay_tolerance: float = 1e-6  # by which floats of a replay may differ; networks differ with threads and machine
-    replay_config: Callable[[Any], Any] = lambda cfg: cfg  # the config for a replay, which must touch nothing outside
+    replay_config: Callable[[Config], Config] = lambda cfg: cfg  # for a replay, which touches nothing outside

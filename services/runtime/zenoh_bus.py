@@ -2,7 +2,7 @@
 
 Every process is a client of a router on its own host (peers do not relay). `every` uses advanced publishers with a
 cache, history for late readers and recovery of missed samples; what these cannot recover is caught by the revisions of
-deltas.
+deltas. The encoding of everything sent names its schema; what comes in another version is brought to ours, or refused.
 """
 
 import contextlib
@@ -19,8 +19,9 @@ import zenoh
 from zenoh import CongestionControl, ConsolidationMode, Priority, QueryTarget, SampleKind
 from zenoh import ext as zx
 
-from prior_sg.schemas.codec import schema_name
-from prior_sg.schemas.topics import Topic
+from prior_sg.schemas.codec import Message, schema_name
+from prior_sg.schemas.migrations import received
+from prior_sg.schemas.topics import Topic, called_with
 from prior_sg.services.runtime.bus import (
     Answer,
     BusError,
@@ -124,12 +125,14 @@ class ZenohRequest:
 
     def __init__(self, query: zenoh.Query) -> None:
         self._query = query
-        self.payload = query.payload.to_bytes() if query.payload is not None else b""
+        request, self._reply = called_with(str(query.key_expr))
+        self.payload = _payload(request, query.payload, query.encoding)
 
     def reply(self, payload: bytes) -> None:
         """Answer; a caller that has gone away is no error."""
+        key = str(self._query.key_expr)
         with self._query:
-            _quietly(lambda: self._query.reply(str(self._query.key_expr), payload))
+            _quietly(lambda: self._query.reply(key, payload, encoding=_encoding(self._reply)))
 
     def refuse(self, reason: str) -> None:
         """Decline."""
@@ -169,7 +172,7 @@ class ZenohBus:
         publisher.put(payload, attachment=header)
 
     def _declare_publisher(self, topic: Topic, key: str) -> Any:
-        encoding = zenoh.Encoding("application/msgpack").with_schema(schema_name(topic.type))
+        encoding = _encoding(topic.type)
         if topic.delivery == "latest":
             return self._session.declare_publisher(
                 key, encoding=encoding, congestion_control=CongestionControl.DROP, priority=Priority.INTERACTIVE_HIGH
@@ -192,7 +195,8 @@ class ZenohBus:
         def receive(sample: zenoh.Sample) -> None:
             if sample.kind == SampleKind.PUT:
                 header = sample.attachment.to_bytes() if sample.attachment is not None else None
-                on_sample(Sample(topic, str(sample.key_expr), sample.payload.to_bytes(), *unpack_header(header)))
+                payload = _payload(topic.type, sample.payload, sample.encoding)
+                on_sample(Sample(topic, str(sample.key_expr), payload, *unpack_header(header)))
 
         if topic.delivery == "latest":
             self._entities.append(self._session.declare_subscriber(pattern, receive))
@@ -216,14 +220,16 @@ class ZenohBus:
 
     def call(self, key: str, payload: bytes, timeout_s: float, on_answer: OnAnswer) -> None:
         """Ask the nearest server of the key."""
+        request, reply = called_with(key)
         self._session.get(
             key,
-            _answer_once(on_answer),
+            _answer_once(reply, on_answer),
             target=QueryTarget.BEST_MATCHING,
             consolidation=ConsolidationMode.NONE,
             congestion_control=CongestionControl.BLOCK,
             timeout=timeout_s,
             payload=payload,
+            encoding=_encoding(request),
         )
 
     def announce(self, key: str) -> None:
@@ -243,7 +249,19 @@ class ZenohBus:
         _close_within(self._session, CLOSE_TIMEOUT_S)
 
 
-def _answer_once(on_answer: OnAnswer) -> Any:
+def _encoding(kind: type[Message] | None) -> zenoh.Encoding:
+    encoding = zenoh.Encoding("application/msgpack")
+    return encoding if kind is None else encoding.with_schema(schema_name(kind))
+
+
+def _payload(kind: type[Message] | None, payload: zenoh.ZBytes | None, encoding: zenoh.Encoding | None) -> bytes:
+    """What has arrived, in our version where it is a message."""
+    data = b"" if payload is None else payload.to_bytes()
+    schema = "" if encoding is None else str(encoding).partition(";")[2]
+    return data if kind is None or not data else received(kind, data, schema)
+
+
+def _answer_once(kind: type[Message] | None, on_answer: OnAnswer) -> Any:
     """A reply handler that calls back exactly once: with the first reply, or at the end with the reason for none."""
     answered = threading.Event()
 
@@ -252,7 +270,7 @@ def _answer_once(on_answer: OnAnswer) -> Any:
             return
         answered.set()
         if reply.ok is not None:
-            on_answer(Answer(reply.ok.payload.to_bytes()))
+            on_answer(Answer(_payload(kind, reply.ok.payload, reply.ok.encoding)))
         else:
             reason = reply.err.payload.to_string() if reply.err is not None else "nobody"
             on_answer(Answer(None, "timeout" if reason == "Timeout" else reason))

@@ -1,7 +1,9 @@
 """Keeps every robot's scene graph durably: reads deltas, writes revisions, answers with the scene."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
+from typing import TypeVar
 
 import msgspec
 
@@ -24,13 +26,15 @@ from prior_sg.schemas.topics import (
     SCENE_REVISION,
     TASK,
     TASK_IN_FORCE,
+    Query,
 )
-from prior_sg.services.deltas import Follower
+from prior_sg.services.deltas import Delta, Follower
 from prior_sg.services.runtime.service import Ask, Identity, Output, Service
 from prior_sg.services.scene_store.core import graph as core
 from prior_sg.services.scene_store.database import Database
 
 CHECKPOINT_S = 1.0  # the write-ahead log is folded into the file between deltas, not within a commit
+D = TypeVar("D", bound=Delta)
 
 
 @dataclass
@@ -65,11 +69,11 @@ def step(state: State, message: Message, cfg: core.Config) -> Iterator[Output]:
     yield from _resume(state)
     match message:
         case PlaceDelta():
-            yield from _take_places(state, message)
+            yield from _take_places(state, _known(state, message.robot), message)
         case RegionDelta():
-            yield from _take_regions(state, message)
+            yield from _take_regions(state, _known(state, message.robot), message)
         case ObjectDelta():
-            yield from _take_objects(state, message)
+            yield from _take_objects(state, _known(state, message.robot), message)
         case Task():
             if core.set_task(_known(state, message.robot).graph, message):
                 state.database.put_task(message)
@@ -88,38 +92,41 @@ def _resume(state: State) -> Iterator[Output]:
         yield Ask(OBJECT_SNAPSHOT, request)
 
 
-def _take_places(state: State, delta: PlaceDelta) -> Iterator[Output]:
-    robot = _known(state, delta.robot)
-    ready = robot.places.take(delta)
+def _take_places(state: State, robot: Robot, delta: PlaceDelta) -> Iterator[Output]:
+    """Where the cameras were is known even while the delta itself must wait."""
     cameras = core.note_cameras(robot.graph, delta)
-    if cameras and not ready:
+    if cameras and robot.places.verdict(delta) != "apply":
         state.database.put_cameras(delta.robot, cameras)
-    for due in ready:
-        changes = core.apply_places(robot.graph, due)
-        state.database.put_places(robot.graph, changes, cameras)
+    put = partial(state.database.put_places, cameras=cameras)
+    yield from _follow(state, robot, robot.places, delta, apply=core.apply_places, put=put, snapshot=PLACE_SNAPSHOT)
+
+
+def _take_regions(state: State, robot: Robot, delta: RegionDelta) -> Iterator[Output]:
+    put = state.database.put_regions
+    return _follow(state, robot, robot.regions, delta, apply=core.apply_regions, put=put, snapshot=REGION_SNAPSHOT)
+
+
+def _take_objects(state: State, robot: Robot, delta: ObjectDelta) -> Iterator[Output]:
+    put = state.database.put_objects
+    return _follow(state, robot, robot.objects, delta, apply=core.apply_objects, put=put, snapshot=OBJECT_SNAPSHOT)
+
+
+def _follow(
+    state: State,
+    robot: Robot,
+    follower: Follower[D],
+    delta: D,
+    *,
+    apply: Callable[[core.Graph, D], core.Changes],
+    put: Callable[[core.Graph, core.Changes], None],
+    snapshot: Query,
+) -> Iterator[Output]:
+    """Apply what is due of one writer's stream, make it durable and announce it; while deltas are missing, ask."""
+    for due in follower.take(delta):
+        put(robot.graph, apply(robot.graph, due))
         yield SCENE_REVISION, core.revision_of(robot.graph, state.epoch)
-    if robot.places.needs_snapshot:
-        yield Ask(PLACE_SNAPSHOT, SnapshotRequest(robot=delta.robot))
-
-
-def _take_regions(state: State, delta: RegionDelta) -> Iterator[Output]:
-    robot = _known(state, delta.robot)
-    for due in robot.regions.take(delta):
-        changes = core.apply_regions(robot.graph, due)
-        state.database.put_regions(robot.graph, changes)
-        yield SCENE_REVISION, core.revision_of(robot.graph, state.epoch)
-    if robot.regions.needs_snapshot:
-        yield Ask(REGION_SNAPSHOT, SnapshotRequest(robot=delta.robot))
-
-
-def _take_objects(state: State, delta: ObjectDelta) -> Iterator[Output]:
-    robot = _known(state, delta.robot)
-    for due in robot.objects.take(delta):
-        changes = core.apply_objects(robot.graph, due)
-        state.database.put_objects(robot.graph, changes)
-        yield SCENE_REVISION, core.revision_of(robot.graph, state.epoch)
-    if robot.objects.needs_snapshot:
-        yield Ask(OBJECT_SNAPSHOT, SnapshotRequest(robot=delta.robot))
+    if follower.needs_snapshot:
+        yield Ask(snapshot, SnapshotRequest(robot=robot.graph.robot))
 
 
 def _known(state: State, robot: str) -> Robot:

@@ -3,10 +3,10 @@
 from collections.abc import Iterator
 
 from prior_sg.schemas.codec import Message
-from prior_sg.schemas.features import Backfill, TextRequest
+from prior_sg.schemas.features import TextRequest
 from prior_sg.schemas.objects import ObjectDelta
 from prior_sg.schemas.places import SnapshotRequest
-from prior_sg.schemas.priors import PriorEvidence, PriorRequest, TaskRequest
+from prior_sg.schemas.priors import PriorRequest, TaskRequest
 from prior_sg.schemas.regions import PosteriorReply, PosteriorRequest, RegionDelta
 from prior_sg.schemas.topics import (
     BACKFILL,
@@ -26,6 +26,7 @@ from prior_sg.schemas.topics import (
     TASK,
     TASK_IN_FORCE,
     TEXT,
+    topic_of,
 )
 from prior_sg.services.runtime.service import Ask, Identity, Output, Service
 from prior_sg.services.segmenter.core import report, update
@@ -37,12 +38,6 @@ QUESTIONS = {
     PriorRequest: PRIORS,
     TaskRequest: TASK_IN_FORCE,
 }
-PUBLISHED = {
-    RegionDelta: REGION_DELTA,
-    ObjectDelta: OBJECT_DELTA,
-    Backfill: BACKFILL,
-    PriorEvidence: PRIOR_EVIDENCE,
-}
 
 
 def init(cfg: Config, identity: Identity) -> State:
@@ -53,7 +48,7 @@ def init(cfg: Config, identity: Identity) -> State:
 def step(state: State, message: Message, cfg: Config) -> Iterator[Output]:
     """One input; regions go to their topic, requests become questions."""
     for output in update.update(state, message, cfg):
-        topic = PUBLISHED.get(type(output))
+        topic = topic_of(type(output))
         yield (topic, output) if topic is not None else Ask(QUESTIONS[type(output)], output)
 
 

@@ -6,7 +6,7 @@ from prior_sg.schemas.priors import Keep, ModelRequest, Prior, Recall, Recalled
 from prior_sg.schemas.status import Tick
 from prior_sg.schemas.topics import PRIOR
 from prior_sg.services.prior_gateway import service
-from prior_sg.services.prior_gateway.core.compose import Config
+from prior_sg.services.prior_gateway.core.config import Config
 from prior_sg.services.prior_gateway.outside.archive import open_keep, open_recall
 from prior_sg.services.prior_gateway.outside.endpoint import open_endpoint
 from prior_sg.services.runtime.service import Ask, Identity

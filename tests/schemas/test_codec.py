@@ -23,7 +23,7 @@ from prior_sg.schemas.codec import (
     encode,
     schema_name,
 )
-from prior_sg.schemas.topics import QUERIES, TOPICS
+from prior_sg.schemas.topics import ENCODE, KEYFRAME, QUERIES, TOPICS, topic_of
 
 CAMERA = frames.Intrinsics(640, 480, 525.5, 526.5, 319.5, 239.5)
 POSE = np.array([[0.0, -1, 0, 1.5], [1, 0, 0, -2.5], [0, 0, 1, 3.5], [0, 0, 0, 1]])
@@ -403,3 +403,10 @@ def test_one_key_per_topic_and_type_names_are_versioned():
     keys = [entry.key for entry in (*TOPICS, *QUERIES)]
     assert len(set(keys)) == len(keys)
     assert schema_name(scene.Scene) == "Scene/1"
+
+
+def test_a_message_type_names_the_topic_it_is_published_on():
+    published = [topic for topic in TOPICS if topic is not ENCODE]
+    assert [topic_of(topic.type) for topic in published] == published  # each type on one topic, beside its jobs
+    assert topic_of(ENCODE.type) is KEYFRAME
+    assert topic_of(scene.SceneRequest) is None

@@ -4,9 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from prior_sg.schemas.regions import NO_REGION
 from prior_sg.services.segmenter.core.regions.components import components
 
-from .common import NO_LABEL, NO_REGION, Answer, Inputs, similarities
+from .common import NO_LABEL, Answer, Inputs, similarities
 
 
 @dataclass(frozen=True)

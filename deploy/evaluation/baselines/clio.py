@@ -10,9 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from prior_sg.schemas.regions import NO_REGION
 from prior_sg.services.geometry import inverse, project, transform
 
-from .common import NO_LABEL, NO_REGION, Answer, Inputs, similarities
+from .common import NO_LABEL, Answer, Inputs, similarities
 
 EPSILON = 1e-12  # score of a task that does not count
 

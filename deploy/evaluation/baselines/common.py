@@ -12,12 +12,11 @@ import numpy as np
 
 from prior_sg.schemas.features import Pyramid, TextEmbeddings
 from prior_sg.schemas.places import PlaceDelta, VoxelMap
-from prior_sg.schemas.regions import Region
+from prior_sg.schemas.regions import NO_REGION, Region
 from prior_sg.schemas.scene import Scene
 from prior_sg.services.segmenter.core.evidence import kernel
 from prior_sg.services.segmenter.core.regions.components import footprint_m2
 
-NO_REGION = -1
 NO_LABEL = ""
 FOOTPRINT_CELL_M = 0.1
 

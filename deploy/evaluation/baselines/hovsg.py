@@ -17,8 +17,9 @@ from scipy.cluster.vq import kmeans2
 from scipy.spatial import cKDTree
 
 from prior_sg.schemas.places import VoxelMap
+from prior_sg.schemas.regions import NO_REGION
 
-from .common import NO_LABEL, NO_REGION, Answer, Inputs, Views, similarities
+from .common import NO_LABEL, Answer, Inputs, Views, similarities
 
 BACKGROUND = 1  # watershed marker of the corner outside the building
 

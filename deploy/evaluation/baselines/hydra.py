@@ -9,7 +9,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .common import NO_LABEL, NO_REGION, Answer, Inputs, similarities
+from prior_sg.schemas.regions import NO_REGION
+
+from .common import NO_LABEL, Answer, Inputs, similarities
 
 
 @dataclass(frozen=True)

@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 
 from prior_sg.services.feature_pyramid import pretrained
-from prior_sg.services.feature_pyramid.core.crops import Config
-from prior_sg.services.feature_pyramid.detectors.base import Grid
+from prior_sg.services.feature_pyramid.core.config import Config
+from prior_sg.services.feature_pyramid.core.lift import Grid
 from prior_sg.services.feature_pyramid.encoders.base import EncoderUnavailable
 
 KINDS = "depth or sam:MODEL"

@@ -5,8 +5,10 @@ from typing import Any
 import numpy as np
 
 from prior_sg.services.feature_pyramid import pretrained
-from prior_sg.services.feature_pyramid.core.crops import Config
-from prior_sg.services.feature_pyramid.detectors.base import Detector, Found, Grid, Shot, mask_in_box, without_doubles
+from prior_sg.services.feature_pyramid.core.config import Config
+from prior_sg.services.feature_pyramid.core.lift import Grid, mask_in_box, without_doubles
+from prior_sg.services.feature_pyramid.core.upright import quarter_turns, turned, turned_back
+from prior_sg.services.feature_pyramid.detectors.base import Detector, Found, Shot
 from prior_sg.services.feature_pyramid.detectors.masks import load_masks
 
 MODELS = {"grounding_dino": "GroundingDinoForObjectDetection", "owlv2": "Owlv2ForObjectDetection"}
@@ -27,7 +29,9 @@ class Prompted(Detector):
     def detect(self, shot: Shot, sought: tuple[str, ...] = ()) -> list[Found]:
         if not sought:
             return []
-        boxes_px, scores, names = self.boxes(shot.color, sought)
+        turns, (height_px, width_px) = quarter_turns(shot.world_from_camera), shot.color.shape[:2]
+        boxes_px, scores, names = self.boxes(turned(shot.color, turns), sought)
+        boxes_px = turned_back(boxes_px, turns, width_px, height_px)
         keep = np.flatnonzero(scores >= self.cfg.detector_threshold)
         keep = keep[without_doubles(boxes_px[keep], scores[keep])][: self.cfg.segments.most]
         grid = Grid.of(shot.depth_m, self.cfg.segments.cell_px)

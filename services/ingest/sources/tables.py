@@ -11,6 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from prior_sg.services.runtime.service import ServiceError
+
 NS_PER = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
 EPOCH_NS = (946_684_800 * 10**9, 4_102_444_800 * 10**9)  # 2000 to 2100: a stamp in between is a date
 EPOCH_SPACING_NS = (500_000, 10**12)  # and then frames lie between half a millisecond and a quarter of an hour apart
@@ -22,7 +24,7 @@ NUMBER = re.compile(r"[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?|[-+]?(?:nan|
 BOMS = ((b"\xff\xfe", "utf-16"), (b"\xfe\xff", "utf-16"))
 
 
-class SourceError(RuntimeError):
+class SourceError(ServiceError):
     """A source cannot be opened; the text is one sentence for the user."""
 
 

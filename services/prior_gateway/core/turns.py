@@ -7,8 +7,7 @@ back with its faults.
 """
 
 import json
-import math
-from collections.abc import Callable, Generator, Iterable, Sequence
+from collections.abc import Callable, Generator, Iterable
 from dataclasses import dataclass, field
 from string import Template
 from typing import Any, TypeVar
@@ -16,7 +15,23 @@ from typing import Any, TypeVar
 import msgspec
 import numpy as np
 
-from prior_sg.schemas.priors import LONGEST_NAME, LONGEST_PHRASE, MOST_REGIONS, Prior, Task
+from prior_sg.schemas.priors import MOST_REGIONS, Prior, Task
+from prior_sg.services.prior_gateway.core.faults import (
+    LARGEST_CM,
+    Described,
+    NamedList,
+    Placed,
+    Sized,
+    faults_of_description,
+    faults_of_keys,
+    faults_of_names,
+    faults_of_percentages,
+    faults_of_places,
+    faults_of_size,
+    faults_of_spans,
+    parse,
+    unknown,
+)
 
 PROMPT_FIELDS: dict[str, set[str]] = {
     "system": set(),
@@ -35,9 +50,7 @@ MOST_FAULTS = 12  # told at once
 LONGEST_ECHO = 8000  # characters of a faulty answer that go back to the model
 ASYMMETRY = 15.0  # percent by which two statements about one pair may differ; their mean counts
 OBJECTS_PER_REGION = 8  # asked for
-MOST_LISTED = 16  # objects or phrases of one region
 LEAST, MOST = 0.01, 0.99  # no estimate of a model is certain
-LARGEST_CM, HIGHEST_CM = 10_000, 2_000  # sides of an object, and its lower edge above the floor
 
 Schema = dict[str, Any]
 A = TypeVar("A")
@@ -119,44 +132,6 @@ class Draft:
 
 class Unusable(Exception):
     """The model's answer still had faults after all repairs; the message is one sentence."""
-
-
-class Described(msgspec.Struct):
-    """What a model says of one region."""
-
-    phrases: list[str]
-    objects: list[str]
-    inclination_deg: float
-    inclination_spread_deg: float
-    scale_cm: float
-
-
-class Sized(msgspec.Struct):
-    """What a model says of the size of one object."""
-
-    longest_cm: float
-    shortest_cm: float
-    height_cm: float
-    bottom_cm: float
-
-
-class Placed(msgspec.Struct):
-    """Zone and share of one region."""
-
-    parent: str
-    share: float
-
-
-class Named(Placed):
-    """A region that the model has chosen."""
-
-    name: str
-
-
-class NamedList(msgspec.Struct):
-    """The answer to `regions`."""
-
-    regions: list[Named]
 
 
 @dataclass
@@ -247,7 +222,7 @@ def choose_regions(talk: Talk) -> Dialogue[tuple[list[str], dict[str, Placed]]]:
         faults = [f"the region {name!r} is named more than once" for name in sorted({*names}) if names.count(name) > 1]
         if len(found) < 3 or len(found) > talk.cfg.most_regions:
             faults.append(f"name between 3 and {talk.cfg.most_regions} different regions; there are {len(found)}")
-        return found, faults + _faults_of_names("region", names) + _faults_of_places(found)
+        return found, faults + faults_of_names("region", names) + faults_of_places(found)
 
     found = yield from talk.ask("regions", schema, read, most_regions=str(talk.cfg.most_regions))
     return list(found), found
@@ -261,7 +236,7 @@ def place_regions(talk: Talk, regions: list[str]) -> Dialogue[dict[str, Placed]]
         found, faults = parse(text, dict[str, Placed])
         if found is None:
             return {}, faults
-        return found, _faults_of_keys("region", found, regions) or _faults_of_places(found)
+        return found, faults_of_keys("region", found, regions) or faults_of_places(found)
 
     return (yield from talk.ask("fixed_regions", schema, read, regions=", ".join(regions)))
 
@@ -282,12 +257,12 @@ def describe(talk: Talk, batch: list[str]) -> Dialogue[dict[str, Described]]:
         found, faults = parse(text, dict[str, Described])
         if found is None:
             return {}, faults
-        if faults := _faults_of_keys("region", found, batch):
+        if faults := faults_of_keys("region", found, batch):
             return {}, faults
         for entry in found.values():
             entry.phrases = _tidy(entry.phrases)
             entry.objects = _tidy(name.casefold() for name in entry.objects)
-        return found, [fault for name, entry in found.items() for fault in _faults_of_description(name, entry)]
+        return found, [fault for name, entry in found.items() for fault in faults_of_description(name, entry)]
 
     return (yield from talk.ask("describe", _object(dict.fromkeys(batch, form)), read, batch=", ".join(batch)))
 
@@ -301,8 +276,8 @@ def sizes(talk: Talk, batch: list[str]) -> Dialogue[dict[str, Sized]]:
         found, faults = parse(text, dict[str, Sized])
         if found is None:
             return {}, faults
-        faults = _faults_of_keys("object", found, batch)
-        faults += [fault for name, entry in found.items() for fault in _faults_of_size(name, entry)]
+        faults = faults_of_keys("object", found, batch)
+        faults += [fault for name, entry in found.items() for fault in faults_of_size(name, entry)]
         longest = [entry.longest_cm for entry in found.values()]
         if any(value != round(value) for value in longest) and max(longest) <= 10:
             faults.append("the lengths look like metres; give centimetres")
@@ -343,18 +318,18 @@ def read_matrix(
     found, faults = parse(text, dict[str, dict[str, float]])
     if found is None:
         return {}, faults
-    faults = _faults_of_keys(kinds[0], found, list(form))
+    faults = faults_of_keys(kinds[0], found, list(form))
     for row, columns in form.items():
         if row in found:
-            faults += _faults_of_keys(kinds[1], found[row], columns, f" of {row!r}")
-    return found, faults + _faults_of_percentages(found)
+            faults += faults_of_keys(kinds[1], found[row], columns, f" of {row!r}")
+    return found, faults + faults_of_percentages(found)
 
 
 def read_adjacency(found: dict[str, dict[str, float]], regions: list[str]) -> tuple[np.ndarray, list[str]]:
     """The symmetric matrix of probabilities, and what is wrong with what was found."""
-    faults = [f"there is no region {name!r}" for name in _unknown(found, regions)]
-    faults += [f"there is no region {name!r}" for row in found.values() for name in _unknown(row, regions)]
-    faults += _faults_of_percentages(found)
+    faults = [f"there is no region {name!r}" for name in unknown(found, regions)]
+    faults += [f"there is no region {name!r}" for row in found.values() for name in unknown(row, regions)]
+    faults += faults_of_percentages(found)
     matrix = np.eye(len(regions))
     for i, one in enumerate(regions):
         for j, other in enumerate(regions[:i]):
@@ -387,44 +362,16 @@ def revise(prior: Prior, told: str, form: dict[str, dict[str, dict[str, tuple[fl
         found, faults = parse(text, dict[str, dict[str, dict[str, float]]])
         if found is None:
             return {}, faults
-        faults = _faults_of_keys("matrix", found, list(form))
+        faults = faults_of_keys("matrix", found, list(form))
         for kind, rows in form.items():
-            faults += _faults_of_keys("region", found.get(kind, {}), list(rows), f" of {kind}")
+            faults += faults_of_keys("region", found.get(kind, {}), list(rows), f" of {kind}")
             for row, columns in rows.items():
                 given = found.get(kind, {}).get(row, {})
-                faults += _faults_of_keys("entry", given, list(columns), f" of {row!r}")
-                faults += _faults_of_spans(row, given, columns)
+                faults += faults_of_keys("entry", given, list(columns), f" of {row!r}")
+                faults += faults_of_spans(row, given, columns)
         return found, faults
 
     return (yield from talk.ask("revise", schema, read, disagreements=told))
-
-
-def _faults_of_spans(row: str, given: dict[str, float], columns: dict[str, tuple[float, float]]) -> list[str]:
-    return [
-        f"{row!r}, {name!r}: {given[name]:g} lies outside {min(span):.0f} to {max(span):.0f}, "
-        "which were expected and observed"
-        for name, span in columns.items()
-        if name in given and not math.floor(min(span)) <= given[name] <= math.ceil(max(span))
-    ]
-
-
-def parse(text: str, kind: type[A]) -> tuple[A | None, list[str]]:
-    """The JSON object in an answer, decoded and typed, or the one fault that prevents it. Thoughts before and a code
-    fence around it are ignored; text in its place is no answer."""
-    start, end = text.find("{"), text.rfind("}")
-    if "</think>" in text:
-        start = text.find("{", text.rfind("</think>"))
-    if start < 0:
-        said = " ".join(text.split())[:120]
-        return None, [f"there is no JSON object in it, but: {said!r}" if said else "it is empty"]
-    if end < start:
-        return None, ["the JSON object is cut off; answer more briefly"]
-    try:
-        return msgspec.json.decode(text[start : end + 1], type=kind), []
-    except msgspec.ValidationError as error:
-        return None, [f"it does not have the form asked for: {error}"]
-    except msgspec.DecodeError as error:
-        return None, [f"it is not valid JSON: {error}"]
 
 
 TEXT: Schema = {"type": "string"}
@@ -444,77 +391,6 @@ def _probability(percent: Any) -> np.ndarray:
     return np.clip(np.asarray(percent, dtype=float) / 100, LEAST, MOST)
 
 
-def _unknown(found: dict[str, Any], known: Sequence[str]) -> list[str]:
-    return [name for name in found if name not in known]
-
-
-def _faults_of_keys(kind: str, found: dict[str, Any], wanted: list[str], where: str = "") -> list[str]:
-    faults = [f"there is no {kind} {name!r}{where}" for name in _unknown(found, wanted)]
-    return faults + [f"the {kind} {name!r}{where} is missing" for name in wanted if name not in found]
-
-
-def _faults_of_names(kind: str, names: Sequence[str]) -> list[str]:
-    faults = [
-        f"a name of the kind {kind} has neither letter nor digit"
-        for name in names
-        if not any(c.isalnum() for c in name)
-    ]
-    return faults + [f"the name {name[:LONGEST_NAME]!r}... is too long" for name in names if len(name) > LONGEST_NAME]
-
-
-def _faults_of_places(found: dict[str, Placed]) -> list[str]:
-    faults = [
-        f"{name!r}: the share {at.share:g} is no percentage" for name, at in found.items() if not 0 <= at.share <= 100
-    ]
-    total = sum(at.share for at in found.values())
-    if not faults and total <= 2:  # fractions, or nothing at all
-        faults.append(f"the shares sum to {total:g}; they are percentages and sum to 100")
-    return faults + _faults_of_names("zone", [at.parent for at in found.values() if at.parent])
-
-
 def _tidy(texts: Iterable[str]) -> list[str]:
     """Each text once, with single spaces; one without letter or digit says nothing and is left out."""
     return [text for text in dict.fromkeys(" ".join(text.split()) for text in texts) if any(c.isalnum() for c in text)]
-
-
-def _faults_of_description(name: str, entry: Described) -> list[str]:
-    faults = _faults_of_names("object", entry.objects)
-    if not entry.phrases:
-        faults.append(f"{name!r}: there is no phrase")
-    if not 1 <= len(entry.objects) <= MOST_LISTED or len(entry.phrases) > MOST_LISTED:
-        faults.append(f"{name!r}: give 1 to {MOST_LISTED} objects and as many phrases at most")
-    faults += [
-        f"{name!r}: a phrase is longer than {LONGEST_PHRASE} characters"
-        for p in entry.phrases
-        if len(p) > LONGEST_PHRASE
-    ]
-    if not (0 <= entry.inclination_deg <= 90 and 0 < entry.inclination_spread_deg <= 90):
-        faults.append(f"{name!r}: inclination must be 0 to 90 degrees, its spread above 0")
-    if not 10 <= entry.scale_cm <= 10000:
-        faults.append(f"{name!r}: scale_cm {entry.scale_cm:g} is no sensible distance in centimetres")
-    return faults
-
-
-def _faults_of_size(name: str, entry: Sized) -> list[str]:
-    sides = (entry.longest_cm, entry.shortest_cm, entry.height_cm)
-    faults = []
-    if min(sides) <= 0 or max(sides) > LARGEST_CM:
-        faults.append(f"{name!r}: sides are centimetres between 0 and {LARGEST_CM}")
-    if entry.shortest_cm > entry.longest_cm:
-        faults.append(f"{name!r}: the shortest side is longer than the longest")
-    if not 0 <= entry.bottom_cm <= HIGHEST_CM:
-        faults.append(f"{name!r}: its lower edge is 0 to {HIGHEST_CM} centimetres above the floor")
-    return faults
-
-
-def _faults_of_percentages(found: dict[str, dict[str, float]]) -> list[str]:
-    values = [value for row in found.values() for value in row.values()]
-    faults = [
-        f"{row!r}, {column!r}: {value:g} is no percentage"
-        for row, columns in found.items()
-        for column, value in columns.items()
-        if not 0 <= value <= 100
-    ]
-    if any(value != round(value) for value in values) and max(values) <= 1:
-        faults.append("the values look like fractions; give percentages from 0 to 100")
-    return faults

@@ -13,7 +13,7 @@ import msgspec
 
 from prior_sg.schemas.codec import DecodeError, Message, decode, encode
 from prior_sg.schemas.priors import Keep, Kept, Prior, PriorEvidence, Recall, Recalled
-from prior_sg.services.prior_gateway.core.compose import Config
+from prior_sg.services.prior_gateway.core.config import Config
 from prior_sg.services.prior_gateway.outside.signing import Signer
 from prior_sg.services.runtime.service import Identity
 
@@ -36,8 +36,8 @@ def task_digest(environment: str, task: str, regions: list[str]) -> str:
     return hashlib.blake2b(msgspec.msgpack.encode((environment, task, regions)), digest_size=12).hexdigest()
 
 
-class Archive:
-    """The folder. Without a path nothing is kept and nothing found; damaged files are told in the log and skipped."""
+class PriorShelf:
+    """The archive's folder. Without a path nothing is kept or found; damaged files are told in the log and skipped."""
 
     def __init__(self, path: str, kept_maps: int = 256) -> None:
         self.root = Path(path).expanduser() if path else None
@@ -123,22 +123,22 @@ def _write(path: Path, content: bytes) -> None:
 
 def open_recall(cfg: Config, identity: Identity) -> Callable[[Recall], Awaitable[Recalled]]:
     """The errand that looks into the archive."""
-    archive = Archive(cfg.archive)
+    shelf = PriorShelf(cfg.archive)
 
     async def recall(request: Recall) -> Recalled:
-        return await asyncio.to_thread(archive.recall, request)
+        return await asyncio.to_thread(shelf.recall, request)
 
     return recall
 
 
 def open_keep(cfg: Config, identity: Identity) -> Callable[[Keep], Awaitable[Kept]]:
     """The errand that keeps, dates and signs. Raises ServiceError for unusable keys."""
-    archive = Archive(cfg.archive, cfg.learning.kept_maps)
+    shelf = PriorShelf(cfg.archive, cfg.learning.kept_maps)
     signer = Signer(cfg.signing_key, cfg.trusted_keys)
 
     def keep_now(request: Keep) -> Kept:
         if request.evidence is not None:
-            archive.put_evidence(request.evidence)
+            shelf.put_evidence(request.evidence)
         if (prior := request.prior) is None:
             return Kept()
         if request.own:
@@ -147,7 +147,7 @@ def open_keep(cfg: Config, identity: Identity) -> Callable[[Keep], Awaitable[Kep
         if cfg.require_signature and not (trusted or request.own):
             log.warning("a prior from elsewhere is not trusted: left out", extra={"why": verdict})
             return Kept(question=request.question, verdict=verdict)
-        archive.put(prior, PREFERRED if request.preferred else request.question, request.root, verdict)
+        shelf.put(prior, PREFERRED if request.preferred else request.question, request.root, verdict)
         return Kept(prior=prior, question=request.question, verdict=verdict)
 
     async def keep(request: Keep) -> Kept:

@@ -24,7 +24,7 @@ import httpx
 import msgspec
 
 from prior_sg.schemas.priors import ModelReply, ModelRequest
-from prior_sg.services.prior_gateway.core.compose import DEFAULT_ENDPOINTS, Config
+from prior_sg.services.prior_gateway.core.config import DEFAULT_ENDPOINTS, Config
 from prior_sg.services.runtime.service import Identity, ServiceError
 
 log = logging.getLogger(__name__)

@@ -5,43 +5,34 @@ All of a service's state is touched by one worker thread only; the event loop ha
 
 import asyncio
 import logging
-import math
 import os
 import threading
 import time
-from collections import deque
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
-from statistics import quantiles
 from typing import Any, cast
 
 import msgspec
 import psutil
 
-from prior_sg.schemas.codec import DecodeError, Message, decode, encode
+from prior_sg.schemas.codec import DecodeError, Message, decode, encode, versions
 from prior_sg.schemas.status import Consumed, JobDone, ServiceStatus, Started, StatusRequest, Tick, TopicCount
 from prior_sg.schemas.topics import JOURNAL, Query, Topic, alive_key, status_key, worker_keys
-from prior_sg.services.runtime.bus import Answer, Bus, Request, Sample, pack_header
+from prior_sg.services.runtime.bus import Bus, Request, Sample
+from prior_sg.services.runtime.host.asks import Asks, Reply
 from prior_sg.services.runtime.host.flow import Progress
 from prior_sg.services.runtime.host.inbox import Inbox
-from prior_sg.services.runtime.jobs.dispatcher import CREDITS, Ended, JobPool
-from prior_sg.services.runtime.service import Ask, Errand, Identity, Service
+from prior_sg.services.runtime.host.outbox import Outbox
+from prior_sg.services.runtime.host.port import Fed, Port
+from prior_sg.services.runtime.host.timing import Timing
+from prior_sg.services.runtime.jobs.board import Ended
+from prior_sg.services.runtime.jobs.dispatcher import CREDITS
+from prior_sg.services.runtime.jobs.pool import JobPool
+from prior_sg.services.runtime.service import Ask, Identity, Service
 
 log = logging.getLogger(__name__)
-
-ASK_TIMEOUT_S = 10.0
-ASK_RETRY_S = 0.5
-RECENT_STEPS = 512
-
-
-@dataclass(frozen=True)
-class Reply:
-    """An answer to one of the service's questions."""
-
-    ask: Ask
-    payload: bytes
 
 
 @dataclass(frozen=True)
@@ -60,14 +51,6 @@ class Work:
     message: Message | None  # None = malformed
 
 
-@dataclass(frozen=True)
-class Fed:
-    """An input from the service's own `drive`."""
-
-    message: Message
-    done: Callable[[], None]
-
-
 class UndeclaredError(Exception):
     """A service wrote or asked what its declaration does not name: a fault in the service."""
 
@@ -77,29 +60,24 @@ class Host:
 
     def __init__(self, service: Service, bus: Bus, cfg: Any, identity: Identity) -> None:
         self.service, self.bus, self.cfg, self.identity = service, bus, cfg, identity
-        self.writer = f"{service.name}/{identity.instance}/{identity.epoch}"
         self.inbox = Inbox(wake=self._wake)
         self.stopping = asyncio.Event()
         self._loop = asyncio.get_running_loop()
         self._waiting = asyncio.Event()
         self._thread = ThreadPoolExecutor(1, thread_name_prefix=service.name)
-        self._sequences: dict[str, int] = {}
-        self._order = 0
-        self._asks: dict[tuple[str, bytes], Ask] = {}
-        self._errands: dict[Errand, Callable[[Any], Awaitable[Message]]] = {}
-        self._running: set[asyncio.Task] = set()
-        self._fault: asyncio.Future = self._loop.create_future()  # of an errand that raised
+        self._asks = Asks(bus, self.inbox, self.stopping)
         self._pools: dict[Topic, JobPool] = {}
         self._slots = threading.Semaphore(CREDITS)
         self._progress = Progress()
-        self._started_s = time.monotonic()
-        self._steps: deque[tuple[float, float]] = deque(maxlen=RECENT_STEPS)  # (end, duration), seconds
+        self._outbox = Outbox(service.name, identity, bus, self._progress)
+        self._timing = Timing()
         self._state: Any = None
 
     async def run(self) -> None:
         """Build the state, join the bus, and work until stopped."""
         self._state = await self._on_thread(self.service.init, self.cfg, self.identity)
-        self._errands = {errand: errand.open(self.cfg, self.identity) for errand in self.service.errands}
+        for errand in self.service.errands:
+            self._asks.can_do(errand, errand.open(self.cfg, self.identity))
         await self._on_thread(self._join)
         tasks = [asyncio.create_task(self._work())]
         if self.service.tick_s is not None:
@@ -108,14 +86,14 @@ class Host:
             tasks.append(asyncio.create_task(self._drive()))
         stop = asyncio.create_task(self.stopping.wait())
         try:
-            pending = {*tasks, self._fault, stop}
+            pending = {*tasks, self._asks.fault, stop}
             while not stop.done():
                 done, pending = await asyncio.wait(pending, return_when=asyncio.FIRST_COMPLETED)
                 for task in done:
                     task.result()
-            await self._on_thread(self._journal, "STOP")  # only of an orderly end
+            await self._on_thread(self._outbox.journal, "STOP")  # only of an orderly end
         finally:
-            under_way = (*tasks, *self._running, self._fault, stop)
+            under_way = (*tasks, *self._asks.tasks, stop)
             for task in under_way:
                 task.cancel()
             await asyncio.gather(*under_way, return_exceptions=True)
@@ -144,8 +122,9 @@ class Host:
             epoch=self.identity.epoch,
             config=config,
             reads=[topic.name for topic in service.reads],
+            versions=versions(),
         )
-        self._journal("START", inline=encode(started))
+        self._outbox.journal("START", inline=encode(started))
         log.info("started", extra={"robot": robot, "config": msgspec.to_builtins(self.cfg)})
         for query in service.answers:
             fields = {name: robot if name == "robot" else "*" for name in query.request.__struct_fields__}
@@ -189,7 +168,7 @@ class Host:
                 self._handle_sample(item)
             case Tick():
                 self._step(item)
-                self._journal("Tick", inline=encode(item))
+                self._outbox.journal("Tick", inline=encode(item))
             case Reply():
                 self._handle_reply(item)
             case Question():
@@ -211,7 +190,7 @@ class Host:
         self._step(message)
         counts.consumed += 1
         known = bool(sample.writer)
-        self._journal(
+        self._outbox.journal(
             sample.topic.name,
             frame_id=getattr(message, "frame_id", -1),
             writer=sample.writer,
@@ -224,11 +203,11 @@ class Host:
         query = reply.ask.query
         message = self._decoded(query.reply, reply.payload, query.name, query.key, "")
         if message is None:
-            self._loop.call_soon_threadsafe(self._loop.call_later, ASK_RETRY_S, self._call_again, reply.ask)
+            self._asks.ask_later(reply.ask)
             return
-        self._asks.pop((query.name, encode(reply.ask.request)), None)
+        self._asks.answered(reply.ask)
         self._step(message)
-        self._journal(query.name, inline=reply.payload)
+        self._outbox.journal(query.name, inline=reply.payload)
 
     def _handle_question(self, question: Question) -> None:
         query = question.query
@@ -262,7 +241,7 @@ class Host:
             log.exception("job failed", extra={"topic": job.name, "frame_id": getattr(message, "frame_id", -1)})
             work.request.refuse(f"failed: {error}")
             return
-        self._journal(job.name, frame_id=getattr(message, "frame_id", -1))
+        self._outbox.journal(job.name, frame_id=getattr(message, "frame_id", -1))
         work.request.reply(b"done")
 
     def _queue_question(self, query: Query, request: Request) -> None:
@@ -302,8 +281,7 @@ class Host:
                 self._ask(output)
             else:
                 self._publish(*output)
-        ended_s = time.monotonic()
-        self._steps.append((ended_s, ended_s - started_s))
+        self._timing.stepped(started_s)
 
     def _publish(self, topic: Topic, message: Message) -> None:
         if topic not in self.service.writes:
@@ -314,68 +292,12 @@ class Host:
             group = getattr(message, "space", "")  # of a back-fill, which gives way to the stream
             self._pools[topic].submit(job_id, encode(message), group, later=bool(group))
         else:
-            self._put(topic, message)
-
-    def _put(self, topic: Topic, message: Message) -> None:
-        key = topic.key_of(message)
-        sequence = self._sequences.get(key, 0)
-        self._sequences[key] = sequence + 1
-        if topic is not JOURNAL:
-            self._progress.published(topic.name, sequence)
-        self.bus.put(topic, key, encode(message), pack_header(self.writer, sequence, time.time_ns()))
-
-    def _journal(self, topic: str, **fields: Any) -> None:
-        """One more input is finished with; `fields` are those of `Consumed` that say which."""
-        entry = Consumed(
-            robot=self.identity.robot if self.identity.robot != "*" else "fleet",
-            service=self.service.name,
-            instance=self.identity.instance,
-            order=self._order,
-            topic=topic,
-            **fields,
-        )
-        self._order += 1
-        self._put(JOURNAL, entry)
+            self._outbox.put(topic, message)
 
     def _ask(self, ask: Ask) -> None:
         if ask.query not in (*self.service.asks, *self.service.errands):
             raise UndeclaredError(f"{self.service.name} asked {ask.query.name}, which it does not declare")
-        name = (ask.query.name, encode(ask.request))
-        if name not in self._asks:
-            self._asks[name] = ask
-            self._call(ask)
-
-    def _call(self, ask: Ask) -> None:
-        if isinstance(ask.query, Errand):
-            self._loop.call_soon_threadsafe(self._run_errand, ask)
-            return
-
-        def answered(answer: Answer) -> None:
-            if answer.payload is not None:
-                self.inbox.put(Reply(ask, answer.payload))
-            else:
-                log.debug("no answer yet", extra={"query": ask.query.name, "reason": answer.reason})
-                self._loop.call_soon_threadsafe(self._loop.call_later, ASK_RETRY_S, self._call_again, ask)
-
-        self.bus.call(ask.query.key_of(ask.request), encode(ask.request), ASK_TIMEOUT_S, answered)
-
-    def _run_errand(self, ask: Ask) -> None:
-        async def work() -> None:
-            reply = await self._errands[ask.query](ask.request)  # type: ignore[index]
-            self.inbox.put(Reply(ask, encode(reply)))
-
-        task = self._loop.create_task(work())
-        self._running.add(task)
-        task.add_done_callback(self._errand_ended)
-
-    def _errand_ended(self, task: asyncio.Task) -> None:
-        self._running.discard(task)
-        if not task.cancelled() and (error := task.exception()) is not None and not self._fault.done():
-            self._fault.set_exception(error)
-
-    def _call_again(self, ask: Ask) -> None:
-        if not self.stopping.is_set():
-            self._loop.run_in_executor(None, self._call, ask)
+        self._asks.ask(ask)
 
     def _job_ended(self, topic: Topic) -> Callable[[Ended], None]:
         def ended(job: Ended) -> None:
@@ -397,7 +319,8 @@ class Host:
 
     async def _drive(self) -> None:
         assert self.service.drive is not None
-        await self.service.drive(Port(self), self.cfg)
+        port = Port(self.identity.robot, self.stopping, self.inbox, self._progress, self.service.writes, self._pools)
+        await self.service.drive(port, self.cfg)
 
     def _missed(self, topic: Topic, number: int) -> None:
         self.inbox.missed(topic.name, number)
@@ -409,7 +332,7 @@ class Host:
             if entry.topic == "START":
                 self._progress.reader(entry.instance, decode(Started, entry.inline).reads)
             else:
-                own = entry.writer == self.writer
+                own = entry.writer == self._outbox.writer
                 self._progress.consumed(entry.instance, entry.topic, entry.sequence if own else -1)
         except DecodeError as error:
             self.inbox.of(JOURNAL.name).malformed += 1
@@ -432,59 +355,21 @@ class Host:
 
     def status(self) -> ServiceStatus:
         """Health of this process now."""
-        now_s = time.monotonic()
-        steps = list(self._steps)
-        durations_ms = sorted(1e3 * duration for _, duration in steps)
-        cuts = quantiles(durations_ms, n=100) if len(durations_ms) > 1 else durations_ms * 99 or [0.0] * 99
-        window_s = min(10.0, max(now_s - self._started_s, 1e-3))
-        busy_s = sum(duration for end, duration in steps if end > now_s - window_s)
+        figures = self._timing.figures()
         return ServiceStatus(
             service=self.service.name,
             instance=self.identity.instance,
             robot=self.identity.robot,
             pid=os.getpid(),
-            uptime_s=now_s - self._started_s,
+            uptime_s=figures.uptime_s,
             backlog=len(self.inbox),
-            busy_share=min(1.0, busy_s / window_s),
-            step_ms_p50=cuts[49],
-            step_ms_p99=cuts[98],
+            busy_share=figures.busy_share,
+            step_ms_p50=figures.step_ms_p50,
+            step_ms_p99=figures.step_ms_p99,
             resident_mb=psutil.Process().memory_info().rss / 1e6,
-            waiting_for=sorted({name for name, _ in list(self._asks)}),
+            waiting_for=self._asks.waiting_for,
             topics=[TopicCount(topic=name, **vars(counts)) for name, counts in sorted(self.inbox.counts.items())],
         )
 
     async def _on_thread(self, function: Callable[..., Any], *arguments: Any) -> Any:
         return await self._loop.run_in_executor(self._thread, function, *arguments)
-
-
-class Port:
-    """What a source's `drive` may do."""
-
-    def __init__(self, host: Host) -> None:
-        self._host = host
-        self.robot = host.identity.robot
-        self.stopping = host.stopping
-
-    async def consume(self, message: Message) -> None:
-        """Run one step on this message; returns when its outputs are out."""
-        done = asyncio.Event()
-        self._host.inbox.put(Fed(message, done.set))
-        await done.wait()
-
-    async def room(self, window: int) -> None:
-        """Wait until somebody reads, readers are at most `window` messages behind, there are workers, and fewer than
-        `window` jobs are outstanding."""
-        host, said = self._host, False
-        while not host.stopping.is_set():
-            host._progress.event.clear()
-            lags = [host._progress.lag(topic.name) for topic in host.service.writes if topic.delivery == "every"]
-            jobs = [pool.outstanding if pool.workers else math.inf for pool in host._pools.values()]
-            if max(lags, default=0) <= window and max(jobs, default=0) < window:
-                return
-            if not said and math.inf in (*lags, *jobs):
-                said = True
-                log.info("waiting for readers and workers", extra={"lags": lags, "jobs": jobs})
-            try:
-                await asyncio.wait_for(host._progress.event.wait(), timeout=1.0)
-            except TimeoutError:
-                continue

@@ -13,11 +13,10 @@ import numpy as np
 from prior_sg.schemas.objects import ObjectDelta, SceneObject
 from prior_sg.schemas.places import PlaceDelta
 from prior_sg.schemas.priors import Task
-from prior_sg.schemas.regions import Region, RegionDelta
+from prior_sg.schemas.regions import NO_REGION, Region, RegionDelta
 from prior_sg.schemas.scene import Scene, SceneRevision
 
 Edge = tuple[int, int]
-NO_REGION = -1
 
 
 class Config(msgspec.Struct, frozen=True, kw_only=True):

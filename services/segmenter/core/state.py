@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import msgspec
 import numpy as np
 
-from prior_sg.schemas.features import TextEmbeddings, TextRequest
+from prior_sg.schemas.features import DEFAULT_SPACE, TextEmbeddings, TextRequest
 from prior_sg.schemas.places import PlaceDelta
 from prior_sg.schemas.priors import Prior, PriorEvidence, Task
 from prior_sg.schemas.regions import Region
@@ -30,7 +30,7 @@ from prior_sg.services.segmenter.core.regions import ledger as publication
 class Config(msgspec.Struct, frozen=True, kw_only=True):
     """Settings of the segmenter. Those marked (paper) are published values; the others were chosen here."""
 
-    space: str = "conse/efficientnet-lite2/minilm-l6-v2"  # embedding space at the start; another may take over
+    space: str = DEFAULT_SPACE  # embedding space at the start; another may take over
     spaces: SpacesConfig = msgspec.field(default_factory=SpacesConfig)
     kernel: descriptors.KernelConfig = msgspec.field(default_factory=descriptors.KernelConfig)
     default_query_radius_m: float = 0.75  # r_Q until a prior is in force (paper)

@@ -7,10 +7,12 @@ from hypothesis import strategies as st
 from scipy.spatial.distance import jensenshannon
 
 from prior_sg.deploy.evaluation.baselines import argmax, clio, common, hovsg, hydra
-from prior_sg.deploy.evaluation.metrics import GroundTruth, evaluate
+from prior_sg.deploy.evaluation.metrics import evaluate
+from prior_sg.deploy.truth import GroundTruth
 from prior_sg.schemas.features import Pyramid, TextEmbeddings
 from prior_sg.schemas.frames import Intrinsics
 from prior_sg.schemas.places import VoxelMap
+from prior_sg.schemas.regions import NO_REGION
 from tests.help.world import SPACE, place_delta
 
 VOXEL_M = 0.1
@@ -349,7 +351,7 @@ def test_hydra_leaves_out_what_no_large_room_reaches():
     cut = clearances.copy()
     kept = np.arange(len(edges)) != 11
     found = hydra.rooms(count, edges[kept], cut[kept], hydra.Config())
-    assert found.tolist() == [0] * 12 + [common.NO_REGION] * 4
+    assert found.tolist() == [0] * 12 + [NO_REGION] * 4
     assert set(hydra.rooms(count, edges[kept], cut[kept], hydra.Config(max_dilation_m=0.9, min_room_size=13))) == {-1}
     assert set(hydra.rooms(3, chain(3), np.ones(2), hydra.Config())) == {-1}
 

@@ -13,12 +13,14 @@ from rich.console import Console
 from prior_sg.deploy.cli import main
 from prior_sg.deploy.cli.report import compare
 from prior_sg.deploy.evaluation import command, methods, oracles, priors, runner
-from prior_sg.deploy.evaluation.metrics import GroundTruth, Reliability
+from prior_sg.deploy.evaluation.kinds import BASELINES, ORACLES, SWEEPS
+from prior_sg.deploy.evaluation.metrics import Reliability
 from prior_sg.deploy.evaluation.object_metrics import OBJECT_SCORES
 from prior_sg.deploy.evaluation.page import page, reliability_points, true_scene
-from prior_sg.deploy.evaluation.perception import Cache, EvaluationError, Perception, source_digest
+from prior_sg.deploy.evaluation.perception import CODE, Cache, EvaluationError, Perception, code_digest, source_digest
 from prior_sg.deploy.evaluation.plots import line_plot
 from prior_sg.deploy.running.job import Counts, Result
+from prior_sg.deploy.truth import GroundTruth, TrueObject, read_objects
 from prior_sg.schemas.codec import encode
 from prior_sg.schemas.places import VoxelMap
 from prior_sg.schemas.priors import ObjectPrior
@@ -102,9 +104,9 @@ def test_the_object_oracle_counts_the_boxes_that_were_seen(case, tmp_path):
         {"label": "bed", "min_m": [6.0, 1.0, 2.5], "max_m": [7.0, 3.0, 2.7]},  # nothing was seen there
         {"label": "lamp", "min_m": [5.0, 1.0, 0.5], "max_m": [7.0, 3.0, 0.7]},  # not in the prior
     ]
-    assert oracles.read_objects(tmp_path) == ()
+    assert read_objects(tmp_path) == ()
     (tmp_path / "objects.json").write_text(json.dumps({"objects": boxes}))
-    objects = oracles.read_objects(tmp_path)
+    objects = read_objects(tmp_path)
     occupied = np.array([[5, 5, 3], [30, 10, 3]], np.int16)
     voxels = replace_struct(case.perception.voxels, occupied=occupied)
     found = oracles.seen_objects(objects, case.prior, voxels)
@@ -119,7 +121,7 @@ def test_the_object_oracle_counts_the_boxes_that_were_seen(case, tmp_path):
 
 def with_detections(case, detector="segments"):
     """A bed and an oven, seen eight times; the ground truth has the bed, and another that was never seen."""
-    boxes = [oracles.TrueObject("bed", *BED[:2]), oracles.TrueObject("bed", BED[0] + 9, BED[1] + 9)]
+    boxes = [TrueObject("bed", *BED[:2]), TrueObject("bed", BED[0] + 9, BED[1] + 9)]
     seen = tuple(
         sight(frame, pose, [BED, OVEN] if detector != "none" else [], detector=detector)
         for frame, pose in enumerate(around())
@@ -265,18 +267,21 @@ def test_sweeps_ask_for_other_features():
     assert all(m.features["space"].startswith("conse/") for m in methods.sweep(Config(), "encoder"))
 
 
-@pytest.mark.parametrize("name", methods.BASELINES)
-def test_baselines_of_the_checkout_run(case, name):
+@pytest.mark.parametrize("name", BASELINES)
+def test_baselines_run(case, name):
     scores = score(methods.baseline(name), case)
     assert 0 <= scores["f1_s"] <= 1
     assert math.isnan(scores["ece"])
 
 
-def test_baselines_need_a_checkout(tmp_path, monkeypatch):
-    monkeypatch.setitem(methods.sys.modules, methods.BASELINE_PACKAGE, None)
-    monkeypatch.delitem(methods.sys.modules, methods.BASELINE_PACKAGE)
-    with pytest.raises(EvaluationError, match="source checkout"):
-        methods.baseline("clio", folder=tmp_path)
+def test_an_unknown_baseline_names_the_known_ones():
+    with pytest.raises(EvaluationError, match="ours, clio, hovsg, hydra, argmax"):
+        methods.baseline("magic")
+
+
+def test_every_kind_that_the_command_line_lists_is_a_method():
+    assert [methods.oracle(Config(), kind).name for kind in ORACLES] == [f"oracle {kind}" for kind in ORACLES]
+    assert [len(methods.sweep(Config(), kind)) for kind in SWEEPS] == [len(values) for values in SWEEPS.values()]
 
 
 @pytest.fixture
@@ -357,6 +362,12 @@ def test_a_changed_source_has_another_digest(tmp_path):
     assert source_digest(tmp_path) == before
     (tmp_path / "trajectory.csv").write_text("other")
     assert source_digest(tmp_path) != before
+
+
+def test_a_digest_of_code_covers_the_files_that_make_a_perception():
+    digests = {name: code_digest(name, files) for name, files in CODE.items()}
+    assert len(set(digests.values())) == len(CODE)  # an empty choice of files would digest to the same everywhere
+    assert code_digest("ingest", "nothing.py") not in digests.values()
 
 
 def test_environments_go_by_name_or_to_all():

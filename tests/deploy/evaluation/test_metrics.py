@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from prior_sg.deploy.evaluation.metrics import SCORES, GroundTruth, assign, evaluate, reliability, voxel_owners
+from prior_sg.deploy.evaluation.metrics import SCORES, assign, evaluate, reliability
+from prior_sg.deploy.truth import GroundTruth, voxel_owners
 from prior_sg.schemas.places import VoxelMap
 from prior_sg.schemas.regions import Region
 from prior_sg.schemas.scene import Scene

@@ -14,7 +14,7 @@ from prior_sg.deploy.evaluation.object_metrics import (
     object_scores,
     pairs,
 )
-from prior_sg.deploy.evaluation.oracles import TrueObject
+from prior_sg.deploy.truth import TrueObject
 from prior_sg.schemas.objects import SceneObject
 from prior_sg.schemas.places import VoxelMap
 

@@ -9,7 +9,6 @@ import pytest
 import spark_dsg
 from scipy.spatial.transform import Rotation
 
-from prior_sg.deploy.evaluation.metrics import GroundTruth
 from prior_sg.deploy.showing.export import (
     map_png,
     places_png,
@@ -21,6 +20,7 @@ from prior_sg.deploy.showing.export import (
 )
 from prior_sg.deploy.showing.map import FREE, PALETTE, UNLABELLED, WALL, label_colors
 from prior_sg.deploy.showing.places import OPENING
+from prior_sg.deploy.truth import GroundTruth
 from prior_sg.schemas.objects import SceneObject
 from prior_sg.schemas.places import VoxelMap
 from prior_sg.schemas.regions import Region

@@ -13,9 +13,11 @@ from prior_sg.schemas.objects import Detections
 from prior_sg.schemas.priors import ObjectPrior, PriorList, PriorRequest, TaskInForce, TaskRequest
 from prior_sg.services import intent
 from prior_sg.services.feature_pyramid import service
-from prior_sg.services.feature_pyramid.core.crops import Config
-from prior_sg.services.feature_pyramid.detectors import base
-from prior_sg.services.feature_pyramid.detectors.base import Found, Grid, Shot
+from prior_sg.services.feature_pyramid.core import lift
+from prior_sg.services.feature_pyramid.core.config import Config
+from prior_sg.services.feature_pyramid.core.lift import Grid
+from prior_sg.services.feature_pyramid.detectors.base import Detector, Found, Shot
+from prior_sg.services.feature_pyramid.detectors.load import load_detector
 from prior_sg.services.feature_pyramid.detectors.masks import load_masks
 from prior_sg.services.feature_pyramid.detectors.prompted import as_sentences, batches, best_sentence
 from prior_sg.services.feature_pyramid.encoders import torchvision_parts
@@ -83,7 +85,7 @@ class Colours:
 
 
 def worked(frame, cfg):
-    state = service.Worker("worker-7", Colours(), base.load_detector(cfg))
+    state = service.Worker("worker-7", Colours(), load_detector(cfg))
     try:
         (_, pyramid), (_, detections) = service.step(state, frame, cfg)
     finally:
@@ -93,7 +95,7 @@ def worked(frame, cfg):
 
 def test_segments_are_the_furniture_and_the_picture_and_nothing_of_the_room():
     color, depth_m, shown = room()
-    found = base.load_detector(Config()).detect(Shot(color, depth_m, CAMERA, POSE))
+    found = load_detector(Config()).detect(Shot(color, depth_m, CAMERA, POSE))
     coarse = shown[2::4, 2::4]
     matched = [int(np.bincount(coarse[one.mask] + 1, minlength=4).argmax()) - 1 for one in found]
     assert sorted(matched) == [0, 1, 2]
@@ -111,7 +113,7 @@ def test_segments_do_not_depend_on_the_heading(turn):
     color, depth_m, _ = room()
     heading = np.eye(4)
     heading[:2, :2] = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
-    detector = base.load_detector(Config())
+    detector = load_detector(Config())
     assert len(detector.detect(Shot(color, depth_m, CAMERA, heading @ POSE))) == 3
 
 
@@ -121,7 +123,7 @@ def test_an_empty_room_has_no_objects():
     with np.errstate(divide="ignore"):
         depth_m = _slabs(rays, ROOM)[1].astype(np.float32)
     color = np.full((480, 640, 3), 190, np.uint8)
-    assert base.load_detector(Config()).detect(Shot(color, depth_m, CAMERA, POSE)) == []
+    assert load_detector(Config()).detect(Shot(color, depth_m, CAMERA, POSE)) == []
 
 
 def test_lifting_by_hand():
@@ -133,7 +135,7 @@ def test_lifting_by_hand():
     empty = np.zeros_like(mask)
     empty[0, 0] = True
     found = [Found(np.zeros(4, np.float32), part, 0.5) for part in (mask, empty)]
-    kept, points_m = base.lift(found, depth_m, CAMERA, Config())
+    kept, points_m = lift.lift(found, depth_m, CAMERA, Config())
     assert kept == found[:1]  # nothing measured: no object
     # (322 - 320) / 500 * 2 = 0.008; (326 - 320) / 500 * 4 = 0.048, (242 - 240) / 500 * 4 = 0.016
     np.testing.assert_allclose(points_m[0], [[0.008, 0.008, 2.0], [0.048, 0.016, 4.0]], atol=1e-6)
@@ -142,7 +144,7 @@ def test_lifting_by_hand():
 def test_one_point_per_cube():
     depth_m = np.full((480, 640), 2.02, np.float32)
     found = [Found(np.zeros(4, np.float32), np.ones((120, 160), bool), 1.0)]
-    (points_m,) = base.lift(found, depth_m, CAMERA, Config(object_point_m=0.5))[1]
+    (points_m,) = lift.lift(found, depth_m, CAMERA, Config(object_point_m=0.5))[1]
     cubes = np.floor(points_m / 0.5).astype(int)
     assert len(np.unique(cubes, axis=0)) == len(cubes)
     # x from -1.29 to 1.28 and y from -0.97 to 0.96: cubes -3 .. 2 and -2 .. 1
@@ -152,7 +154,7 @@ def test_one_point_per_cube():
 def test_crops_are_squares_around_the_boxes_inside_the_image():
     boxes = [(100, 100, 200, 150), (0, 0, 50, 20), (0, 0, 640, 480)]
     found = [Found(np.array(box, np.float32), np.ones((1, 1), bool), 1.0) for box in boxes]
-    crops = base.object_crops(found, 640, 480)
+    crops = lift.object_crops(found, 640, 480)
     assert crops.side_px.tolist() == [120, 60, 480]  # 1.2 longer sides, at most the image's shorter side
     assert crops.left_px.tolist() == [90, 0, 80] and crops.top_px.tolist() == [65, 0, 0]
 
@@ -161,18 +163,18 @@ def test_masks_in_boxes_leave_out_what_is_in_front_and_behind():
     depth_m = np.full((480, 640), 5.0, np.float32)
     depth_m[160:320, 240:400] = 2.0
     depth_m[160:320, 240:260] = 0.5
-    mask = base.mask_in_box(np.array([200, 120, 440, 360], np.float32), Grid.of(depth_m, 4), CAMERA)
+    mask = lift.mask_in_box(np.array([200, 120, 440, 360], np.float32), Grid.of(depth_m, 4), CAMERA)
     expected = np.zeros((120, 160), bool)
     expected[40:80, 65:100] = True
     assert (mask == expected).all()
-    assert not base.mask_in_box(np.array([0, 0, 9, 9]), Grid.of(np.zeros((480, 640)), 4), CAMERA).any()
+    assert not lift.mask_in_box(np.array([0, 0, 9, 9]), Grid.of(np.zeros((480, 640)), 4), CAMERA).any()
 
 
 def test_doubles_by_hand():
     """Intersection over union of the first two 90 / 110, of the first and the third 0."""
     boxes = np.array([[0, 0, 10, 10], [1, 0, 11, 10], [20, 0, 30, 10]], np.float32)
-    assert base.without_doubles(boxes, np.array([0.5, 0.9, 0.1])).tolist() == [1, 2]
-    assert base.without_doubles(boxes, np.array([0.5, 0.9, 0.1]), 0.85).tolist() == [1, 0, 2]
+    assert lift.without_doubles(boxes, np.array([0.5, 0.9, 0.1])).tolist() == [1, 2]
+    assert lift.without_doubles(boxes, np.array([0.5, 0.9, 0.1]), 0.85).tolist() == [1, 0, 2]
 
 
 def test_detections_of_a_keyframe():
@@ -217,7 +219,7 @@ def test_detection_can_be_switched_off():
 )
 def test_a_detector_that_cannot_be_loaded_says_so_in_a_sentence(setting, masks, why):
     with pytest.raises(EncoderUnavailable, match=why) as caught:
-        base.load_detector(Config(detector=setting, detector_masks=masks))
+        load_detector(Config(detector=setting, detector_masks=masks))
     assert str(caught.value).count("\n") == 0 and str(caught.value).endswith(".")
 
 
@@ -274,7 +276,7 @@ def test_prompted_detectors_give_the_boxes_that_transformers_gives(network, tmp_
     torch.manual_seed(0)
     network(tmp_path)
     cfg = Config(detector=f"{network.__name__}:{tmp_path}", detector_threshold=0.0, device="cpu")
-    detector = base.load_detector(cfg)
+    detector = load_detector(cfg)
     color = np.random.default_rng(1).integers(0, 255, (480, 640, 3), dtype=np.uint8)
     boxes_px, scores, names = detector.boxes(color, ("stove", "bed"))
     if network is owlv2:
@@ -358,7 +360,7 @@ def test_masks_are_those_that_transformers_gives(tmp_path):
     assert masks.of(color, boxes_px[:0], Grid.of(depth_m, 4)) == []
 
 
-class Named(base.Detector):
+class Named(Detector):
     """Finds the picture's place on the wall, under the last name that is sought."""
 
     name, prompted = "named", True

@@ -18,7 +18,7 @@ from prior_sg.schemas.frames import Intrinsics, Keyframe
 from prior_sg.schemas.topics import DETECTIONS, ENCODE, PRIOR, PYRAMID, TASK, TEXT
 from prior_sg.services.feature_pyramid import service
 from prior_sg.services.feature_pyramid.core import crops as core
-from prior_sg.services.feature_pyramid.core.crops import Config
+from prior_sg.services.feature_pyramid.core.config import Config
 from prior_sg.services.feature_pyramid.encoders.base import EncoderUnavailable, Options, load_encoder
 from prior_sg.services.runtime.service import Identity
 from tests.help.paths import SHARED_DATA

@@ -12,7 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from prior_sg.deploy.cli.packing import pack
+from prior_sg.deploy.sample.packed import pack_source
 from prior_sg.schemas.frames import Intrinsics
 from prior_sg.services.ingest.core.options import ReadOptions
 from prior_sg.services.ingest.core.selection import BadFrame, RawFrame
@@ -603,7 +603,7 @@ def test_a_packed_log_reads_as_the_source_that_was_put_right(tmp_path):
     folder = dataset(tmp_path / "d", frames)
     (folder / "depth/000003.png").unlink()
     (folder / "regions.json").write_text(json.dumps({"rooms": [{"name": "kitchen"}]}))  # somebody else's
-    source, refused = pack(folder, tmp_path / "out.mcap", robot="r")
+    source, refused = pack_source(folder, tmp_path / "out.mcap", robot="r")
     assert sum(refused.values()) == 1
     again = open_source(tmp_path / "out.mcap")
     assert again.origin_m == source.origin_m != (0.0, 0.0, 0.0)

@@ -10,7 +10,7 @@ import pytest
 
 from prior_sg.schemas.priors import ModelReply, ModelRequest, Prior, PriorRequest, Task
 from prior_sg.services.prior_gateway import service
-from prior_sg.services.prior_gateway.core.compose import CallConfig, Config
+from prior_sg.services.prior_gateway.core.config import CallConfig, Config
 from prior_sg.services.prior_gateway.core.turns import SynthesisConfig
 from prior_sg.services.prior_gateway.outside.endpoint import Endpoint, open_endpoint, read_key, retry_after_s
 from prior_sg.services.runtime.service import Identity, ServiceError

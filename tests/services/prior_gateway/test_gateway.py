@@ -13,7 +13,8 @@ from prior_sg.schemas.codec import decode, encode
 from prior_sg.schemas.priors import ObjectPrior, Prior, PriorRequest, Task
 from prior_sg.services.prior_gateway import service
 from prior_sg.services.prior_gateway.core import compose
-from prior_sg.services.prior_gateway.core.compose import Config, Library, NoPrior, with_article
+from prior_sg.services.prior_gateway.core.compose import Library, NoPrior, with_article
+from prior_sg.services.prior_gateway.core.config import Config
 from prior_sg.services.prior_gateway.core.knowledge import (
     Environment,
     RegionEntry,
@@ -24,7 +25,7 @@ from prior_sg.services.prior_gateway.core.knowledge import (
 )
 from prior_sg.services.prior_gateway.core.matching import contains, match_environment, match_task, stems, words
 from prior_sg.services.prior_gateway.outside import library
-from prior_sg.services.prior_gateway.outside.archive import PREFERRED, Archive
+from prior_sg.services.prior_gateway.outside.archive import PREFERRED, PriorShelf
 from tests.help.gateway import Gateway
 
 LIBRARY = library.load()
@@ -504,14 +505,14 @@ def test_memory_forgets_the_oldest():
 def test_an_imported_prior_comes_before_the_library(tmp_path):
     cfg = Config(archive=str(tmp_path))
     other = compose.noted(prior_of("house", "clean"), "another opinion")
-    Archive(cfg.archive).put(other, PREFERRED)
+    PriorShelf(cfg.archive).put(other, PREFERRED)
     assert Gateway(cfg).feed(asked("house", "clean")) == [other]
     assert Gateway(cfg).feed(asked("house", "patrol"))[0].provenance.source == "library"
 
 
 def test_a_damaged_archive_is_told_and_left_out(tmp_path, caplog):
     cfg = Config(archive=str(tmp_path))
-    Archive(cfg.archive).put(prior_of("house", "clean"), PREFERRED)
+    PriorShelf(cfg.archive).put(prior_of("house", "clean"), PREFERRED)
     [file] = tmp_path.glob("*/*.prior")
     file.write_bytes(file.read_bytes()[:-5])
     assert Gateway(cfg).feed(asked("house", "clean"))[0].provenance.source == "library"

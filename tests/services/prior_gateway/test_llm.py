@@ -9,7 +9,7 @@ import time
 import httpx
 import pytest
 
-from prior_sg.deploy.cli.priors import read
+from prior_sg.deploy.cli.prior_file import read
 
 URL = os.environ.get("PSG_TEST_LLM_URL", "")
 START_S, MAKE_S = 120, 1500

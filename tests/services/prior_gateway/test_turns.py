@@ -14,6 +14,7 @@ from prior_sg.schemas.priors import PriorClaim, PriorEvidence, Provenance, Task
 from prior_sg.services.prior_gateway.core import compose, ensemble, learning
 from prior_sg.services.prior_gateway.core import turns as synthesis
 from prior_sg.services.prior_gateway.core.claims import Claims
+from prior_sg.services.prior_gateway.core.config import Config
 from prior_sg.services.prior_gateway.core.matching import same_region
 from prior_sg.services.prior_gateway.outside import library, prompts
 from prior_sg.services.runtime.service import ServiceError
@@ -303,7 +304,7 @@ def combined(drafts, regions=()):
         task(regions),
         drafts,
         lambda one, other: same_region(one, other, LIBRARY.environments),
-        lambda name: compose.phrases_of(name, compose.Config()),
+        lambda name: compose.phrases_of(name, Config()),
         Provenance(source="m"),
     )
 
@@ -371,7 +372,7 @@ def test_samples_that_agree_on_nothing_still_give_a_prior():
 
 
 def library_prior(regions=("kitchen", "bathroom", "hallway")):
-    return LIBRARY.answer(task(regions), compose.Config())
+    return LIBRARY.answer(task(regions), Config())
 
 
 def evidence(prior, epoch, **counts):

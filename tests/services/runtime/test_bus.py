@@ -4,13 +4,17 @@ import threading
 import time
 
 import pytest
+import zenoh
 
-from prior_sg.schemas.codec import encode
+from prior_sg.schemas.codec import DecodeError, decode, encode
 from prior_sg.schemas.frames import IngestState
+from prior_sg.schemas.migrations import MIGRATIONS
+from prior_sg.schemas.places import SnapshotRequest
 from prior_sg.schemas.priors import Task
-from prior_sg.schemas.topics import INGEST_STATE, KEYFRAME, TASK
+from prior_sg.schemas.topics import INGEST_STATE, KEYFRAME, PLACE_SNAPSHOT, TASK
 from prior_sg.services.runtime.bus import Answer, BusError, Hub, LocalBus, key_matches, pack_header, unpack_header
-from prior_sg.services.runtime.zenoh_bus import ZenohBus
+from prior_sg.services.runtime.zenoh_bus import ZenohBus, client_config
+from tests.help import reading
 
 
 @pytest.fixture(params=["local", "zenoh"])
@@ -178,3 +182,79 @@ def test_damaged_headers_mean_an_unknown_writer(header):
 def test_header_round_trip():
     assert unpack_header(pack_header("segmenter/1/2", 5, 6)) == ("segmenter/1/2", 5, 6)
     assert KEYFRAME.pattern("*") == "psg/*/keyframe"
+
+
+@pytest.fixture
+def foreign(endpoint):
+    """A program of another version: a bare session, which names the schema of what it sends."""
+    with zenoh.open(client_config(endpoint)) as session:
+        yield session
+
+
+def encoding(schema):
+    return zenoh.Encoding("application/msgpack").with_schema(schema)
+
+
+def put_until_heard(session, key, payload, schema, got):
+    end_s = time.monotonic() + 20
+    while not got:
+        assert time.monotonic() < end_s, "nobody hears"
+        session.put(key, payload, encoding=encoding(schema))
+        time.sleep(0.05)
+    return got[0].payload
+
+
+def test_a_sample_of_an_older_version_arrives_as_ours(endpoint, foreign, monkeypatch):
+    for step, function in reading.MIGRATIONS.items():
+        monkeypatch.setitem(MIGRATIONS, step, function)
+    bus, got = ZenohBus(endpoint), []
+    bus.subscribe(reading.READING, "psg/r/reading", got.append, lambda topic, number: None)
+    payload = put_until_heard(foreign, "psg/r/reading", encode(reading.FIRST), "Reading/1", got)
+    assert decode(reading.Reading, payload) == reading.THIRD
+    bus.close()
+
+
+@pytest.mark.parametrize(
+    ("schema", "why"),
+    [("Task/2", "newer than this program's Task/1; update it"), ("Keyframe/1", "where a Task/1 belongs")],
+)
+def test_a_sample_of_a_newer_version_or_another_message_is_refused(endpoint, foreign, schema, why):
+    bus, got = ZenohBus(endpoint), []
+    bus.subscribe(TASK, TASK.pattern("newer"), got.append, lambda topic, number: None)
+    payload = put_until_heard(foreign, TASK.pattern("newer"), encode(task("newer", "t")), schema, got)
+    with pytest.raises(DecodeError, match=why):
+        decode(TASK.type, payload)
+    bus.close()
+
+
+def test_questions_and_answers_name_their_schema_and_are_refused_like_samples(endpoint, foreign):
+    bus, key, asked, answers = ZenohBus(endpoint), "psg/versions/ask/places", [], []
+    payload = encode(SnapshotRequest(robot="versions"))
+
+    def serve(request):
+        asked.append(request.payload)
+        request.reply(b"an answer")
+
+    bus.serve(key, serve)
+    eventually(lambda: list(foreign.get(key, payload=payload, encoding=encoding("SnapshotRequest/1"))))
+    assert asked[-1] == payload
+    (reply,) = foreign.get(key, payload=payload, encoding=encoding("SnapshotRequest/2"))
+    assert str(reply.ok.encoding) == "application/msgpack;PlaceDelta/1"
+    with pytest.raises(DecodeError, match="SnapshotRequest/2 is newer"):
+        decode(SnapshotRequest, asked[-1])
+
+    def answer_newer(query):
+        with query:
+            asked.append(str(query.encoding))
+            query.reply(key, b"an answer", encoding=encoding("PlaceDelta/2"))
+
+    bus.close()
+    bus = ZenohBus(endpoint)
+    with foreign.declare_queryable(key, answer_newer):
+        eventually(lambda: foreign.get(key) and True)
+        bus.call(key, payload, 5.0, answers.append)
+        eventually(lambda: answers)
+    assert asked[-1] == "application/msgpack;SnapshotRequest/1"
+    with pytest.raises(DecodeError, match="PlaceDelta/2 is newer than this program's PlaceDelta/1"):
+        decode(PLACE_SNAPSHOT.reply, answers[0].payload)
+    bus.close()

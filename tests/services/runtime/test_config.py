@@ -3,7 +3,15 @@
 import msgspec
 import pytest
 
-from prior_sg.services.runtime.config import ConfigError, from_arguments, from_environment, merge, read_file, resolve
+from prior_sg.services.runtime.config import (
+    ConfigError,
+    from_arguments,
+    from_environment,
+    merge,
+    read_file,
+    recorded,
+    resolve,
+)
 
 
 class Group(msgspec.Struct, frozen=True, kw_only=True):
@@ -73,3 +81,33 @@ def test_unreadable_file(tmp_path):
         read_file(tmp_path / "bad.toml")
     with pytest.raises(ConfigError, match="outside any section"):
         merge({"beta": 2.0})
+
+
+def test_a_recorded_config_of_this_version_is_read_as_it_was():
+    cfg = Grouped(group=Group(limit=0.75), weights={"a": 2.0})
+    assert recorded(Grouped, "segmenter", msgspec.json.encode(cfg)) == (cfg, [])
+
+
+def test_settings_that_came_or_went_since_a_config_was_recorded_are_reported():
+    data = msgspec.json.encode({"group": {"limit": 0.75, "depth": 3}, "weights": {"depth": 2.0}, "old": [1, 2]})
+    cfg, notes = recorded(Grouped, "segmenter", data)
+    assert cfg == Grouped(group=Group(limit=0.75), weights={"depth": 2.0})
+    assert notes == [
+        "segmenter.old = [1, 2] was recorded, and is no setting any more: it is left out",
+        "segmenter.group.depth = 3 was recorded, and is no setting any more: it is left out",
+        "segmenter.group.count was not a setting yet: it gets its default",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("data", "why"),
+    [
+        (b'{"group": 3}', "does not fit this program: Expected `object`"),
+        (b'{"group": {"count": "many"}}', r"does not fit this program: .*\$.group.count"),
+        (b"[]", "does not fit"),
+        (b"{", "does not fit"),
+    ],
+)
+def test_a_recorded_value_that_no_longer_fits_is_named(data, why):
+    with pytest.raises(ConfigError, match=f"the recorded config of segmenter {why}"):
+        recorded(Grouped, "segmenter", data)

@@ -7,6 +7,7 @@ import time
 import msgspec
 import numpy as np
 import pytest
+import zenoh
 
 from prior_sg.schemas.codec import Message, decode, encode
 from prior_sg.schemas.frames import Intrinsics, Keyframe
@@ -18,7 +19,7 @@ from prior_sg.services.runtime.bus import Hub, LocalBus, pack_header
 from prior_sg.services.runtime.client import Client
 from prior_sg.services.runtime.host.host import Host, UndeclaredError
 from prior_sg.services.runtime.service import Ask, Identity, Service
-from prior_sg.services.runtime.zenoh_bus import ZenohBus
+from prior_sg.services.runtime.zenoh_bus import ZenohBus, client_config
 
 CAMERA = Intrinsics(4, 3, 5.0, 5.0, 2.0, 1.5)
 
@@ -229,6 +230,22 @@ def test_a_question_is_repeated_until_somebody_can_answer(new_bus):
             assert set(asker._state) == {0.25}
 
     asyncio.run(main())
+
+
+def test_a_message_of_a_newer_version_is_malformed_for_a_reason_that_is_told(endpoint, caplog):
+    newer = zenoh.Encoding("application/msgpack").with_schema("Keyframe/2")
+
+    async def main():
+        async with running(lambda: ZenohBus(endpoint), (READER, Config(), "a")) as (reader,):
+            with await asyncio.to_thread(zenoh.open, client_config(endpoint)) as session:
+                key = KEYFRAME.key_of(keyframe(1))
+                session.put(key, encode(keyframe(1)), encoding=newer, attachment=pack_header("w", 0, 0))
+                await until(lambda: reader.inbox.of("KEYFRAME").malformed == 1)
+            assert reader._state == []
+
+    asyncio.run(main())
+    told = next(record for record in caplog.records if record.getMessage() == "malformed message dropped")
+    assert told.why == "Keyframe/2 is newer than this program's Keyframe/1; update it"
 
 
 def test_malformed_questions_are_refused(new_bus):

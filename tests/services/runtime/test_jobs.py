@@ -3,15 +3,8 @@
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from prior_sg.services.runtime.jobs.dispatcher import (
-    ABANDONED_S,
-    MAX_ATTEMPTS,
-    NO_WORKER,
-    OVERDUE_LEAST_S,
-    QUARANTINE_S,
-    Board,
-    Dispatcher,
-)
+from prior_sg.services.runtime.jobs.board import ABANDONED_S, NO_WORKER, Board
+from prior_sg.services.runtime.jobs.dispatcher import MAX_ATTEMPTS, OVERDUE_LEAST_S, QUARANTINE_S, Dispatcher
 
 
 def test_least_loaded_worker_with_credits():

@@ -14,8 +14,10 @@ from mcap.reader import make_reader
 
 from prior_sg.schemas.codec import decode, encode
 from prior_sg.schemas.frames import CameraState, IngestState
+from prior_sg.schemas.migrations import MIGRATIONS
 from prior_sg.schemas.topics import CAMERA_STATE, INGEST_STATE, KEYFRAME
 from prior_sg.services.runtime.record import LogError, LogWriter, attachments, contents, metadata, read_log, summary
+from tests.help import reading
 from tests.help.paths import ROOT
 
 SECOND = 1_000_000_000
@@ -190,6 +192,41 @@ def test_topics_of_another_version_are_passed_over(tmp_path):
     write(path, [entry(0, 1, unknown), entry(1, 2)])
     assert [m.sequence for m in read_log(path)] == [1]
     assert summary(path) == {"RETIRED": 1, "CAMERA_STATE": 1}
+
+
+def write_reading(path, message, kind=None, cut=False):
+    topic = reading.topic_of_version(kind or type(message))
+    write(path, [entry(7, 123, topic, encode(message), key="psg/r/reading")])
+    if cut:
+        path.write_bytes(path.read_bytes()[:-8])
+
+
+@pytest.mark.parametrize("cut", [False, True])
+@pytest.mark.parametrize("old", [reading.FIRST, reading.SECOND, reading.THIRD])
+def test_messages_of_an_older_version_are_read_as_ours(tmp_path, monkeypatch, old, cut):
+    for step, function in reading.MIGRATIONS.items():
+        monkeypatch.setitem(MIGRATIONS, step, function)
+    path = tmp_path / "a.mcap"
+    write_reading(path, old, cut=cut)
+    (logged,) = read_log(path, (reading.READING,))
+    assert (logged.topic, logged.sequence) == (reading.READING, 7)
+    assert decode(reading.Reading, logged.payload) == reading.THIRD
+
+
+@pytest.mark.parametrize("cut", [False, True])
+def test_a_log_of_a_newer_version_or_of_another_message_is_refused(tmp_path, cut):
+    path = tmp_path / "a.mcap"
+    write_reading(path, reading.SECOND, cut=cut)
+    with pytest.raises(LogError, match=r"cannot be read: Reading/2 is newer than this program's Reading/1; update it"):
+        list(read_log(path, (reading.topic_of_version(reading.First.Reading),)))
+    assert summary(path) == {"READING": 1}
+    assert as_dicts(path, (CAMERA_STATE,)) == []  # nobody asked for what cannot be read
+    write_reading(path, camera(3), cut=cut)
+    with pytest.raises(LogError, match="CameraState/1 stands where a Reading/3 belongs"):
+        list(read_log(path, (reading.READING,)))
+    with pytest.raises(LogError, match="Reading/1 is too old for this program's Reading/3"):
+        write_reading(path, reading.FIRST, cut=cut)
+        list(read_log(path, (reading.READING,)))
 
 
 @pytest.mark.parametrize("content", [b"", b"\x89MCAP", b"a,b\n1,2\n"])

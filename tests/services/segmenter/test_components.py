@@ -6,10 +6,10 @@ from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull
 
+from prior_sg.schemas.regions import NO_REGION
 from prior_sg.services.segmenter.core.experts.context import ObjectView
 from prior_sg.services.segmenter.core.map.received import PlaceGraph, apply
 from prior_sg.services.segmenter.core.regions.components import (
-    NO_REGION,
     border,
     components,
     events,

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from prior_sg.schemas.priors import ObjectPrior, Task
-from prior_sg.services.prior_gateway.core import compose
+from prior_sg.services.prior_gateway.core.config import Config
 from prior_sg.services.prior_gateway.outside import library
 from prior_sg.services.segmenter.core.map.received import PlaceGraph, apply
 from prior_sg.services.segmenter.core.objects import names, sizes
@@ -18,7 +18,7 @@ from tests.help.world import place_delta
 CELL_M = 0.15
 CFG = SizeConfig(weight=1.0)
 HOME = library.load().answer(
-    Task(robot="r", stamp_ns=1, environment="residential home", task="real-estate listing"), compose.Config()
+    Task(robot="r", stamp_ns=1, environment="residential home", task="real-estate listing"), Config()
 )
 
 

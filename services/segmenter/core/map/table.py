@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from prior_sg.schemas.regions import NO_REGION
 from prior_sg.services.segmenter.core.map.received import Step
-from prior_sg.services.segmenter.core.regions.components import NO_REGION
 
 UNLABELLED = -1
 

@@ -8,11 +8,10 @@ from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, cKDTree
 
-from prior_sg.schemas.regions import RegionEvent, Transition
+from prior_sg.schemas.regions import NO_REGION, RegionEvent, Transition
 from prior_sg.services.segmenter.core.experts.context import ObjectView
 from prior_sg.services.segmenter.core.map.received import PlaceGraph
 
-NO_REGION = -1
 HULL_CORNERS = 8  # of the polygon that stands for a sphere in a hull
 OBJECT_REACH_M = 1.5  # an object stands in a region when one of its places is at most this far
 SIDE_BY_SIDE_M = 1.0  # edges across a border whose middles are closer than this lead through the same opening

@@ -1,0 +1,133 @@
+"""Commands that do the main job: on the sample, and on a source of the user's."""
+
+import argparse
+from pathlib import Path
+
+from prior_sg.deploy.cli.shared import Commands, add_bus, add_settings, console, names_in
+from prior_sg.deploy.cli.source_options import add_source_options, read_options, source_settings
+from prior_sg.deploy.errors import UserError
+from prior_sg.deploy.sample import SAMPLE
+from prior_sg.deploy.settings import DEMO_ENVIRONMENT, DEMO_TASK
+
+
+def add_commands(commands: Commands) -> None:
+    """`demo` and `run`."""
+    demo = commands.add(
+        "demo",
+        cmd_demo,
+        "run everything on the sample home and score the result",
+        "prior-sg demo --workers 2",
+        needs="encode",
+    )
+    demo.add_argument("--out", type=Path, default=Path("out/demo"), help="folder for the results")
+    demo.add_argument("--task", default=DEMO_TASK, help="what the robot is to do (default: %(default)s)")
+    demo.add_argument("--regions", default="", help="fixed region names, separated by commas; see --open")
+    demo.add_argument(
+        "--open",
+        action="store_true",
+        help="let the prior name the regions; by default the demo fixes the ground truth's names, as the paper's "
+        "benchmarks do, so that labels can be scored",
+    )
+    add_run_options(demo)
+
+    run = commands.add(
+        "run",
+        cmd_run,
+        "turn a recording into a scene graph",
+        'prior-sg run deploy/sample/home.mcap --environment "residential home" --task "serve drinks to guests"',
+        needs="encode",
+    )
+    run.add_argument("source", help="a folder in a known layout (docs/sources.md) or an MCAP log")
+    run.add_argument("--environment", required=True, help="what kind of place it is, in plain words")
+    run.add_argument("--task", required=True, help="what the robot is to do, in plain words")
+    run.add_argument("--regions", default="", help="fixed region names, separated by commas; default: the prior's")
+    run.add_argument("--out", type=Path, default=Path("out/run"), help="folder for the results")
+    run.add_argument("--in-process", action="store_true", help="all services in this process, for debugging")
+    add_run_options(run)
+    add_source_options(run)
+
+
+def _at_least_one(text: str) -> int:
+    number = int(text)
+    if number < 1:
+        raise argparse.ArgumentTypeError("must be at least 1")
+    return number
+
+
+def add_run_options(parser: argparse.ArgumentParser) -> None:
+    """Options of whatever starts services."""
+    add_bus(parser)
+    parser.add_argument("--workers", type=_at_least_one, default=1, help="feature workers (default: %(default)s)")
+    parser.add_argument(
+        "--speed", type=float, default=0.0, help="replay speed; 0 = as fast as the pipeline drains (default)"
+    )
+    parser.add_argument(
+        "--places",
+        choices=("3d", "2d"),
+        help="spheres of free space, or pieces of ground for large and unbounded spaces (default: 3d)",
+    )
+    parser.add_argument(
+        "--encoder", default="", help="conse/…, open_clip/MODEL/PRETRAINED or onnx:FOLDER (docs/encoders.md)"
+    )
+    add_settings(parser)
+
+
+def settings_of(arguments: argparse.Namespace) -> list[str]:
+    """Settings that run options stand for, then those given by --set."""
+    places = [f"place_graph.places={arguments.places}"] if arguments.places else []
+    return [*places, *_encoder_settings(arguments.encoder), *source_settings(arguments), *arguments.set]
+
+
+def _encoder_settings(choice: str) -> list[str]:
+    """Settings of workers and segmenter for one choice of an encoder. Raises UserError."""
+    from prior_sg.services.feature_pyramid.encoders.base import EncoderUnavailable, space_of
+
+    try:
+        return [f"feature_pyramid.space={choice}", f"segmenter.space={space_of(choice)}"] if choice else []
+    except EncoderUnavailable as error:
+        raise UserError(str(error)) from error
+
+
+def cmd_demo(arguments: argparse.Namespace) -> int:
+    """The main job on the embedded sample."""
+    from prior_sg.deploy.truth import truth_of
+
+    arguments.source, arguments.environment = str(SAMPLE), DEMO_ENVIRONMENT
+    if not (arguments.regions or arguments.open) and arguments.task == DEMO_TASK:
+        truth = truth_of(arguments.source) or {"regions": []}
+        arguments.regions = ",".join(dict.fromkeys(region["label"] for region in truth["regions"]))
+        console.print(
+            f"region names fixed to the ground truth's: {arguments.regions.replace(',', ', ')} (--open frees them)"
+        )
+    return cmd_run(arguments)
+
+
+def cmd_run(arguments: argparse.Namespace) -> int:
+    """The main job on a source of the user's."""
+    from prior_sg.deploy.cli import report
+    from prior_sg.deploy.running.job import Job, run
+    from prior_sg.deploy.truth import read_objects, truth_of
+
+    if not Path(arguments.source).exists():
+        raise UserError(f"{arguments.source} does not exist")
+    truth = truth_of(arguments.source, read_options(arguments))  # also finds out at once whether it can be opened
+    job = Job(
+        source=arguments.source,
+        out=arguments.out,
+        environment=arguments.environment,
+        task=arguments.task,
+        regions=names_in(arguments.regions),
+        robot=arguments.robot,
+        connect=arguments.connect,
+        workers=arguments.workers,
+        speed=arguments.speed,
+        settings=settings_of(arguments),
+        config=arguments.config,
+        in_process=getattr(arguments, "in_process", False),
+        on_started=lambda endpoint, pids: console.print(
+            f"{len(pids)} service processes: " + ", ".join(f"{name} {pid}" for name, pid in sorted(pids.items()))
+        ),
+    )
+    result = run(job, console)
+    report.write(result, job.out, truth, console, read_objects(Path(arguments.source)))
+    return 0

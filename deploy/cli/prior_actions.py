@@ -1,0 +1,297 @@
+"""What `prior-sg priors` does."""
+
+import argparse
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import msgspec
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from prior_sg.deploy.cli.prior_file import PriorError, Rows, adjacency, containment, existence, read, write
+from prior_sg.deploy.cli.shared import names_in, open_client
+from prior_sg.deploy.running.inprocess import InProcess
+from prior_sg.deploy.settings import resolved_config
+from prior_sg.schemas.codec import DecodeError, decode
+from prior_sg.schemas.priors import ObjectPrior, Prior, PriorRevision, Provenance, Task
+from prior_sg.schemas.topics import PRIOR, PRIOR_REVISION
+from prior_sg.services.prior_gateway.core.compose import Library, NoPrior
+from prior_sg.services.prior_gateway.core.config import Config
+from prior_sg.services.prior_gateway.outside.archive import PREFERRED, PriorShelf
+from prior_sg.services.prior_gateway.outside.library import environments, load
+from prior_sg.services.prior_gateway.outside.signing import Signer
+from prior_sg.services.registry import BY_NAME
+from prior_sg.services.runtime.bus import LocalBus, Sample
+from prior_sg.services.runtime.client import Client, NoPriorError
+
+LIBRARY_SIGN = "made by the curated library of this version"
+
+
+def settings(arguments: argparse.Namespace) -> Config:
+    """The gateway's configuration."""
+    return resolved_config(BY_NAME["prior_gateway"], arguments.config, arguments.set)
+
+
+def task_of(arguments: argparse.Namespace) -> Task:
+    """The task that the options name."""
+    if not arguments.environment:
+        raise PriorError("name an environment with --environment, or a file or digest")
+    return Task(
+        robot="cli",
+        stamp_ns=time.time_ns(),
+        environment=arguments.environment,
+        task=arguments.task,
+        regions=names_in(arguments.regions),
+    )
+
+
+def find(what: str, cfg: Config) -> Prior:
+    """The prior in a file, or the kept one of a digest. Raises PriorError."""
+    if Path(what).is_file():
+        return read(Path(what))
+    found = {entry.prior.digest(): entry.prior for _, entry in PriorShelf(cfg.archive).all()}
+    fitting = [digest for digest in found if len(what) >= 4 and digest.startswith(what)]
+    if len(fitting) != 1:
+        raise PriorError(
+            f"{what} is no file, and {len(fitting) or 'no'} kept priors have such a digest; see `priors list`"
+        )
+    return found[fitting[0]]
+
+
+def wanted(arguments: argparse.Namespace, cfg: Config) -> Prior:
+    """The prior that `what` names, else the one that answers the task: a kept one, else the library's."""
+    if arguments.what:
+        return find(arguments.what, cfg)
+    task = task_of(arguments)
+    kept = [
+        (name == PREFERRED, entry.prior) for name, entry in PriorShelf(cfg.archive).all() if entry.prior.answers(task)
+    ]
+    if kept:
+        return max(kept, key=lambda pair: pair[0])[1]
+    try:
+        return load().answer(task, cfg)
+    except NoPrior as reason:
+        raise PriorError(str(reason)) from reason
+
+
+def verdict(prior: Prior, cfg: Config, library: Library) -> str:
+    """What speaks for a prior's origin."""
+    if not prior.provenance.signature and prior.provenance.source == "library" and not prior.provenance.parent_digest:
+        task = Task(robot="", stamp_ns=0, environment=prior.environment, task=prior.task, regions=prior.vocabulary)
+        try:
+            said = library.answer(task, cfg)
+            same = msgspec.structs.replace(said, provenance=prior.provenance).digest() == prior.digest()
+        except NoPrior:
+            same = False
+        return LIBRARY_SIGN if same else "not signed, and not what this version's library says"
+    return Signer(cfg.signing_key, cfg.trusted_keys).check(prior)[1]
+
+
+def make(arguments: argparse.Namespace, console: Console) -> int:
+    """A gateway in this process does exactly what the service does."""
+    cfg, task = settings(arguments), task_of(arguments)
+    gateway = InProcess("cli", Path(), list(arguments.set), arguments.config)
+    gateway.start("prior_gateway")
+    try:
+        with Client(LocalBus(gateway.hub)) as client, console.status("asking for the prior") as status:
+            while "prior_gateway" not in client.alive(0.05).values():
+                gateway.check()
+            prior = client.give_task(task, arguments.timeout, lambda reason: status.update(reason or "asking"))
+    except NoPriorError as error:
+        raise PriorError(str(error)) from error
+    finally:
+        gateway.stop()
+    describe(prior, cfg, console)
+    if arguments.out:
+        write(prior, arguments.out)
+        console.print(f"written to {arguments.out}")
+    return 0
+
+
+def show(arguments: argparse.Namespace, console: Console) -> int:
+    """Tables, and a picture."""
+    from prior_sg.deploy.showing.prior import draw
+
+    cfg = settings(arguments)
+    prior = wanted(arguments, cfg)
+    describe(prior, cfg, console)
+    if arguments.out:
+        try:
+            draw(prior, arguments.out)
+        except (ValueError, OSError) as error:
+            raise PriorError(f"cannot draw {arguments.out}: {error}") from error
+        console.print(f"drawn in {arguments.out}")
+    return 0
+
+
+def export(arguments: argparse.Namespace, console: Console) -> int:
+    """JSON that `import` reads."""
+    prior = wanted(arguments, settings(arguments))
+    write(prior, arguments.out)
+    console.print(f"prior {prior.digest()} written to {arguments.out}")
+    return 0
+
+
+def bring(arguments: argparse.Namespace, console: Console) -> int:
+    """A prior from elsewhere is checked like a model's."""
+    cfg, prior = settings(arguments), read(arguments.file)
+    said = verdict(prior, cfg, load())
+    if cfg.require_signature and not Signer(cfg.signing_key, cfg.trusted_keys).check(prior)[0]:
+        raise PriorError(f"{arguments.file}: {said}; prior_gateway.require_signature lets no such prior in")
+    if not cfg.archive:
+        raise PriorError("there is no archive to import into; set prior_gateway.archive to a folder")
+    PriorShelf(cfg.archive).put(prior, PREFERRED, verdict=said)
+    console.print(f"prior {prior.digest()} ({said}) answers {prior.task!r} in {prior.environment!r} from now on")
+    return 0
+
+
+def list_all(arguments: argparse.Namespace, console: Console) -> int:
+    """The library, then what the archive holds."""
+    table = Table("environment", "task", "regions", show_lines=True)
+    for listing in environments():
+        for task, regions in listing.tasks.items():
+            table.add_row(listing.name, task, ", ".join(regions))
+    console.print(table)
+    cfg = settings(arguments)
+    kept = list(PriorShelf(cfg.archive).all())
+    if kept:
+        table = Table(title=f"kept in {cfg.archive}")
+        table.add_column("digest", no_wrap=True)
+        for column in ("environment", "task", "from", "regions", "signature"):
+            table.add_column(column)
+        for name, entry in kept:
+            prior = entry.prior
+            source = prior.provenance.source + (" (in force)" if name == PREFERRED else "")
+            table.add_row(
+                prior.digest()[:12], prior.environment, prior.task, source, str(len(prior.regions)), entry.verdict
+            )
+        console.print(table)
+    return 0
+
+
+def diff(arguments: argparse.Namespace, console: Console) -> int:
+    """What one prior has and the other has not, and where they differ."""
+    cfg = settings(arguments)
+    before, after = find(arguments.what, cfg), find(arguments.other, cfg)
+    lines = differences(before, after, arguments.least)
+    for line in lines:
+        console.print(line)
+    if not lines:
+        console.print(f"no difference of {arguments.least:g} or more")
+    return 0
+
+
+def differences(before: Prior, after: Prior, least: float) -> list[str]:
+    """One line per difference; entries whose names both have, by size."""
+    lines = (
+        [f"parent: {after.provenance.parent_digest[:12]}"] if after.provenance.parent_digest == before.digest() else []
+    )
+    kinds = (("region", before.regions, after.regions), ("object", before.objects, after.objects))
+    for kind, old, new in kinds:
+        names, others = [entry.name for entry in old], [entry.name for entry in new]  # type: ignore[attr-defined]
+        lines += [f"- {kind} {name}" for name in names if name not in others]
+        lines += [f"+ {kind} {name}" for name in others if name not in names]
+    found = []
+    matrices: tuple[tuple[str, Rows, Rows], ...] = (
+        ("P(r)", existence(before), existence(after)),
+        ("P(o | r)", containment(before), containment(after)),
+        ("P(ri - rj)", adjacency(before), adjacency(after)),
+    )
+    for title, old_rows, new_rows in matrices:
+        for row in old_rows.keys() & new_rows.keys():
+            for column in old_rows[row].keys() & new_rows[row].keys():
+                was, now = old_rows[row][column], new_rows[row][column]
+                if abs(now - was) >= least:
+                    found.append((-abs(now - was), f"{title} {row}, {column}: {was:.2f} -> {now:.2f}"))
+    return lines + [line for _, line in sorted(found)]
+
+
+def revise(arguments: argparse.Namespace, console: Console) -> int:
+    """The running gateway revises and publishes; robots that work under the prior take it over at once."""
+    task = task_of(arguments)
+    found: list[Prior] = []
+
+    def see(sample: Sample) -> None:
+        try:
+            prior = decode(Prior, sample.payload)
+        except DecodeError:
+            return
+        if prior.answers(task) and prior.provenance.parent_digest and sample.sent_ns > given_ns:
+            found.append(prior)
+
+    given_ns = time.time_ns()
+    with open_client(arguments.connect) as client, console.status("revising"):
+        client.listen(PRIOR, "*", see)
+        client.publish(
+            PRIOR_REVISION,
+            PriorRevision(
+                environment=task.environment, task=task.task, regions=task.regions, by_model=arguments.by_model
+            ),
+        )
+        end_s = time.monotonic() + arguments.timeout
+        while not found:
+            if time.monotonic() > end_s:
+                raise PriorError(
+                    f"no revised prior within {arguments.timeout:.0f} s; has any robot observed regions under this very"
+                    " task (`prior-sg health` shows PRIOR_EVIDENCE at prior_gateway)?"
+                )
+            time.sleep(0.1)
+    console.print(f"{found[0].digest()} replaces {found[0].provenance.parent_digest}: {found[0].provenance.note}")
+    return 0
+
+
+def describe(prior: Prior, cfg: Config, console: Console) -> None:
+    """Each region with what tells it from the others, and where the prior comes from."""
+    from prior_sg.deploy.showing.prior import merits
+
+    merit = merits(prior)
+    for i, region in enumerate(prior.regions):
+        best = [j for j in np.argsort(-merit[i], kind="stable")[:5] if merit[i, j] > 0]
+        near = [j for j in np.argsort(-prior.adjacency[i], kind="stable") if j != i][:4]
+        share = _with_spread(region.existence, prior.spread.existence[i] if prior.spread else None)
+        slope = f"{np.degrees(region.inclination_mean_rad):.0f}±{np.degrees(region.inclination_std_rad):.0f}° steep"
+        zone = f", {region.parent}" if region.parent else ""
+        console.print(
+            f"[bold]{region.name}[/]  {share} of the places{zone}, {slope}, r_Q {region.query_radius_m:.2f} m"
+        )
+        console.print("    holds " + ", ".join(f"{prior.objects[j].name} {prior.containment[i, j]:.0%}" for j in best))
+        console.print("    touches " + ", ".join(f"{prior.regions[j].name} {prior.adjacency[i, j]:.0%}" for j in near))
+        console.print("    looks like " + "; ".join(region.phrases[:3]))
+    if sized := [_size(item) for item in prior.objects if item.size_m is not None]:
+        console.print("[bold]sizes[/]  " + ", ".join(sized))
+    made = prior.provenance
+    console.print(f"prior {prior.digest()}: {len(prior.regions)} regions, {len(prior.objects)} objects")
+    console.print(f"made by {made.source} ({made.detail}){_when(made)}: {made.note}")
+    console.print(f"origin: {verdict(prior, cfg, load())}")
+    if made.parent_digest:
+        console.print(f"revises {made.parent_digest}")
+
+
+def _with_spread(value: float, spread: float | None) -> str:
+    return f"{value:.0%}" + (f" ±{spread:.0%}" if spread is not None and spread >= 0.005 else "")
+
+
+def _size(item: ObjectPrior) -> str:
+    """Its name and sides in metres, and where its lower edge is if that is not the floor."""
+    sides = "×".join(f"{side_m:.2g}" for side_m in item.size_m or ())
+    return f"{item.name} {sides} m" + (f" at {item.bottom_m:.2g} m" if item.bottom_m else "")
+
+
+def _when(made: Provenance) -> str:
+    if not made.made_ns:
+        return ""
+    at = time.strftime("%Y-%m-%d %H:%M", time.localtime(made.made_ns / 1e9))
+    return f" at {at} by {made.made_by}, prompts {made.prompts}, {made.samples} samples"
+
+
+ACTIONS: dict[str, Callable[[argparse.Namespace, Console], int]] = {
+    "list": list_all,
+    "make": make,
+    "show": show,
+    "diff": diff,
+    "import": bring,
+    "export": export,
+    "revise": revise,
+}

@@ -1,0 +1,63 @@
+"""What the commands of `prior-sg` share: the terminal, options and the way onto the bus."""
+
+import argparse
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from rich.console import Console
+
+from prior_sg.deploy.settings import DEFAULT_ROBOT, connect_in_force
+
+if TYPE_CHECKING:
+    from prior_sg.services.runtime.client import Client
+
+console = Console(highlight=False)
+
+Run = Callable[[argparse.Namespace], int]  # does what a command was told; its exit status
+
+
+class Commands:
+    """Where commands are declared: each with what it does, a line about it and an example."""
+
+    def __init__(self, parser: argparse.ArgumentParser, dest: str, metavar: str, prefix: str = "") -> None:
+        self._parsers = parser.add_subparsers(dest=dest, required=True, metavar=metavar)
+        self._prefix = prefix
+
+    def add(self, name: str, run: Run, summary: str, example: str, needs: str = "") -> argparse.ArgumentParser:
+        """The parser of a new command. `needs` names the extra whose packages it cannot do without."""
+        parser = self._parsers.add_parser(
+            name, help=summary, description=summary, **with_example(self._prefix + example)
+        )
+        parser.set_defaults(run=run, needs=needs)
+        return parser
+
+
+def with_example(text: str) -> dict:
+    """Arguments of a parser whose help ends in an example."""
+    return {"epilog": f"example: {text}", "formatter_class": argparse.RawDescriptionHelpFormatter}
+
+
+def add_bus(parser: argparse.ArgumentParser, robot: bool = True) -> None:
+    """Options of whatever talks to running services."""
+    parser.add_argument("--connect", default=connect_in_force(), help="Zenoh router (default: %(default)s)")
+    if robot:
+        parser.add_argument("--robot", default=DEFAULT_ROBOT, help="name of the robot (default: %(default)s)")
+
+
+def add_settings(parser: argparse.ArgumentParser) -> None:
+    """Options that change the services' settings."""
+    parser.add_argument("--config", default="", help="TOML file with a section per service")
+    parser.add_argument("--set", action="append", default=[], metavar="SERVICE.FIELD=VALUE", help="one setting")
+
+
+def open_client(connect: str) -> "Client":
+    """A client on the bus. Raises BusError."""
+    from prior_sg.services.runtime.client import Client
+    from prior_sg.services.runtime.zenoh_bus import ZenohBus
+
+    return Client(ZenohBus(connect, wait_s=2.0))
+
+
+def names_in(text: str) -> list[str]:
+    """Names separated by commas."""
+    return [name.strip() for name in text.split(",") if name.strip()]

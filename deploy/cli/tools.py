@@ -1,0 +1,294 @@
+"""Commands for what is done with results, logs and the system itself."""
+
+import argparse
+import json
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rich.table import Table
+
+from prior_sg.deploy.cli.shared import Commands, add_bus, console, open_client
+from prior_sg.deploy.errors import UserError
+from prior_sg.deploy.evaluation import command as evaluation
+
+if TYPE_CHECKING:
+    from prior_sg.schemas.status import ServiceStatus, TopicCount
+
+
+def add_commands(commands: Commands) -> None:
+    """`export`, `explain`, `record`, `replay`, `topics`, `health`, `eval` and `bench`."""
+    export = commands.add(
+        "export",
+        cmd_export,
+        "write the scene graph as a file",
+        "prior-sg export --format spark-dsg --out dsg.json",
+        needs="map",
+    )
+    export.add_argument("--format", choices=("json", "spark-dsg", "png"), default="json")
+    export.add_argument(
+        "--out", type=Path, required=True, help="the file to write; png: the map, and places in 3D in NAME-3d.png"
+    )
+    export.add_argument("--database", type=Path, help="read this scene.sqlite instead of the running store")
+    add_bus(export)
+
+    explain = commands.add(
+        "explain",
+        cmd_explain,
+        "say why a place carries its label",
+        "prior-sg explain 49 --log out/demo/log.mcap",
+        needs="map",
+    )
+    explain.add_argument("place", type=int, help="id of the place, as in scene.json")
+    explain.add_argument("--log", type=Path, help="ask the segmenter at the end of this log, not the running one")
+    explain.add_argument("--json", action="store_true", help="print JSON")
+    add_bus(explain)
+
+    record = commands.add(
+        "record", cmd_record, "record all topics into a log, until Ctrl-C", "prior-sg record out/log.mcap"
+    )
+    record.add_argument("log", type=Path)
+    record.add_argument("--seconds", type=float, default=0.0, help="stop after this long; 0 = at Ctrl-C")
+    add_bus(record, robot=False)
+
+    replay = commands.add(
+        "replay",
+        cmd_replay,
+        "feed a log to one service again and compare",
+        "prior-sg replay out/demo/log.mcap segmenter --diff",
+        needs="map",
+    )
+    replay.add_argument("log", type=Path)
+    replay.add_argument("service")
+    replay.add_argument("--diff", action="store_true", help="compare with what was recorded; exit 1 on differences")
+
+    topics = commands.add(
+        "topics",
+        cmd_topics,
+        "show topics and queries, or check that all documents agree",
+        "prior-sg topics --check",
+        needs="map",
+    )
+    topics.add_argument("--check", action="store_true", help="exit 1 when anything disagrees")
+    topics.add_argument("--write", action="store_true", help="renew README, docs and docker-compose.yml")
+
+    health = commands.add("health", cmd_health, "show every running process and its topics", "prior-sg health --json")
+    health.add_argument("--json", action="store_true", help="print JSON")
+    add_bus(health, robot=False)
+
+    evaluation.add_arguments(
+        commands.add(
+            "eval",
+            cmd_eval,
+            "compare methods on datasets with ground truth",
+            'prior-sg eval recordings/home --environment "residential home" --methods ours,clio --html',
+            needs="encode",
+        )
+    )
+
+    bench = commands.add(
+        "bench",
+        cmd_bench,
+        "measure one part, or all",
+        "prior-sg bench places --json",
+        needs="encode",
+    )
+    bench.add_argument(
+        "name", help="bus, places, features, kernel, swap, segmenter, task, learning, e2e, all of these, or pool"
+    )
+    bench.add_argument("--seconds", type=float, default=300.0, help="how long pool lasts (default: %(default)s)")
+    bench.add_argument("--json", action="store_true", help="print one JSON object per measurement")
+
+
+def cmd_export(arguments: argparse.Namespace) -> int:
+    """Write the scene graph from the running store or a database file."""
+    from prior_sg.deploy.cli import report
+    from prior_sg.schemas.places import MapRequest
+    from prior_sg.schemas.scene import SceneRequest
+    from prior_sg.schemas.topics import SCENE, VOXEL_MAP
+    from prior_sg.services.runtime.bus import BusError
+
+    voxels = None
+    if arguments.database is not None:
+        if not arguments.database.exists():
+            raise UserError(f"{arguments.database} does not exist; `run` and `up` write it as scene.sqlite")
+        scene = report.scene_in(arguments.database, arguments.robot)
+    else:
+        with open_client(arguments.connect) as client:
+            scene = client.ask(SCENE, SceneRequest(robot=arguments.robot))
+            if arguments.format == "png":
+                try:
+                    voxels = client.ask(VOXEL_MAP, MapRequest(robot=arguments.robot))
+                except BusError as error:
+                    console.print(f"without the map of walls: {error}")
+    if not len(scene.place_ids):
+        raise UserError(f"the store holds no places of {arguments.robot}; name another with --robot")
+    report.export(scene, voxels, arguments.format, arguments.out)
+    also = f" and {report.picture_of_places(arguments.out)}" if arguments.format == "png" else ""
+    console.print(f"{len(scene.place_ids)} places, {len(scene.regions)} regions: {arguments.out}{also}")
+    return 0
+
+
+def cmd_explain(arguments: argparse.Namespace) -> int:
+    """Each expert's vote on a place, its neighbours' pull, and what follows."""
+    import msgspec
+
+    from prior_sg.deploy.inspecting import explain
+    from prior_sg.schemas.regions import PosteriorRequest
+    from prior_sg.schemas.topics import POSTERIOR
+
+    if arguments.log is not None:
+        if not arguments.log.exists():
+            raise UserError(f"{arguments.log} does not exist; `run`, `demo` and `record` write one")
+        reply = explain.from_log(arguments.log, arguments.robot, arguments.place)
+    else:
+        with open_client(arguments.connect) as client:
+            reply = client.ask(POSTERIOR, PosteriorRequest(robot=arguments.robot, place_id=arguments.place))
+    if not reply.found:
+        raise UserError(f"{arguments.robot} has no labelled place {arguments.place}; scene.json lists their ids")
+    if arguments.json:
+        print(msgspec.json.encode(reply).decode())
+    else:
+        explain.show(reply, console)
+    return 0
+
+
+def cmd_record(arguments: argparse.Namespace) -> int:
+    """Record until Ctrl-C or the given time."""
+    from prior_sg.deploy.running.recorder import Recorder
+
+    with open_client(arguments.connect) as client:
+        recorder = Recorder(client, arguments.log)
+        end_s = time.monotonic() + (arguments.seconds or float("inf"))
+        try:
+            with console.status("recording; Ctrl-C stops") as status:
+                while time.monotonic() < end_s:
+                    time.sleep(0.2)
+                    recorder.check()
+                    total = sum(recorder.counts.values())
+                    status.update(f"recording: {total} messages; Ctrl-C stops")
+        except KeyboardInterrupt:
+            pass
+        finally:
+            recorder.close()
+    console.print(f"{sum(recorder.counts.values())} messages: {arguments.log}")
+    return 0
+
+
+def cmd_replay(arguments: argparse.Namespace) -> int:
+    """Replay a service and report differences."""
+    from prior_sg.deploy.cli import report
+    from prior_sg.deploy.inspecting import replay
+    from prior_sg.services.registry import BY_NAME
+
+    if arguments.service not in BY_NAME:
+        raise UserError(f"there is no service {arguments.service!r}; known: {', '.join(BY_NAME)}")
+    log = replay.open_log(arguments.log, arguments.service)
+    differences = 0
+    for life in log.lives:
+        found = replay.compare(log, life)
+        console.print(
+            f"{found.instance}: {found.inputs} inputs, {found.recorded} outputs recorded, {found.outputs} made"
+        )
+        for text in found.differences[:20] if arguments.diff else []:
+            console.print(f"  {text}")
+        differences += len(found.differences)
+    if arguments.service == "scene_store":
+        text = report.final_scene_difference(log, arguments.log)
+        console.print(f"  {text}" if text else "final scene: equal to that of an undisturbed replay")
+        differences += bool(text)
+    console.print(f"{differences} differences")
+    return 1 if arguments.diff and differences else 0
+
+
+def cmd_topics(arguments: argparse.Namespace) -> int:
+    """Show, check or renew what is generated from the registry."""
+    from prior_sg.deploy.inspecting import topics
+
+    if arguments.write:
+        console.print("renewed " + ", ".join(topics.write()))
+    elif arguments.check:
+        found = topics.faults()
+        for text in found:
+            console.print(text)
+        console.print(f"{len(found)} faults")
+        return 1 if found else 0
+    else:
+        print(topics.table())
+    return 0
+
+
+def cmd_health(arguments: argparse.Namespace) -> int:
+    """Every process: alive, busy, what it dropped."""
+    import msgspec
+
+    from prior_sg.services.runtime.bus import BusError
+
+    with open_client(arguments.connect) as client:
+        statuses, silent = [], []
+        for instance, service in sorted(client.alive().items()):
+            try:
+                statuses.append(client.status(service, instance))
+            except BusError as error:
+                silent.append({"service": service, "instance": instance, "error": str(error)})
+    if arguments.json:
+        print(json.dumps({"processes": msgspec.to_builtins(statuses), "silent": silent}))
+    else:
+        _print_health(statuses, silent)
+    return 1 if silent or not statuses else 0
+
+
+def _print_health(statuses: list["ServiceStatus"], silent: list[dict]) -> None:
+    """Two lines a process: what it is doing, and what went through each topic."""
+    for status in statuses:
+        waits = f", waits for {', '.join(status.waiting_for)}" if status.waiting_for else ""
+        console.print(
+            f"[bold]{status.instance}[/]  pid {status.pid}, up {status.uptime_s:.0f} s, busy {status.busy_share:.0%}, "
+            f"step {status.step_ms_p50:.1f} ms (p99 {status.step_ms_p99:.1f}), {status.resident_mb:.0f} MB, "
+            f"backlog {status.backlog}{waits}"
+        )
+        console.print("    " + " · ".join(map(_topic_line, status.topics)))
+    for entry in silent:
+        console.print(f"[red]{entry['error']}[/]")
+    if not statuses and not silent:
+        console.print("no service is running; start them with `prior-sg up`")
+
+
+def _topic_line(count: "TopicCount") -> str:
+    """One topic's counts; what should not happen stands out."""
+    parts = [
+        (count.consumed, "in"),
+        (count.published, "out"),
+        (count.skipped, "skipped"),
+        (count.duplicate, "repeated"),
+    ]
+    texts = [f"{number} {word}" for number, word in parts if number]
+    faults = [(count.malformed, "malformed"), (count.missed, "missed")]
+    texts += [f"[red]{number} {word}[/]" for number, word in faults if number]
+    return f"{count.topic} {', '.join(texts) or '-'}"
+
+
+def cmd_bench(arguments: argparse.Namespace) -> int:
+    """Measure."""
+    from prior_sg.deploy.benches import main as bench
+
+    if arguments.name not in (*bench.BENCHES, bench.POOL, "all"):
+        raise UserError(
+            f"there is no measurement {arguments.name!r}; known: {', '.join((*bench.BENCHES, bench.POOL))}, all"
+        )
+    for name in bench.BENCHES if arguments.name == "all" else [arguments.name]:
+        with console.status(f"measuring {name}"):
+            found = bench.run(name, arguments.seconds)
+        if arguments.json:
+            print(json.dumps(found))
+        else:
+            table = Table("metric", "value", title=f"{name} ({found['machine']['cores']} cores)")
+            for metric, value in found["metrics"].items():
+                table.add_row(metric, f"{value:.4g}")
+            console.print(table)
+    return 0
+
+
+def cmd_eval(arguments: argparse.Namespace) -> int:
+    """Compare methods on datasets with ground truth."""
+    return evaluation.run(arguments, console)

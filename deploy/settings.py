@@ -1,0 +1,43 @@
+"""Settings of the services as a user gives them, and what holds where nothing is given."""
+
+import os
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from prior_sg.services.runtime.config import check_sections, from_arguments, from_environment, merge, read_file, resolve
+from prior_sg.services.runtime.service import Service
+
+DEFAULT_CONNECT = "tcp/127.0.0.1:7447"
+DEFAULT_ROBOT = "robot1"
+DEMO_ENVIRONMENT = "residential home"
+DEMO_TASK = "real-estate listing"
+
+Layers = Mapping[str, Mapping[str, Any]]  # fields by service
+
+
+def connect_in_force() -> str:
+    """The router of this environment: PSG_CONNECT, else the one that every command expects on this machine."""
+    return os.environ.get("PSG_CONNECT", DEFAULT_CONNECT)
+
+
+def settings_layers(config: str, settings: Sequence[str]) -> Layers:
+    """Settings of all services: the TOML file, then the environment, then `SERVICE.FIELD=VALUE`. Raises ConfigError."""
+    from prior_sg.services.registry import BY_NAME
+
+    file, given = read_file(config), from_arguments(settings)
+    check_sections(file, list(BY_NAME))
+    check_sections(given, list(BY_NAME))
+    return merge(file, from_environment(os.environ), given)
+
+
+def resolved_config(service: Service, config: str, settings: Sequence[str]) -> Any:
+    """The config of one service from all layers. Raises ConfigError."""
+    return resolve(service.config, service.name, settings_layers(config, settings))
+
+
+def check_settings(config: str, settings: Sequence[str]) -> None:
+    """Resolve the config of every service now, so that a wrong setting is told before anything starts."""
+    from prior_sg.services.registry import SERVICES
+
+    for service in SERVICES:
+        resolved_config(service, config, settings)

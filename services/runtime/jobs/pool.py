@@ -1,0 +1,131 @@
+"""`job` delivery over a bus: each job to one worker of every group of a pool, at least once.
+
+Workers of one group do the same work (they serve one embedding space); a pool may hold several groups. The board
+decides, the pool calls workers, watches them come and go, and looks again when time alone changes something.
+"""
+
+import logging
+import threading
+from collections.abc import Callable, Hashable
+from functools import partial
+
+from prior_sg.schemas.topics import Topic, worker_keys
+from prior_sg.services.runtime.bus import Answer, Bus
+from prior_sg.services.runtime.jobs.board import Board, Ended
+from prior_sg.services.runtime.jobs.dispatcher import Job
+
+log = logging.getLogger(__name__)
+
+DEFAULT_TIMEOUT_S = 60.0
+
+
+class JobPool:
+    """Dispatches the jobs of one topic over a bus. `on_ended` comes on a foreign thread, once per job.
+
+    With `limit`, at most so many jobs wait and the oldest is skipped for a newer one; 0 = none is skipped.
+    """
+
+    def __init__(
+        self,
+        bus: Bus,
+        topic: Topic,
+        clock_s: Callable[[], float],
+        on_ended: Callable[[Ended], None],
+        *,
+        limit: int = 0,
+        timeout_s: float = DEFAULT_TIMEOUT_S,
+    ) -> None:
+        self._bus, self._topic, self._clock_s, self._on_ended = bus, topic, clock_s, on_ended
+        self._timeout_s = timeout_s
+        self._board = Board(limit=limit)
+        self._lock = threading.RLock()
+        self._timer: threading.Timer | None = None
+        self._timer_at_s = 0.0
+        self._closed = False
+        self._live_prefix = worker_keys(topic, "", "")[1]
+        bus.watch(worker_keys(topic, "*", "**")[1], self._worker_changed)
+
+    @property
+    def outstanding(self) -> int:
+        """Jobs submitted and not finished, those for later left out."""
+        with self._lock:
+            return self._board.outstanding
+
+    @property
+    def workers(self) -> int:
+        """Workers alive."""
+        with self._lock:
+            return self._board.workers
+
+    def submit(self, job_id: Hashable, payload: bytes, group: str = "", later: bool = False) -> None:
+        """Line up one job, for one group or for all, and send what can be sent."""
+        with self._lock:
+            ended = self._board.submit(job_id, payload, group, later)
+        self._tell(ended)
+        self._send()
+
+    def close(self) -> None:
+        """Send nothing more."""
+        with self._lock:
+            self._closed = True
+            if self._timer is not None:
+                self._timer.cancel()
+
+    def _worker_changed(self, key: str, alive: bool) -> None:
+        name, _, group = key.removeprefix(self._live_prefix).partition("/")
+        ended: list[Ended] = []
+        with self._lock:
+            if alive:
+                self._board.worker_up(name, group)
+            else:
+                ended = self._board.worker_down(name, self._clock_s())
+        log.info(
+            "worker joined" if alive else "worker left",
+            extra={"worker": name, "group": group, "topic": self._topic.name},
+        )
+        self._tell(ended)
+        self._send()
+
+    def _send(self) -> None:
+        with self._lock:
+            if self._closed:
+                return
+            assignments, ended = self._board.assign(self._clock_s())
+            self._set_timer()
+        self._tell(ended)
+        for name, job in assignments:
+            key = worker_keys(self._topic, name)[0]
+            self._bus.call(key, job.payload, self._timeout_s, partial(self._answered, name, job))
+
+    def _answered(self, name: str, job: Job, answer: Answer) -> None:
+        with self._lock:
+            if answer.payload is not None:
+                ended = self._board.finished(name, job.id, self._clock_s())
+            else:
+                ended = self._board.failed(name, job.id, answer.reason, self._clock_s())
+        if answer.payload is None and answer.reason != "busy":
+            log.warning("job not done", extra={"worker": name, "job": str(job.id), "reason": answer.reason})
+        self._tell(ended)
+        self._send()
+
+    def _tell(self, ended: list[Ended]) -> None:
+        for job in ended:
+            self._on_ended(job)
+
+    def _set_timer(self) -> None:
+        """Look again when the board says; an earlier time replaces a later one."""
+        now_s = self._clock_s()
+        when_s = self._board.next_time_s(now_s)
+        if when_s is None or (self._timer is not None and self._timer_at_s <= when_s):
+            return
+        if self._timer is not None:
+            self._timer.cancel()
+        self._timer = threading.Timer(max(0.01, when_s - now_s), self._timer_fired)
+        self._timer_at_s = when_s
+        self._timer.daemon = True
+        self._timer.start()
+
+    def _timer_fired(self) -> None:
+        with self._lock:
+            self._timer = None
+        self._send()

@@ -1,0 +1,110 @@
+"""The bytes of every message type, as files that no later program may read or write otherwise: one per version.
+
+`PYTHONPATH=src python -m tests.schemas.test_golden` writes those that are missing; a file that is there stays.
+"""
+
+import struct
+from pathlib import Path
+
+import msgpack
+import msgspec
+import numpy as np
+import pytest
+
+from prior_sg.schemas.codec import ARRAY_EXT_CODE, DTYPES, Message, decode, encode, message_types
+from prior_sg.schemas.migrations import current
+from tests.help.examples import EXAMPLES, unset_fields
+
+GOLDEN = Path(__file__).parent / "golden"
+MESSAGE_TYPES = [kind for kind in message_types() if kind.__module__.startswith("prior_sg.schemas.")]
+
+
+def file_of(kind: type[Message], version: int = 0) -> Path:
+    return GOLDEN / f"{kind.__name__}-{version or kind.VERSION}.msgpack"
+
+
+def by_name(message):
+    return type(message).__name__
+
+
+def test_every_message_type_has_one_example_and_every_file_a_type():
+    assert sorted(map(by_name, EXAMPLES)) == sorted(kind.__name__ for kind in MESSAGE_TYPES)
+    wanted = [file_of(kind, version) for kind in MESSAGE_TYPES for version in range(1, kind.VERSION + 1)]
+    assert sorted(GOLDEN.iterdir()) == sorted(wanted), "see the head of this file"
+
+
+@pytest.mark.parametrize("kind", MESSAGE_TYPES, ids=lambda kind: kind.__name__)
+def test_every_version_ever_written_can_be_read(kind):
+    for version in range(1, kind.VERSION + 1):
+        golden = file_of(kind, version).read_bytes()
+        assert isinstance(decode(kind, current(kind, golden, f"{kind.__name__}/{version}")), kind)
+
+
+def test_the_digest_of_a_prior_stays():
+    prior = next(example for example in EXAMPLES if by_name(example) == "Prior")
+    assert prior.digest() == "eab9114663fcaab470acb71942c653fc"
+
+
+@pytest.mark.parametrize("message", EXAMPLES, ids=by_name)
+def test_an_example_leaves_no_field_at_its_default(message):
+    assert list(unset_fields(message)) == []
+
+
+@pytest.mark.parametrize("message", EXAMPLES, ids=by_name)
+def test_the_bytes_are_read_and_written_as_ever(message):
+    golden = file_of(type(message)).read_bytes()
+    assert encode(message) == golden
+    assert decode(type(message), golden) == message
+    assert encode(decode(type(message), golden)) == golden
+
+
+@pytest.mark.parametrize("message", EXAMPLES, ids=by_name)
+def test_the_bytes_say_the_same_to_an_independent_reader(message):
+    unpacked = msgpack.unpackb(file_of(type(message)).read_bytes(), ext_hook=array)
+    assert list(unpacked) == list(message.__struct_fields__)
+    same(unpacked, message)
+
+
+def array(code, data):
+    """An array by the description in schemas/codec.py."""
+    assert code == ARRAY_EXT_CODE
+    dtype, ndim = DTYPES[data[0]], data[1]
+    shape = struct.unpack_from(f"<{ndim}I", data, 2)
+    return np.frombuffer(data[2 + 4 * ndim :], np.dtype(dtype).newbyteorder("<")).reshape(shape)
+
+
+def same(unpacked, value):
+    if isinstance(value, msgspec.Struct):
+        assert list(unpacked) == list(value.__struct_fields__)
+        for name, inner in unpacked.items():
+            same(inner, getattr(value, name))
+    elif isinstance(value, np.ndarray):
+        assert unpacked.dtype == value.dtype
+        np.testing.assert_array_equal(unpacked, value)
+    elif isinstance(value, list | tuple):
+        assert len(unpacked) == len(value)
+        for one, other in zip(unpacked, value, strict=True):
+            same(one, other)
+    else:
+        assert type(unpacked) is type(value) and unpacked == value
+
+
+def test_a_field_left_at_its_default_is_found():
+    deltas = next(example for example in EXAMPLES if by_name(example) == "RegionDelta")
+    bare = msgspec.structs.replace(deltas.regions[0], parent="", transitions=[])
+    assert list(unset_fields(msgspec.structs.replace(deltas, regions=[bare], snapshot=False))) == [
+        ".snapshot",
+        ".regions[].transitions",
+        ".regions[].parent",
+    ]
+
+
+def write_missing():
+    GOLDEN.mkdir(exist_ok=True)
+    for message in EXAMPLES:
+        if not file_of(type(message)).exists():
+            file_of(type(message)).write_bytes(encode(message))
+
+
+if __name__ == "__main__":
+    write_missing()
