@@ -44,7 +44,7 @@ def pack(dataset: str | Path, path: str | Path, max_mb: float = 12, provenance: 
 
 
 def _write(source: Source, path: Path, quality: int | None, provenance: str) -> None:
-    write_log(path, source, _keyframes(source, quality), ROBOT, provenance, source.ground_truth)
+    write_log(path, _keyframes(source, quality), ROBOT, provenance, source.ground_truth)
 
 
 def _keyframes(source: Source, quality: int | None) -> Iterator[Keyframe]:

@@ -13,7 +13,7 @@ from prior_sg.schemas.frames import Keyframe, PoseUpdate
 from prior_sg.schemas.topics import KEYFRAME, POSE_UPDATE, Topic
 from prior_sg.services.ingest.core.selection import BadFrame, Correction, RawFrame
 from prior_sg.services.ingest.sources import ReadOptions, Source, open_source
-from prior_sg.services.ingest.sources.recording import ORIGIN, REGIONS, SOURCE_METADATA
+from prior_sg.services.ingest.sources.recording import REGIONS
 from prior_sg.services.runtime.record import LogWriter
 
 
@@ -33,6 +33,7 @@ def keyframe_of(frame: RawFrame, robot: str, color: bytes, depth: bytes) -> Keyf
         depth=depth,
         depth_scale_m=frame.depth_scale_m,
         mask=frame.mask,
+        origin_m=frame.origin_m,
     )
 
 
@@ -48,13 +49,12 @@ def pose_update_of(correction: Correction, robot: str, revision: int) -> PoseUpd
     )
 
 
-def write_log(  # noqa: PLR0917
-    path: Path, source: Source, messages: Iterable[Message], writer: str, provenance: str, truth: dict[str, Any] | None
+def write_log(
+    path: Path, messages: Iterable[Message], writer: str, provenance: str, truth: dict[str, Any] | None
 ) -> None:
     """Write keyframes and pose updates, the ground truth and where all of it comes from. Raises LogError."""
     with LogWriter(path) as log:
-        moved = {ORIGIN: " ".join(map(repr, source.origin_m))} if any(source.origin_m) else {}
-        log.metadata(SOURCE_METADATA, {"provenance": provenance, **moved})
+        log.metadata("source", {"provenance": provenance})
         if truth is not None:
             log.attach(REGIONS, "application/json", json.dumps(truth).encode())
         for sequence, (topic, message) in enumerate(_topics(messages)):
@@ -84,7 +84,7 @@ def pack_source(  # noqa: PLR0917
     refused: Counter[str] = Counter()
     partial = log_path.with_name(f"{log_path.name}.partial")
     try:
-        write_log(partial, source, _messages(source, robot, refused, progress), robot, provenance, _truth(source))
+        write_log(partial, _messages(source, robot, refused, progress), robot, provenance, _truth(source))
         if refused.total() == source.total:
             top = refused.most_common(1)
             raise PackError(f"no frame of {path} can be packed: {top[0][0] if top else 'it holds none'}")

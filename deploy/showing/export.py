@@ -2,6 +2,7 @@
 
 `scene_json` (lists sorted by id, metres, world with z up, null where nothing is known yet):
 
+    origin_m      [x, y, z]                       of this world in the source's: add it to any position
     robot, stamp_ns, environment, task, prior_digest, embedding_space
     labels        [label]                         columns of every posterior
     regions       [{id, label, parent, probability, unknown, predicted, area_m2, position_m [x, y, z], hull_m [[x, y]],
@@ -51,6 +52,7 @@ def scene_json(scene: Scene) -> dict[str, Any]:
         "task": scene.task,
         "prior_digest": scene.prior_digest,
         "embedding_space": scene.space,
+        "origin_m": list(scene.origin_m),
         "labels": list(scene.labels),
         "regions": [
             {
@@ -210,7 +212,9 @@ def spark_dsg_graph(scene: Scene) -> spark_dsg.DynamicSceneGraph:
         for region in scene.regions:
             graph.insert_edge(_symbol(BUILDING, 0), _symbol(ROOM, region.id), enforce_single_parent=True)
     about = {"robot": scene.robot, "environment": scene.environment, "task": scene.task}
-    graph.metadata.set(about | {"prior_digest": scene.prior_digest, "embedding_space": scene.space})
+    graph.metadata.set(
+        about | {"prior_digest": scene.prior_digest, "embedding_space": scene.space, "origin_m": list(scene.origin_m)}
+    )
     labelspace = spark_dsg.Labelspace(dict(enumerate(scene.labels)))  # kept in the metadata, hence after them
     for named in (layer, spark_dsg.DsgLayers.ROOMS):
         key = graph.get_layer_key(named)

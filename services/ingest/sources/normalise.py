@@ -69,6 +69,7 @@ class Normaliser:
     depth: Depth
     maps: tuple[np.ndarray, np.ndarray] | None  # where the pixels of a straight image lie in a bent one
     world_from_source: np.ndarray | None  # None = nothing to be done, so that poses pass unchanged
+    origin_m: tuple[float, float, float]  # where the frames' world has its zero in the source's, levelled
 
     def frame(  # noqa: PLR0917
         self, index: int, total: int, frame_id: int, stamp_ns: int, source_from_camera: np.ndarray, images: Images
@@ -87,6 +88,7 @@ class Normaliser:
                 depth_scale_m=depth_scale_m,
                 index=index,
                 total=total,
+                origin_m=self.origin_m,
             )
         except UNUSABLE:
             raise
@@ -182,7 +184,7 @@ def finish(found: Found, options: ReadOptions) -> Source:
     if not samples and len(found.entries) >= FEW:
         raise SourceError(f"none of the frames of {found.path} can be read: {_most_common(reasons)}")
     poses = [pose for pose, _ in samples]
-    normaliser, notes, origin_m = prepare(found, options, samples)
+    normaliser, notes = prepare(found, options, samples)
     corrections = [
         msgspec.structs.replace(correction, world_from_camera=normaliser.pose(correction.world_from_camera))
         for correction in found.corrections
@@ -195,11 +197,11 @@ def finish(found: Found, options: ReadOptions) -> Source:
         intrinsics=normaliser.intrinsics,
         total=total,
         frames=lambda: _frames(normaliser, entries),
-        ground_truth=shifted_truth(found.ground_truth, origin_m),
+        ground_truth=shifted_truth(found.ground_truth, normaliser.origin_m),
         corrections=lambda: iter(corrections),
         why=found.why,
         notes=(*found.notes, *paced, *_rounded(poses), *notes),
-        origin_m=origin_m,
+        origin_m=normaliser.origin_m,
     )
 
 
@@ -280,8 +282,8 @@ def _rounded(poses: Sequence[np.ndarray]) -> tuple[str, ...]:
 
 def prepare(
     found: Found, options: ReadOptions, samples: Sequence[tuple[np.ndarray, Images]]
-) -> tuple[Normaliser, tuple[str, ...], tuple[float, float, float]]:
-    """What is to be done to the frames of a source, the notes on it, and the new origin. Raises SourceError."""
+) -> tuple[Normaliser, tuple[str, ...]]:
+    """What is to be done to the frames of a source, and the notes on it. Raises SourceError."""
     notes: list[str] = []
     images = [images for _, images in samples]
     sizes = _sizes(images, found.camera.intrinsics)
@@ -292,9 +294,9 @@ def prepare(
     if any(origin_m):
         world_from_source = np.eye(4) if world_from_source is None else world_from_source
         world_from_source[:3, 3] -= origin_m
-    normaliser = Normaliser(camera.intrinsics, sizes, depth, _maps(camera), world_from_source)
+    normaliser = Normaliser(camera.intrinsics, sizes, depth, _maps(camera), world_from_source, origin_m)
     _check_frames(normaliser, found.path, samples)
-    return normaliser, tuple(notes), origin_m
+    return normaliser, tuple(notes)
 
 
 def _sizes(images: Sequence[Images], camera: Intrinsics) -> Sizes:

@@ -18,11 +18,10 @@ from prior_sg.services.ingest.core.selection import BadFrame, Correction, RawFra
 from prior_sg.services.ingest.sources.base import Camera, Found, Images, Source, SourceError
 from prior_sg.services.ingest.sources.normalise import LOOKED_AT, UNUSABLE, Normaliser, prepare, shifted_truth
 from prior_sg.services.ingest.sources.poses import Convention
-from prior_sg.services.runtime.record import Content, LogError, attachments, contents, metadata, read_log
+from prior_sg.services.runtime.record import Content, LogError, attachments, contents, read_log
 
 NAME = "log"
 REGIONS = "regions.json"
-SOURCE_METADATA, ORIGIN = "source", "origin_m"  # where a packed log says what its coordinates were moved by
 log = logging.getLogger(__name__)
 Rig = tuple[Intrinsics, float]
 
@@ -36,7 +35,6 @@ class Log:
     total: int
     first: Keyframe
     truth: dict[str, Any] | None
-    origin_m: tuple[float, float, float]  # that was taken off before packing
 
 
 def load(path: Path, options: ReadOptions) -> Source:
@@ -44,10 +42,10 @@ def load(path: Path, options: ReadOptions) -> Source:
     recorded, corrected = _opened(path, options.source_robot)
     samples = _samples(recorded)
     found = Found(NAME, path, Camera(recorded.first.intrinsics), recorded.first.depth_scale_m, ())
-    normaliser, notes, moved_m = prepare(found, options, samples)
+    moved, notes = prepare(found, options, samples)
+    normaliser = replace(moved, origin_m=_sum(recorded.first.origin_m, moved.origin_m))
     if options.rate_hz:
         notes = (*notes, f"{options.rate_hz:g} frames a second, as told, in place of the stamps")
-    origin_m = (recorded.origin_m[0] + moved_m[0], recorded.origin_m[1] + moved_m[1], recorded.origin_m[2] + moved_m[2])
 
     @cache
     def normaliser_of(rig: Rig) -> Normaliser:
@@ -55,7 +53,7 @@ def load(path: Path, options: ReadOptions) -> Source:
         if rig == (recorded.first.intrinsics, recorded.first.depth_scale_m):
             return normaliser
         other = prepare(replace(found, camera=Camera(rig[0]), depth_scale_m=rig[1]), options, ())[0]
-        return replace(other, world_from_source=normaliser.world_from_source)
+        return replace(other, world_from_source=normaliser.world_from_source, origin_m=normaliser.origin_m)
 
     return Source(
         layout=NAME,
@@ -63,12 +61,16 @@ def load(path: Path, options: ReadOptions) -> Source:
         intrinsics=normaliser.intrinsics,
         total=recorded.total,
         frames=lambda: _frames(recorded, normaliser_of, options),
-        ground_truth=shifted_truth(recorded.truth, moved_m),
+        ground_truth=shifted_truth(recorded.truth, moved.origin_m),
         corrections=lambda: _corrections(recorded, normaliser) if corrected else iter(()),
         why=("it is an MCAP log of ours",),
         notes=notes,
-        origin_m=origin_m,
+        origin_m=normaliser.origin_m,
     )
+
+
+def _sum(a: tuple[float, float, float], b: tuple[float, float, float]) -> tuple[float, float, float]:
+    return a[0] + b[0], a[1] + b[1], a[2] + b[2]
 
 
 def _opened(path: Path, robot: str) -> tuple[Log, bool]:
@@ -82,11 +84,9 @@ def _opened(path: Path, robot: str) -> tuple[Log, bool]:
             raise SourceError(f"{path} holds no keyframes{f' of {robot}' if robot else ''}{_robots(streams)}")
         files = attachments(path)
         truth = json.loads(files[REGIONS]) if REGIONS in files else None
-        words = metadata(path).get(SOURCE_METADATA, {}).get(ORIGIN, "0 0 0").split()
-        x_m, y_m, z_m = (float(word) for word in words)
     except (LogError, ValueError) as error:
         raise SourceError(str(error)) from error
-    recorded = Log(path, key, total, _first(path, key), truth, (x_m, y_m, z_m))
+    recorded = Log(path, key, total, _first(path, key), truth)
     return recorded, any(content.topic == POSE_UPDATE.name for content in found)
 
 

@@ -49,6 +49,7 @@ class State:
     revision: int = -1
     stamp_ns: int = 0
     frame_id: int = -1
+    origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of the world, as the newest keyframe says
 
 
 def empty(robot: str, epoch: int, cfg: Config) -> State:
@@ -100,6 +101,7 @@ def integrate(state: State, keyframe: Keyframe, cfg: Config) -> PlaceDelta:
     if jump_m and (reason := _distrust(state, keyframe, depth_m, jump_m, cfg)):
         state.archive.put(keyframe, fused=False)
         return reject(state, keyframe, reason, cfg)
+    state.origin_m = keyframe.origin_m
     event = _order(state, keyframe)
     changed = [_fuse_kept(state, keyframe, depth_m, cfg)]
     if jump_m:
@@ -181,6 +183,7 @@ def snapshot(state: State, cfg: Config) -> PlaceDelta:
         stamp_ns=state.stamp_ns,
         frame_id=state.frame_id,
         snapshot=True,
+        origin_m=state.origin_m,
         **_cameras(state, sorted(state.cameras_m)),
         **fields,
     )
@@ -348,6 +351,7 @@ def _delta(
         frame_id=state.frame_id,
         camera_m=camera_m,
         event=event,
+        origin_m=state.origin_m,
         **_cameras(state, moved_ids),
         **fields,
     )
