@@ -5,7 +5,7 @@ import numpy as np
 
 from prior_sg.schemas.frames import Intrinsics, Keyframe
 
-MAX_PRINCIPAL_OFFSET = 0.2  # share of the image by which the principal point may be off its middle
+MAX_PRINCIPAL_OFFSET = 0.45  # share of the image by which the principal point may be off its middle: crops
 
 
 class ImageFault(ValueError):
@@ -14,7 +14,7 @@ class ImageFault(ValueError):
 
 def color_of(keyframe: Keyframe) -> np.ndarray:
     """Colour (h, w, 3) uint8, RGB. Raises ImageFault."""
-    image = _decoded(keyframe.color, "colour", cv2.IMREAD_COLOR_RGB)
+    image = _decoded(keyframe.color, "colour", cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION)
     _check_size(image, keyframe.intrinsics, "colour")
     return image
 
@@ -22,8 +22,8 @@ def color_of(keyframe: Keyframe) -> np.ndarray:
 def depth_of(keyframe: Keyframe, max_principal_offset: float) -> np.ndarray:
     """Depth (h, w) float32 in metres, 0 = no measurement or masked. Raises ImageFault.
 
-    The principal point of a camera lies near the middle of its image; farther from it than `max_principal_offset`
-    (share of the image), the intrinsics belong to another image size.
+    The principal point of a camera lies in its image, of a crop not in the middle; farther from this than
+    `max_principal_offset` (share of the image), the intrinsics belong to another image size.
     """
     camera = keyframe.intrinsics
     image = _single_channel(keyframe.depth, camera, "depth")

@@ -7,7 +7,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from prior_sg.schemas.frames import Intrinsics
 from prior_sg.services.ingest.core.selection import RawFrame
-from prior_sg.services.ingest.sources.base import MILLIMETRE, SourceError, encode_image, millimetre_png
+from prior_sg.services.ingest.sources.base import MILLIMETRE, SourceError
+from prior_sg.services.ingest.sources.pixels import encoded, millimetres
 
 
 def frame_of(
@@ -34,7 +35,7 @@ def frame_of(
             stamp_ns=int(stamp_ns),
             intrinsics=_camera(intrinsics, color.shape[1], color.shape[0]),
             world_from_camera=np.array(world_from_camera, np.float64).reshape(4, 4),
-            color=encode_image(np.ascontiguousarray(color[:, :, ::-1]), ".png"),
+            color=encoded(np.ascontiguousarray(color[:, :, ::-1]), ".png"),
             depth=_depth_png(depth),
             depth_scale_m=MILLIMETRE,
             index=number,
@@ -58,7 +59,7 @@ def _camera(intrinsics: Intrinsics | ArrayLike, width_px: int, height_px: int) -
 
 def _depth_png(depth: NDArray[Any]) -> bytes:
     if depth.dtype == np.uint16:
-        return encode_image(np.ascontiguousarray(depth), ".png")
+        return encoded(np.ascontiguousarray(depth), ".png")
     if not np.issubdtype(depth.dtype, np.floating):
         raise ValueError(f"depth must be float in metres or uint16 in millimetres; got {depth.dtype}")
-    return millimetre_png(depth)
+    return encoded(millimetres(depth), ".png")

@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 
 from prior_sg.deploy.cli.shared import Commands, add_bus, add_settings, console, names_in
+from prior_sg.deploy.cli.source_options import add_source_options, read_options, source_settings
 from prior_sg.deploy.errors import UserError
 from prior_sg.deploy.sample import COARSE, SAMPLE
 from prior_sg.deploy.settings import DEMO_ENVIRONMENT, DEMO_TASK
@@ -43,6 +44,7 @@ def add_commands(commands: Commands) -> None:
     run.add_argument("--out", type=Path, default=Path("out/run"), help="folder for the results")
     run.add_argument("--in-process", action="store_true", help="all services in this process, for debugging")
     add_run_options(run)
+    add_source_options(run)
 
 
 def _at_least_one(text: str) -> int:
@@ -73,7 +75,7 @@ def add_run_options(parser: argparse.ArgumentParser) -> None:
 def settings_of(arguments: argparse.Namespace) -> list[str]:
     """Settings that run options stand for, then those given by --set."""
     places = [f"place_graph.places={arguments.places}"] if arguments.places else []
-    return [*places, *_encoder_settings(arguments.encoder), *arguments.set]
+    return [*places, *_encoder_settings(arguments.encoder), *source_settings(arguments), *arguments.set]
 
 
 def _encoder_settings(choice: str) -> list[str]:
@@ -110,7 +112,7 @@ def cmd_run(arguments: argparse.Namespace) -> int:
 
     if not Path(arguments.source).exists():
         raise UserError(f"{arguments.source} does not exist")
-    truth = truth_of(arguments.source)  # also finds out at once whether the source is of a known layout
+    truth = truth_of(arguments.source, read_options(arguments))  # also finds out at once whether it can be opened
     job = Job(
         source=arguments.source,
         out=arguments.out,

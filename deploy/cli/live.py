@@ -6,6 +6,7 @@ from pathlib import Path
 
 from prior_sg.deploy.cli.jobs import add_run_options, settings_of
 from prior_sg.deploy.cli.shared import Commands, add_bus, console, names_in, open_client
+from prior_sg.deploy.cli.source_options import add_source_options, read_options
 from prior_sg.deploy.errors import UserError
 from prior_sg.deploy.running import serve
 from prior_sg.services.errors import PriorSgError
@@ -25,6 +26,7 @@ def add_commands(commands: Commands) -> None:
     up.add_argument("--out", type=Path, default=Path("out/up"), help="folder for the database and logs")
     up.add_argument("--no-router", action="store_true", help="use the router at --connect instead of starting one")
     add_run_options(up)
+    add_source_options(up)
 
     one = commands.add(
         "serve",
@@ -72,7 +74,7 @@ def cmd_up(arguments: argparse.Namespace) -> int:
     make_folder(arguments.out)
     settings = [f"scene_store.path={arguments.out / 'scene.sqlite'}", f"ingest.speed={arguments.speed}"]
     if arguments.source:
-        truth_of(arguments.source)  # finds out at once whether the source is of a known layout
+        truth_of(arguments.source, read_options(arguments))  # finds out at once whether it can be opened
         settings.append(f"ingest.source={arguments.source}")
     settings += settings_of(arguments)
     check_settings(arguments.config, settings)

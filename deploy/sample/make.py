@@ -4,7 +4,6 @@ python -m prior_sg.deploy.sample.make DATASET OUT --provenance SENTENCE
 """
 
 import argparse
-import json
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -14,22 +13,17 @@ import cv2
 import msgspec
 import numpy as np
 
-from prior_sg.schemas.codec import encode
+from prior_sg.deploy.sample.packed import PackError, keyframe_of, write_log
 from prior_sg.schemas.frames import Keyframe
-from prior_sg.schemas.topics import KEYFRAME
 from prior_sg.services.ingest.core.selection import RawFrame
 from prior_sg.services.ingest.sources import Source, SourceError, open_source
 from prior_sg.services.ingest.sources.images import jpeg_segments
-from prior_sg.services.runtime.record import LogError, LogWriter
+from prior_sg.services.runtime.record import LogError
 
 ROBOT = "sample"
 QUALITIES = (None, 92, 85, 75)  # of the JPEG; None = as it is
 PNG_EFFORT = (cv2.IMWRITE_PNG_COMPRESSION, 9)
 JPEG_KEPT = frozenset({0xE0, 0xEE}) | frozenset(range(0xC0, 0xE0))  # JFIF and Adobe headers, and what decoding needs
-
-
-class PackError(RuntimeError):
-    """The folder cannot be packed; the text is one sentence."""
 
 
 @dataclass(frozen=True)
@@ -78,40 +72,16 @@ def pack(
 
 
 def _write(source: Source, path: Path, quality: int | None, provenance: str, coarser: Coarser | None) -> None:
-    with LogWriter(path) as log:
-        log.metadata("source", {"provenance": provenance})
-        if source.ground_truth is not None:
-            log.attach("regions.json", "application/json", json.dumps(source.ground_truth).encode())
-        for sequence, keyframe in enumerate(_keyframes(source, quality, coarser)):
-            log.add(
-                KEYFRAME,
-                KEYFRAME.key_of(keyframe),
-                encode(keyframe),
-                writer=ROBOT,
-                sequence=sequence,
-                sent_ns=keyframe.stamp_ns,
-                received_ns=keyframe.stamp_ns,
-            )
+    write_log(path, _keyframes(source, quality, coarser), ROBOT, provenance, source.ground_truth)
 
 
 def _keyframes(source: Source, quality: int | None, coarser: Coarser | None) -> Iterator[Keyframe]:
     for frame in source:
         if not isinstance(frame, RawFrame):
             raise PackError(f"frame {frame.frame_id} of {source.path} cannot be packed: {frame.reason}")
-        yield _keyframe(frame if coarser is None else coarser.of(frame), quality)
-
-
-def _keyframe(frame: RawFrame, quality: int | None) -> Keyframe:
-    return Keyframe(
-        robot=ROBOT,
-        frame_id=frame.frame_id,
-        stamp_ns=frame.stamp_ns,
-        intrinsics=frame.intrinsics,
-        world_from_camera=frame.world_from_camera,
-        color=bare_jpeg(frame.color) if quality is None else _recompressed(frame.color, quality),
-        depth=smallest_png(frame.depth),
-        depth_scale_m=frame.depth_scale_m,
-    )
+        seen = frame if coarser is None else coarser.of(frame)
+        color = bare_jpeg(seen.color) if quality is None else _recompressed(seen.color, quality)
+        yield keyframe_of(seen, ROBOT, color, smallest_png(seen.depth))
 
 
 def bare_jpeg(jpeg: bytes) -> bytes:
@@ -128,7 +98,7 @@ def smallest_png(png: bytes) -> bytes:
 
 
 def _recompressed(color: bytes, quality: int) -> bytes:
-    image = _decoded(color, cv2.IMREAD_COLOR)
+    image = _decoded(color, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     return cv2.imencode(".jpg", image, (cv2.IMWRITE_JPEG_QUALITY, quality))[1].tobytes()
 
 

@@ -54,7 +54,8 @@ def spark_dsg_graph(scene: Scene) -> spark_dsg.DynamicSceneGraph:
         for region in scene.regions:
             graph.insert_edge(_symbol(BUILDING, 0), _symbol(ROOM, region.id), enforce_single_parent=True)
     about = {"robot": scene.robot, "environment": scene.environment, "task": scene.task}
-    graph.metadata.set(about | {"prior_digest": scene.prior_digest, "embedding_space": scene.space})
+    about |= {"prior_digest": scene.prior_digest, "embedding_space": scene.space}
+    graph.metadata.set(about | {"origin_m": list(scene.origin_m)})
     labelspace = spark_dsg.Labelspace(dict(enumerate(scene.labels)))  # kept in the metadata, hence after them
     for named in (layer, spark_dsg.DsgLayers.ROOMS):
         key = graph.get_layer_key(named)

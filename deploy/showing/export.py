@@ -2,6 +2,7 @@
 
 `scene_json` (lists sorted by id, metres, world with z up, null where nothing is known yet):
 
+    origin_m      [x, y, z]                       of this world in the source's: add it to any position
     robot, stamp_ns, environment, task, prior_digest, embedding_space
     labels        [label]                         columns of every posterior
     regions       [{id, label, parent, probability, unknown, predicted, area_m2, position_m [x, y, z], hull_m [[x, y]],
@@ -49,6 +50,7 @@ def scene_json(scene: Scene) -> dict[str, Any]:
         "task": scene.task,
         "prior_digest": scene.prior_digest,
         "embedding_space": scene.space,
+        "origin_m": list(scene.origin_m),
         "labels": list(scene.labels),
         "regions": [
             {

@@ -50,6 +50,7 @@ class RawFrame(Message, frozen=True, kw_only=True):
     index: int  # position in the source, from 0
     total: int  # frames in the source, 0 = unknown (live)
     mask: bytes = b""
+    origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def check(self) -> None:
         check_pose(self.world_from_camera)
@@ -268,4 +269,5 @@ def _keyframe(state: State, frame: RawFrame) -> Keyframe:
         depth=frame.depth,
         depth_scale_m=frame.depth_scale_m,
         mask=frame.mask,
+        origin_m=frame.origin_m,
     )

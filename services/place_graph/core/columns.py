@@ -79,6 +79,7 @@ class Heading(NamedTuple):
     snapshot: bool = False
     camera_m: tuple[float, float, float] | None = None
     event: str = ""
+    origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 def no_ground() -> GroundColumns:
@@ -104,6 +105,7 @@ def place_delta(
         snapshot=heading.snapshot,
         camera_m=heading.camera_m,
         event=heading.event,
+        origin_m=heading.origin_m,
         place_ids=graph.places.place_ids,
         positions_m=graph.places.positions_m,
         radii_m=graph.places.radii_m,

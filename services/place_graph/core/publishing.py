@@ -34,7 +34,7 @@ def publish(
     openings = state.openings.update(looked_at, shown, cfg.voxel_m, cfg.frontier_min_area_m2)
     state.openings.forget(i for i in changes.touched if i not in state.graph.places)
     return place_delta(
-        Heading(state.robot, state.epoch, state.revision, stamp_ns, state.frame_id, camera_m=camera_m, event=event),
+        _heading(state)._replace(stamp_ns=stamp_ns, camera_m=camera_m, event=event),
         graph,
         openings,
         _shapes(state, shown.keys() & changes.touched.union(told_ids), cfg),
@@ -45,7 +45,7 @@ def publish(
 def snapshot(state: State, cfg: Config) -> PlaceDelta:
     """Everything published so far as one delta, ids ascending, at the last revision."""
     return place_delta(
-        Heading(state.robot, state.epoch, state.revision, state.stamp_ns, state.frame_id, snapshot=True),
+        _heading(state)._replace(snapshot=True),
         state.ledger.snapshot(cfg.voxel_m),
         state.openings.snapshot(cfg.voxel_m),
         _shapes(state, state.ledger.places, cfg),
@@ -57,6 +57,10 @@ def voxel_map(state: State, cfg: Config) -> VoxelMap:
     """Free and occupied voxels, in ascending order."""
     free, occupied = (state.grid.voxels_with(label).astype(np.int16) for label in (FREE, OCCUPIED))
     return VoxelMap(robot=state.robot, voxel_m=cfg.voxel_m, free=free, occupied=occupied)
+
+
+def _heading(state: State) -> Heading:
+    return Heading(state.robot, state.epoch, state.revision, state.stamp_ns, state.frame_id, origin_m=state.origin_m)
 
 
 def _shapes(state: State, ids: Iterable[int], cfg: Config) -> GroundColumns:

@@ -34,6 +34,7 @@ class State:
     revision: int = -1
     stamp_ns: int = 0
     frame_id: int = -1
+    origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of the world, as the newest keyframe says
 
     def heard(self, keyframe: Keyframe) -> None:
         """The next delta follows from this keyframe."""

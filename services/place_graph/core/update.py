@@ -35,6 +35,7 @@ def integrate(state: State, keyframe: Keyframe, cfg: Config) -> PlaceDelta:
     if jump_m and (reason := distrust(state, keyframe, depth_m, jump_m, cfg)):
         state.archive.put(keyframe, fused=False)
         return reject(state, keyframe, reason, cfg)
+    state.origin_m = keyframe.origin_m
     event = lateness(state, keyframe)
     changed = [fuse_and_keep(state, keyframe, depth_m, cfg)]
     if jump_m:

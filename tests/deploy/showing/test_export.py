@@ -87,6 +87,13 @@ def flat_map(voxel_m=0.25):
     )
 
 
+def test_the_offset_of_the_world_is_exported_and_positions_stay_local():
+    scene = changed(flat(), origin_m=(512_345.0, 5_403_210.0, 312.0))
+    assert scene_json(scene) == scene_json(flat()) | {"origin_m": [512_345.0, 5_403_210.0, 312.0]}
+    metadata = spark_dsg_graph(scene).metadata.get()
+    assert metadata["origin_m"] == [512_345.0, 5_403_210.0, 312.0]
+
+
 def node(graph, prefix, index):
     return graph.get_node(spark_dsg.NodeSymbol(prefix, index))
 

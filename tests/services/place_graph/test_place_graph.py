@@ -856,3 +856,10 @@ def test_a_process_that_joins_in_mid_stream_fetches_the_missed_keyframes_page_by
     last = frames[4].frame_id
     assert asked[0] == (0, last) and [end for _, end in asked] == [last] * len(asked) and len(asked) == 3
     assert sorted(runner.state.seen) == sorted(archive)
+
+
+def test_the_offset_of_the_world_travels_with_the_places():
+    origin_m = (512_345.0, 5_403_210.0, 312.0)
+    state = core.empty("r", 1, CFG)
+    deltas = play(state, [msgspec.structs.replace(frame, origin_m=origin_m) for frame in ROOM_WALK[:2]])
+    assert {delta.origin_m for delta in deltas} == {publishing.snapshot(state, CFG).origin_m} == {origin_m}

@@ -477,6 +477,21 @@ def test_a_file_of_the_former_layout_is_upgraded(tmp_path):
     assert again.reopened().scene().predicted_ids.tolist() == [1]
 
 
+def test_the_offset_of_the_world_is_kept_and_a_file_without_it_is_upgraded(tmp_path):
+    path, origin_m = tmp_path / "scene.sqlite", (512_345.0, 5_403_210.0, 312.0)
+    store = Store(path)
+    store.feed(place_delta(0, [(1, 0, 0, 1, 0.5)], origin_m=origin_m))
+    assert store.scene().origin_m == store.reopened().scene().origin_m == origin_m
+    service.close(store.state)
+    with sqlite3.connect(path) as sql:
+        sql.execute("DROP TABLE origins")
+        sql.execute("PRAGMA user_version = 4")
+    again = Store(path)
+    assert again.scene().origin_m == (0.0, 0.0, 0.0)
+    again.feed(place_delta(1, origin_m=origin_m))
+    assert again.reopened().scene().origin_m == origin_m
+
+
 def write_text(path):
     path.write_text("this is a diary, not a database " * 200)
 
