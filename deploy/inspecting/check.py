@@ -12,8 +12,10 @@ import numpy as np
 from prior_sg.deploy.inspecting.beside import Beside, truth_beside
 from prior_sg.services.ingest.core import selection
 from prior_sg.services.ingest.core.inspection import Finding, Picker, Reading, Recording, Shot, inspect
+from prior_sg.services.ingest.core.inspection.conventions import FROM_CAMERA
 from prior_sg.services.ingest.core.inspection.findings import ok
 from prior_sg.services.ingest.sources import Source
+from prior_sg.services.ingest.sources.base import levelling
 
 PAIRS, LIMIT_S = 40, 3.5
 BRIEF_PAIRS, BRIEF_FRAMES, BRIEF_LIMIT_S = 6, 60, 0.8
@@ -89,6 +91,8 @@ def look(
 
 def reading_of(source: Source) -> Reading:
     """How the layout's loader reads written poses."""
+    if source.layout == "hm3d":
+        return Reading(axes="opengl", from_camera=FROM_CAMERA["opengl"], world_from_source=levelling((0, 1, 0), 0.0))
     return Reading(quaternion=QUATERNIONS.get(source.layout, ""))
 
 

@@ -28,6 +28,7 @@ SCREENED_PAIRS = 14
 FACTORS = tuple(sorted({a * b for a in (0.001, 0.01, 0.1, 1, 10, 100, 1000) for b in (0.2, 0.25, 0.5, 1, 2, 4, 5)}))
 SCALES = (1000 / 6553.5, 1000 / 256, 6553.5 / 1000, 256 / 1000)  # of well-known data sets, against millimetres
 FEW_PAIRS = 2
+RUNNERS_UP = 5  # readings that are tried with other focal lengths when none convinces
 USUAL_M = (0.3, 40.0)  # median depth of rooms and streets
 FOCAL_FACTORS = (0.5, 0.6, 0.7, 0.8, 0.9, 1.1, 1.2, 1.3, 1.43, 1.6, 1.8, 2.0)
 SMALL_GAIN = 0.1  # of the share by which another focal length must be better
@@ -73,16 +74,24 @@ def judge(shots: Sequence[Shot], reading: Reading) -> Judged:
         return Judged([ok("poses", _said(given))], poses)
     if given.pairs < FEW_PAIRS and len(pairs) < FEW_PAIRS:
         return Judged([note("poses", "too few depth images overlap to say whether the poses are right")], poses)
-    better, found = best_reading(views, pairs, reading)
+    readings = ranked_readings(views, pairs, reading)
     factor, scaled = best_factor(views, pairs)
+    better, found = readings[0], agreement(with_poses(views, reread(poses, reading, readings[0])), pairs)
     if _beats(scaled, given) and _score(scaled) > _score(found):
         return Judged([_other_unit(shots[0].depth_scale_m, factor, scaled, given)], poses, factor)
-    beats = _beats(found, given)
-    findings = [_other_reading(reading, better, found, given)] if beats else []
-    best, best_poses = (found, reread(poses, reading, better)) if beats else (given, poses)
-    if best.share < GOOD:
-        findings += _other_camera(with_poses(views, best_poses), pairs, best)
-    return Judged(findings or [_contradiction(given, views, pairs)], best_poses)
+    if _beats(found, given):
+        best_poses = reread(poses, reading, better)
+        findings = [_other_reading(reading, better, found, given)]
+        findings += _other_camera(with_poses(views, best_poses), pairs, found) if found.share < GOOD else []
+        return Judged(findings, best_poses)
+    for other in readings[:RUNNERS_UP]:
+        best_poses = reread(poses, reading, other)
+        moved = with_poses(views, best_poses)
+        if camera := _other_camera(moved, pairs, given, strict=True):
+            turned = agreement(moved, pairs)
+            same = not changes(reading, other) and np.allclose(other.from_camera, reading.from_camera)
+            return Judged([*([] if same else [_other_reading(reading, other, turned, given)]), *camera], best_poses)
+    return Judged([_contradiction(given, views, pairs)], poses)
 
 
 def _other_reading(reading: Reading, better: Reading, found: Agreement, given: Agreement) -> Finding:
@@ -95,11 +104,14 @@ def _other_unit(scale_m: float, factor: float, found: Agreement, given: Agreemen
     return problem("depth unit", _contrast(looks, found, given), f"--depth-scale {scale_m * factor:.6g}")
 
 
-def _other_camera(views: Sequence[DepthView], pairs: Sequence[tuple[int, int]], given: Agreement) -> list[Finding]:
-    """Another focal length, where depth agrees better with it."""
+def _other_camera(
+    views: Sequence[DepthView], pairs: Sequence[tuple[int, int]], given: Agreement, *, strict: bool = False
+) -> list[Finding]:
+    """Another focal length, where depth agrees better with it; `strict`: so much that it explains everything."""
     tried = {factor: agreement([_focused(view, factor) for view in views], pairs) for factor in FOCAL_FACTORS}
     factor, found = max(tried.items(), key=lambda item: _score(item[1]))
-    if not (_beats(found, given) or (found.share > given.share + SMALL_GAIN and _score(found) > _score(given))):
+    gains = found.share > given.share + SMALL_GAIN and _score(found) > _score(given)
+    if not (_beats(found, given) or (gains and not strict)):
         return []
     camera = _focused(views[0], factor).intrinsics
     looks = f"the focal length looks like {camera.fx_px:.0f} px, not {views[0].intrinsics.fx_px:.0f} px"
@@ -135,17 +147,15 @@ def _along_axis(view: DepthView) -> np.ndarray:
     return view.depth_m / np.sqrt(1 + x * x + y * y)
 
 
-def best_reading(
-    views: Sequence[DepthView], pairs: Sequence[tuple[int, int]], reading: Reading
-) -> tuple[Reading, Agreement]:
-    """Of all readings of the same written poses the one under which depth agrees best, and how well."""
+def ranked_readings(views: Sequence[DepthView], pairs: Sequence[tuple[int, int]], reading: Reading) -> list[Reading]:
+    """All readings of the same written poses by how well depth agrees; of the best alike, what changes least first."""
     poses = [view.world_from_camera for view in views]
     few = list(pairs[:: max(1, len(pairs) // SCREENED_PAIRS)])
     readings = list(_readings(reading))
     scores = [_score(agreement(with_poses(views, reread(poses, reading, other)), few)) for other in readings]
-    near = [other for other, score in zip(readings, scores, strict=True) if score >= max(scores) - ALIKE]
-    chosen = min(near, key=lambda other: _changed(reading, other))
-    return chosen, agreement(with_poses(views, reread(poses, reading, chosen)), pairs)
+    order = sorted(range(len(readings)), key=lambda i: -scores[i])
+    near = [readings[i] for i in order if scores[i] >= scores[order[0]] - ALIKE]
+    return sorted(near, key=lambda other: _changed(reading, other)) + [readings[i] for i in order[len(near) :]]
 
 
 def best_factor(views: Sequence[DepthView], pairs: Sequence[tuple[int, int]]) -> tuple[float, Agreement]:
