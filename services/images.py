@@ -13,8 +13,8 @@ class ImageFault(ValueError):
 def depth_of(keyframe: Keyframe, max_principal_offset: float) -> np.ndarray:
     """Depth (h, w) float32 in metres, 0 = no measurement or masked. Raises ImageFault.
 
-    The principal point of a camera lies near the middle of its image; farther from it than `max_principal_offset`
-    (share of the image), the intrinsics belong to another image size.
+    The principal point of a camera lies in its image, of a crop not in the middle; farther from this than
+    `max_principal_offset` (share of the image), the intrinsics belong to another image size.
     """
     camera = keyframe.intrinsics
     image = _decoded(keyframe.depth, "depth")

@@ -96,7 +96,7 @@ def smallest_png(png: bytes) -> bytes:
 
 
 def _recompressed(color: bytes, quality: int) -> bytes:
-    image = _decoded(color, cv2.IMREAD_COLOR)
+    image = _decoded(color, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     return cv2.imencode(".jpg", image, (cv2.IMWRITE_JPEG_QUALITY, quality))[1].tobytes()
 
 

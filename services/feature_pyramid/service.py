@@ -179,7 +179,7 @@ def detections(state: Worker, frame: Keyframe, seen: View, embeddings: np.ndarra
 
 def read_color(frame: Keyframe) -> np.ndarray:
     """RGB image, uint8 (h, w, 3). Raises BrokenImage."""
-    return _decode(frame.color, cv2.IMREAD_COLOR_RGB, frame)
+    return _decode(frame.color, cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION, frame)
 
 
 def read_depth(frame: Keyframe) -> np.ndarray:

@@ -69,6 +69,8 @@ async def drive(port: Port, cfg: selection.Config) -> None:
         return
     source = await asyncio.to_thread(_open, cfg)
     log.info("reading", extra={"source": cfg.source, "layout": source.layout, "frames": source.total})
+    for note in source.notes:
+        log.info("source", extra={"note": note})
     events = source.events()
     pace = Pace(cfg.speed)
     while (event := await asyncio.to_thread(next, events, None)) is not None:
@@ -100,7 +102,7 @@ class Pace:
 
 
 def _open(cfg: selection.Config) -> Source:
-    source = open_source(cfg.source, world_up=cfg.world_up, floor_m=cfg.floor_m, robot=cfg.source_robot)
+    source = open_source(cfg.source, options=cfg)
     if source.total == 0:
         raise SourceError(f"{cfg.source} holds no frames")
     return source

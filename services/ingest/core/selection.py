@@ -31,22 +31,20 @@ from prior_sg.schemas.frames import (
 from prior_sg.schemas.status import JobDone
 from prior_sg.schemas.topics import CAMERA_STATE, ENCODE, INGEST_STATE, KEYFRAME, POSE_UPDATE, Topic
 from prior_sg.services.geometry import inverse, rotation_angle_rad
+from prior_sg.services.ingest.core.options import ReadOptions
 
 ON_THE_WAY = 16  # keyframes whose pyramids may overtake each other
 Written = tuple[Topic, Message]
 
 
-class Config(msgspec.Struct, frozen=True, kw_only=True):
-    """Where frames come from and which of them become keyframes.
+class Config(ReadOptions, frozen=True, kw_only=True):
+    """Where frames come from, how they are read, and which of them become keyframes.
 
     The paper does not publish its selection; this one is chosen on the development sequences so that neighbouring
     keyframes overlap by more than half at 60 to 75 degrees of view.
     """
 
     source: str = ""  # a folder of a layout in docs/sources.md, or an MCAP log; empty = no source
-    source_robot: str = ""  # of a log with several robots: the one to read; empty = the first
-    world_up: list[float] = msgspec.field(default_factory=list)  # up in the source's world; empty = as the layout says
-    floor_m: float = 0.0  # height of the floor in the source's world, measured along world_up; becomes z = 0
     speed: float = 0.0  # times real time, by stamps; 0 = as fast as the pipeline drains
     when_behind: Literal["wait", "skip"] = "wait"  # wait for slow workers, or keep pace and encode only the newest
     window: int = (

@@ -136,7 +136,7 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
     relocalised_after: int = 5  # keyframes that go on from a jump before it is believed ...
     max_contradiction: float = 0.4  # ... unless more of their depth contradicts the map: 0.1 to 0.33 with true poses of
     # the development sequences, above 0.58 half a metre beside them
-    max_principal_offset: float = 0.2  # share of the image by which the principal point may be off its middle
+    max_principal_offset: float = 0.45  # share of the image by which the principal point may be off its middle: crops
 
     def __post_init__(self) -> None:
         if not 0 < self.voxel_m <= min(self.truncation_m, self.compression_distance_m):
