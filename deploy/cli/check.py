@@ -3,17 +3,16 @@
 import argparse
 import json
 import sys
+from typing import TYPE_CHECKING
 
-import msgspec
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 from rich.table import Table
 
-from prior_sg.deploy.inspecting import check
-from prior_sg.services.ingest.core import selection
-from prior_sg.services.ingest.core.inspection import problems
-from prior_sg.services.ingest.sources import Source
+if TYPE_CHECKING:
+    from prior_sg.deploy.inspecting.check import Report
+    from prior_sg.services.ingest.core.selection import Config
 
 STYLE = {"ok": "green", "note": "yellow", "problem": "bold red"}
 
@@ -22,13 +21,17 @@ class HopelessSource(Exception):
     """No map can come of a source; the message says why and what to do."""
 
 
-def run(source: Source, cfg: selection.Config, *, as_json: bool, console: Console) -> int:
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of `check`."""
+    parser.add_argument("source", help="a folder in a known layout (docs/sources.md) or an MCAP log")
+    parser.add_argument("--json", action="store_true", help="print JSON")
+    parser.add_argument("--config", default="", help="TOML file with a section per service")
+    parser.add_argument("--set", action="append", default=[], metavar="SERVICE.FIELD=VALUE", help="one setting")
+
+
+def run(path: str, cfg: "Config", *, as_json: bool, console: Console) -> int:
     """Check a source and show what was found; 1 when there are problems."""
-    with _progress() as progress:
-        bar = progress.add_task("reading", total=None)
-        report = check.check(
-            source, cfg, progress=lambda done, total: progress.update(bar, completed=done, total=total or None)
-        )
+    report = _checked(path, cfg)
     if as_json:
         print(json.dumps(as_builtins(report)))
     else:
@@ -36,31 +39,36 @@ def run(source: Source, cfg: selection.Config, *, as_json: bool, console: Consol
     return 1 if report.verdict == "problem" else 0
 
 
-def before_start(source: Source, cfg: selection.Config, console: Console) -> check.Report:
-    """A brief check: one line about the source and one for each problem. Raises HopelessSource."""
-    report = check.check(source, cfg, brief=True)
+def before_start(path: str, cfg: "Config", console: Console) -> "Report":
+    """A brief check: one line about the source and one for each problem. Raises HopelessSource and SourceError."""
+    from prior_sg.deploy.inspecting.check import check
+    from prior_sg.services.ingest.sources import open_source
+
+    report = check(open_source(path, options=cfg), cfg, brief=True)
     console.print(escape(report.summary))
-    found = problems(report.findings)
-    for finding in [*found, *(f for f in report.findings if f.topic == "ground truth" and f.verdict == "note")]:
-        console.print(f"[{STYLE[finding.verdict]}]{finding.verdict}[/] {finding.topic}: {escape(finding.line())}")
-    if found and found[0].hopeless:
-        raise HopelessSource(f"{report.source}: {found[0].line()}; `prior-sg check` says more")
+    for finding in report.findings:
+        if finding.verdict == "problem" or (finding.topic, finding.verdict) == ("ground truth", "note"):
+            console.print(f"[{STYLE[finding.verdict]}]{finding.verdict}[/] {finding.topic}: {escape(finding.line())}")
+    if report.problems and report.problems[0].hopeless:
+        raise HopelessSource(f"{report.source}: {report.problems[0].line()}; `prior-sg check` says more")
     return report
 
 
-def show(report: check.Report, console: Console) -> None:
+def show(report: "Report", console: Console) -> None:
     """A table of all findings, and a closing line."""
     table = Table("", "what", "found", "mend", title=escape(report.source))
     for finding in report.findings:
         verdict = f"[{STYLE[finding.verdict]}]{finding.verdict}[/]"
         table.add_row(verdict, finding.topic, escape(finding.text), escape(finding.mend))
     console.print(table)
-    count = len(problems(report.findings))
+    count = len(report.problems)
     console.print(f"{count or 'no'} problem{'s' * (count != 1)}, {report.seconds:.1f} s")
 
 
-def as_builtins(report: check.Report) -> dict:
+def as_builtins(report: "Report") -> dict:
     """The report for `--json`."""
+    import msgspec
+
     return {
         "source": report.source,
         "layout": report.layout,
@@ -70,16 +78,23 @@ def as_builtins(report: check.Report) -> dict:
     }
 
 
+def _checked(path: str, cfg: "Config") -> "Report":
+    from prior_sg.deploy.inspecting.check import check, unreadable
+    from prior_sg.services.ingest.sources import SourceError, open_source
+
+    with _progress() as progress:
+        bar = progress.add_task("reading", total=None)
+
+        def show_progress(done: int, total: int) -> None:
+            progress.update(bar, completed=done, total=total or None)
+
+        try:
+            return check(open_source(path, options=cfg), cfg, progress=show_progress)
+        except SourceError as error:
+            return unreadable(path, str(error))
+
+
 def _progress() -> Progress:
     """A bar on the terminal's error stream, so that JSON stays clean."""
-    console = Console(file=sys.stderr)
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn()
-    return Progress(*columns, console=console, transient=True)
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of `check`."""
-    parser.add_argument("source", help="a folder in a known layout (docs/sources.md) or an MCAP log")
-    parser.add_argument("--json", action="store_true", help="print JSON")
-    parser.add_argument("--config", default="", help="TOML file with a section per service")
-    parser.add_argument("--set", action="append", default=[], metavar="SERVICE.FIELD=VALUE", help="one setting")
+    return Progress(*columns, console=Console(file=sys.stderr), transient=True)

@@ -15,13 +15,14 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 from rich.table import Table
 
-from prior_sg.deploy.cli import priors
+from prior_sg.deploy.cli import check, priors
 from prior_sg.deploy.evaluation import command as evaluation
 from prior_sg.deploy.running import serve
 from prior_sg.deploy.sample import SAMPLE
 
 if TYPE_CHECKING:
     from prior_sg.schemas.status import ServiceStatus, TopicCount
+    from prior_sg.services.ingest.core.selection import Config
     from prior_sg.services.runtime.client import Client
 
 DEFAULT_CONNECT = "tcp/127.0.0.1:7447"
@@ -193,6 +194,10 @@ def _add_tools(command: Command) -> None:
     health.add_argument("--json", action="store_true", help="print JSON")
     _add_bus(health, robot=False)
 
+    check.add_arguments(
+        command("check", "say what a source is and what is wrong with it", "prior-sg check recordings/home")
+    )
+
     evaluation.add_arguments(
         command(
             "eval",
@@ -251,12 +256,11 @@ def cmd_demo(arguments: argparse.Namespace) -> int:
 def cmd_run(arguments: argparse.Namespace) -> int:
     """The main job on a source of the user's."""
     from prior_sg.deploy.cli import report
-    from prior_sg.deploy.evaluation.oracles import read_objects
     from prior_sg.deploy.running.job import Job, run
 
     if not Path(arguments.source).exists():
         raise UserError(f"{arguments.source} does not exist")
-    truth = report.truth_of(arguments.source)  # also finds out at once whether the source is of a known layout
+    beside = check.before_start(arguments.source, _ingest_config(arguments), console).beside
     job = Job(
         source=arguments.source,
         out=arguments.out,
@@ -275,13 +279,12 @@ def cmd_run(arguments: argparse.Namespace) -> int:
         ),
     )
     result = run(job, console)
-    report.write(result, job.out, truth, console, read_objects(Path(arguments.source)))
+    report.write(result, job.out, beside.regions, console, beside.objects)
     return 0
 
 
 def cmd_up(arguments: argparse.Namespace) -> int:
     """Services and a router until Ctrl-C."""
-    from prior_sg.deploy.cli import report
     from prior_sg.deploy.running.job import check_settings, make_folder
     from prior_sg.deploy.running.supervisor import Supervisor
     from prior_sg.services.registry import BY_NAME, SERVICES
@@ -294,7 +297,7 @@ def cmd_up(arguments: argparse.Namespace) -> int:
     make_folder(arguments.out)
     settings = [f"scene_store.path={arguments.out / 'scene.sqlite'}", f"ingest.speed={arguments.speed}"]
     if arguments.source:
-        report.truth_of(arguments.source)  # finds out at once whether the source is of a known layout
+        check.before_start(arguments.source, _ingest_config(arguments), console)
         settings.append(f"ingest.source={arguments.source}")
     settings += _settings(arguments)
     check_settings(arguments.config, settings)
@@ -316,6 +319,21 @@ def cmd_up(arguments: argparse.Namespace) -> int:
     finally:
         supervisor.stop()
         stop_router()
+
+
+def _ingest_config(arguments: argparse.Namespace) -> "Config":
+    """What ingest is told about the source. Raises ConfigError."""
+    from prior_sg.services.registry import BY_NAME
+
+    return serve.resolved_config(BY_NAME["ingest"], arguments.config, _settings(arguments))
+
+
+def cmd_check(arguments: argparse.Namespace) -> int:
+    """What a source is, and what is wrong with it."""
+    from prior_sg.services.registry import BY_NAME
+
+    cfg = serve.resolved_config(BY_NAME["ingest"], arguments.config, arguments.set)
+    return check.run(arguments.source, cfg, as_json=arguments.json, console=console)
 
 
 def cmd_task(arguments: argparse.Namespace) -> int:
@@ -644,7 +662,15 @@ def main(argv: list[str] | None = None) -> int:
     except BrokenPipeError:  # the reader of a pipe has left
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
-    except (UserError, priors.PriorError, RunError, ExportError, ChildFailed, *serve.HOPELESS) as error:
+    except (
+        UserError,
+        check.HopelessSource,
+        priors.PriorError,
+        RunError,
+        ExportError,
+        ChildFailed,
+        *serve.HOPELESS,
+    ) as error:
         print(f"prior-sg: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:

@@ -11,15 +11,13 @@ import numpy as np
 
 from prior_sg.deploy.inspecting.beside import Beside, truth_beside
 from prior_sg.services.ingest.core import selection
-from prior_sg.services.ingest.core.inspection import Finding, Picker, Reading, Recording, Shot, inspect
+from prior_sg.services.ingest.core.inspection import Finding, Picker, Reading, Recording, Shot, inspect, problems
 from prior_sg.services.ingest.core.inspection.conventions import FROM_CAMERA
-from prior_sg.services.ingest.core.inspection.findings import ok
+from prior_sg.services.ingest.core.inspection.findings import note, ok, problem
 from prior_sg.services.ingest.sources import Source
-from prior_sg.services.ingest.sources.base import levelling
 
 PAIRS, LIMIT_S = 40, 3.5
 BRIEF_PAIRS, BRIEF_FRAMES, BRIEF_LIMIT_S = 6, 60, 0.8
-QUATERNIONS = {"dataset": "xyzw", "tum": "xyzw", "icl-nuim": "xyzw", "tartanground": "xyzw"}  # by layout
 COLORS = 12  # colour images decoded at most
 Progress = Callable[[int, int], None]  # frames read, of how many
 
@@ -36,10 +34,15 @@ class Report:
     seconds: float
 
     @property
+    def problems(self) -> list[Finding]:
+        """Those that will spoil the map, hopeless ones first."""
+        return problems(self.findings)
+
+    @property
     def verdict(self) -> str:
         """The worst of all."""
         verdicts = {finding.verdict for finding in self.findings}
-        return next(verdict for verdict in ("problem", "note", "ok") if verdict in {*verdicts, "ok"})
+        return next(verdict for verdict in ("problem", "note", "ok") if verdict in verdicts | {"ok"})
 
 
 def check(
@@ -50,7 +53,7 @@ def check(
     recording = look(source, cfg, brief=brief, progress=progress)
     beside = truth_beside(source)
     findings = [
-        ok("layout", source.layout),
+        *_read_as(source),
         *inspect(recording, reading_of(source), thorough=not brief),
         *beside.findings,
     ]
@@ -62,6 +65,12 @@ def check(
         beside=beside,
         seconds=time.monotonic() - started_s,
     )
+
+
+def unreadable(path: str, reason: str) -> Report:
+    """The report on a source that cannot even be opened."""
+    found = problem("source", reason, hopeless=True)
+    return Report(source=path, layout="", summary="", findings=[found], beside=Beside(), seconds=0.0)
 
 
 def look(
@@ -90,10 +99,18 @@ def look(
 
 
 def reading_of(source: Source) -> Reading:
-    """How the layout's loader reads written poses."""
-    if source.layout == "hm3d":
-        return Reading(axes="opengl", from_camera=FROM_CAMERA["opengl"], world_from_source=levelling((0, 1, 0), 0.0))
-    return Reading(quaternion=QUATERNIONS.get(source.layout, ""))
+    """How the layout's loader read the written poses."""
+    world = np.eye(4) if source.world_from_source is None else source.world_from_source
+    said = source.convention
+    if said is None:
+        return Reading(world_from_source=world, fixed=True)
+    return Reading(said.poses, said.quaternion, said.axes, FROM_CAMERA[said.axes], world)
+
+
+def _read_as(source: Source) -> list[Finding]:
+    """The layout and why it was recognised, and what the loader changed or assumed."""
+    why = f": {'; '.join(source.why)}" if source.why else ""
+    return [ok("layout", f"{source.layout}{why}"), *(note("reading", text) for text in source.notes)]
 
 
 def summary(source: Source, recording: Recording) -> str:

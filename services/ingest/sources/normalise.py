@@ -200,6 +200,8 @@ def finish(found: Found, options: ReadOptions) -> Source:
         why=found.why,
         notes=(*found.notes, *paced, *_rounded(poses), *notes),
         origin_m=origin_m,
+        convention=found.convention,
+        world_from_source=normaliser.world_from_source,
     )
 
 

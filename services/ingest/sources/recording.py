@@ -68,6 +68,8 @@ def load(path: Path, options: ReadOptions) -> Source:
         why=("it is an MCAP log of ours",),
         notes=notes,
         origin_m=origin_m,
+        convention=Convention().changed(options),
+        world_from_source=normaliser.world_from_source,
     )
 
 

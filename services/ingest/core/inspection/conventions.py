@@ -11,22 +11,18 @@ from prior_sg.services.geometry import inverse, pose_from_quaternion
 from prior_sg.services.ingest.core.agreement import NOTHING, Agreement, DepthView, agreement, grid_points, with_poses
 from prior_sg.services.ingest.core.inspection.findings import Finding, note, ok, problem
 from prior_sg.services.ingest.core.inspection.sample import Shot, pairs_of
+from prior_sg.services.ingest.sources.poses import FROM_CAMERA as MOTIONS
 
 FORWARD, BACKWARD = "world_from_camera", "camera_from_world"
 OTHER = {FORWARD: BACKWARD, BACKWARD: FORWARD, "xyzw": "wxyz", "wxyz": "xyzw"}
-FROM_CAMERA = {  # camera axes as written, from ours: x right, y down, z forward
-    "opencv": np.eye(3),
-    "opengl": np.diag((1.0, -1.0, -1.0)),
-    "ros": np.array(((0.0, 0, 1), (-1, 0, 0), (0, -1, 0))),
-    "ned": np.array(((0.0, 0, 1), (1, 0, 0), (0, 1, 0))),
-}
+FROM_CAMERA = {name: matrix[:3, :3] for name, matrix in MOTIONS.items()}  # axes as written, from ours
 DIRECTIONS = ("right", "down", "forward"), ("left", "up", "back")
-GOOD, POOR = 0.85, 0.6  # shares: poses that agree, and that contradict
+GOOD, POOR, CONTRADICTED = 0.85, 0.6, 0.7  # shares: poses that agree, that may be right, that are wrong
 GAIN = 0.15  # of the share by which another reading must be better to be named
+CONVINCING = 0.6  # score of a reading after which no other is looked for
 ALIKE = 0.03  # readings this close are equally good: the one that changes least is taken
 SCREENED_PAIRS = 14
-FACTORS = tuple(sorted({a * b for a in (0.001, 0.01, 0.1, 1, 10, 100, 1000) for b in (0.2, 0.25, 0.5, 1, 2, 4, 5)}))
-SCALES = (1000 / 6553.5, 1000 / 256, 6553.5 / 1000, 256 / 1000)  # of well-known data sets, against millimetres
+SCALES_M = (1.0, 0.01, 0.001, 0.0002, 0.00025, 0.0005, 0.0001, 1 / 256, 1 / 6553.5)  # metres per unit that tools write
 FEW_PAIRS = 2
 RUNNERS_UP = 5  # readings that are tried with other focal lengths when none convinces
 USUAL_M = (0.3, 40.0)  # median depth of rooms and streets
@@ -40,10 +36,11 @@ class Reading:
     """How written poses were turned into world_from_camera."""
 
     poses: str = FORWARD
-    quaternion: str = ""  # order; empty = the poses are written as matrices
+    quaternion: str = "xyzw"  # order, where they have any
     axes: str = "opencv"  # empty = no convention with a name
     from_camera: np.ndarray = field(default_factory=lambda: np.eye(3))  # the axes as written, from ours
     world_from_source: np.ndarray = field(default_factory=lambda: np.eye(4))
+    fixed: bool = False  # no option reads them otherwise
 
     def written(self, world_from_camera: np.ndarray) -> np.ndarray:
         """The motion as it is written, from the pose this reading made of it."""
@@ -75,23 +72,31 @@ def judge(shots: Sequence[Shot], reading: Reading) -> Judged:
     if given.pairs < FEW_PAIRS and len(pairs) < FEW_PAIRS:
         return Judged([note("poses", "too few depth images overlap to say whether the poses are right")], poses)
     readings = ranked_readings(views, pairs, reading)
-    factor, scaled = best_factor(views, pairs)
-    better, found = readings[0], agreement(with_poses(views, reread(poses, reading, readings[0])), pairs)
+    factor, scaled = best_factor(views, pairs, shots[0].depth_scale_m)
+    found = agreement(with_poses(views, reread(poses, reading, readings[0])), pairs)
     if _beats(scaled, given) and _score(scaled) > _score(found):
         return Judged([_other_unit(shots[0].depth_scale_m, factor, scaled, given)], poses, factor)
     if _beats(found, given):
-        best_poses = reread(poses, reading, better)
-        findings = [_other_reading(reading, better, found, given)]
+        best_poses = reread(poses, reading, readings[0])
+        findings = [_other_reading(reading, readings[0], found, given)]
         findings += _other_camera(with_poses(views, best_poses), pairs, found) if found.share < GOOD else []
         return Judged(findings, best_poses)
-    for other in readings[:RUNNERS_UP]:
-        best_poses = reread(poses, reading, other)
-        moved = with_poses(views, best_poses)
-        if camera := _other_camera(moved, pairs, given, strict=True):
-            turned = agreement(moved, pairs)
-            same = not changes(reading, other) and np.allclose(other.from_camera, reading.from_camera)
-            return Judged([*([] if same else [_other_reading(reading, other, turned, given)]), *camera], best_poses)
-    return Judged([_contradiction(given, views, pairs)], poses)
+    together = _reading_and_camera(views, pairs, reading, readings[:RUNNERS_UP])
+    return together or Judged([_contradiction(given, views, pairs)], poses)
+
+
+def _reading_and_camera(
+    views: Sequence[DepthView], pairs: Sequence[tuple[int, int]], reading: Reading, others: Sequence[Reading]
+) -> Judged | None:
+    """The first of several readings that convinces with another focal length; the reading as it is goes first."""
+    given = agreement(views, pairs)
+    for other in (reading, *others):
+        poses = reread([view.world_from_camera for view in views], reading, other)
+        moved = with_poses(views, poses)
+        if camera := _other_camera(moved, pairs, given, strict=other is not reading):
+            turned = [_other_reading(reading, other, agreement(moved, pairs), given)] if other is not reading else []
+            return Judged([*turned, *camera], poses)
+    return None
 
 
 def _other_reading(reading: Reading, better: Reading, found: Agreement, given: Agreement) -> Finding:
@@ -115,8 +120,9 @@ def _other_camera(
         return []
     camera = _focused(views[0], factor).intrinsics
     looks = f"the focal length looks like {camera.fx_px:.0f} px, not {views[0].intrinsics.fx_px:.0f} px"
-    mend = f"--intrinsics with the camera's own numbers (about {camera.fx_px:.0f},{camera.fy_px:.0f},"
-    return [problem("intrinsics", _contrast(looks, found, given), f"{mend}{camera.cx_px:.0f},{camera.cy_px:.0f})")]
+    about = f"{camera.fx_px:.0f},{camera.fy_px:.0f},{camera.cx_px:.0f},{camera.cy_px:.0f}"
+    mend = f"--intrinsics {about} or better ones; --distortion, if the lens bends more or less than was said"
+    return [problem("intrinsics", _contrast(looks, found, given), mend)]
 
 
 def _focused(view: DepthView, factor: float) -> DepthView:
@@ -134,7 +140,7 @@ def _contradiction(given: Agreement, views: Sequence[DepthView], pairs: Sequence
         return problem("poses", text, "convert it to depth along the optical axis")
     if given.pairs < FEW_PAIRS:
         return note("poses", "too few depth images overlap to say whether the poses are right")
-    if given.share < POOR:
+    if given.share < CONTRADICTED:
         text = f"depth contradicts the poses, and no other convention does better: {_said(given)}"
         return problem("poses", text, "check that poses, depth and intrinsics belong together")
     return note("poses", f"depth and poses agree moderately: {_said(given)}")
@@ -148,29 +154,41 @@ def _along_axis(view: DepthView) -> np.ndarray:
 
 
 def ranked_readings(views: Sequence[DepthView], pairs: Sequence[tuple[int, int]], reading: Reading) -> list[Reading]:
-    """All readings of the same written poses by how well depth agrees; of the best alike, what changes least first."""
-    poses = [view.world_from_camera for view in views]
+    """Readings of the same written poses by how well depth agrees; of the best alike, what changes least first.
+
+    Camera axes without a name are only tried where none with a name convinces.
+    """
     few = list(pairs[:: max(1, len(pairs) // SCREENED_PAIRS)])
-    readings = list(_readings(reading))
-    scores = [_score(agreement(with_poses(views, reread(poses, reading, other)), few)) for other in readings]
-    order = sorted(range(len(readings)), key=lambda i: -scores[i])
-    near = [readings[i] for i in order if scores[i] >= scores[order[0]] - ALIKE]
-    return sorted(near, key=lambda other: _changed(reading, other)) + [readings[i] for i in order[len(near) :]]
+    given = [view.world_from_camera for view in views]
+
+    def score(other: Reading) -> float:
+        return _score(agreement(with_poses(views, reread(given, reading, other)), few))
+
+    scored = [(other, score(other)) for other in _named_readings(reading)]
+    if max(value for _, value in scored) < CONVINCING:
+        scored += [(other, score(other)) for other in _nameless_readings(reading)]
+    scored.sort(key=lambda item: -item[1])
+    alike = sum(value >= scored[0][1] - ALIKE for _, value in scored)
+    near = sorted((other for other, _ in scored[:alike]), key=lambda other: _changed(reading, other))
+    return near + [other for other, _ in scored[alike:]]
 
 
-def best_factor(views: Sequence[DepthView], pairs: Sequence[tuple[int, int]]) -> tuple[float, Agreement]:
-    """Of usual factors of depth the one with which depth agrees best under the poses, and how well.
+def best_factor(
+    views: Sequence[DepthView], pairs: Sequence[tuple[int, int]], scale_m: float
+) -> tuple[float, Agreement]:
+    """The factor of depth that makes `scale_m` a usual unit with which depth agrees best, and how well.
 
-    Positions are divided instead of depth multiplied, so that the tolerance stays what it is. Factors that no room
-    or street has are left out.
+    Positions are divided instead of depth multiplied, so that the tolerance stays what it is. Units with which no
+    room or street would be seen are left out.
     """
     few = list(pairs[:: max(1, len(pairs) // SCREENED_PAIRS)])
     median_m = float(np.median(np.concatenate([grid_points(view)[:, 2] for view in views]) if views else 0.0))
-    likely = [factor for factor in (*FACTORS, *SCALES) if USUAL_M[0] <= median_m * factor <= USUAL_M[1]]
+    factors = [unit_m / scale_m for unit_m in SCALES_M]
+    likely = [factor for factor in factors if USUAL_M[0] <= median_m * factor <= USUAL_M[1]]
     scores = {factor: _score(agreement(_moved_less(views, factor), few)) for factor in likely}
     if not scores:
         return 1.0, NOTHING
-    near = [factor for factor, score in scores.items() if score >= max(scores.values()) - ALIKE]
+    near = [factor for factor, score in scores.items() if score >= max(scores.values()) - ALIKE / 3]
     chosen = min(near, key=lambda factor: abs(np.log(factor)))
     return chosen, agreement(_moved_less(views, chosen), pairs)
 
@@ -191,7 +209,7 @@ def reread(poses: Sequence[np.ndarray], reading: Reading, other: Reading) -> lis
 
 def changes(reading: Reading, other: Reading) -> list[str]:
     """The options that turn one reading into the other."""
-    found = [f"--pose {other.poses}"] if other.poses != reading.poses else []
+    found = [f"--poses {other.poses}"] if other.poses != reading.poses else []
     found += [f"--quaternion {other.quaternion}"] if other.quaternion != reading.quaternion else []
     return found + ([f"--axes {other.axes}"] if other.axes and other.axes != reading.axes else [])
 
@@ -215,11 +233,21 @@ def rotations() -> Iterator[np.ndarray]:
                 yield matrix
 
 
-def _readings(reading: Reading) -> Iterator[Reading]:
-    orders = (reading.quaternion, OTHER[reading.quaternion]) if reading.quaternion else ("",)
-    for poses, order, matrix in itertools.product((FORWARD, BACKWARD), orders, rotations()):
-        axes = next((n for n, known in FROM_CAMERA.items() if np.allclose(known, matrix)), "")
-        yield replace(reading, poses=poses, quaternion=order, axes=axes, from_camera=matrix)
+def _named_readings(reading: Reading) -> Iterator[Reading]:
+    yield reading
+    if reading.fixed:
+        return
+    orders = reading.quaternion, OTHER[reading.quaternion]
+    for way, order, (axes, matrix) in itertools.product((FORWARD, BACKWARD), orders, FROM_CAMERA.items()):
+        yield replace(reading, poses=way, quaternion=order, axes=axes, from_camera=matrix)
+
+
+def _nameless_readings(reading: Reading) -> Iterator[Reading]:
+    if reading.fixed:
+        return
+    for way, matrix in itertools.product((FORWARD, BACKWARD), rotations()):
+        if not any(np.allclose(matrix, known) for known in FROM_CAMERA.values()):
+            yield replace(reading, poses=way, axes="", from_camera=matrix)
 
 
 def _changed(reading: Reading, other: Reading) -> float:

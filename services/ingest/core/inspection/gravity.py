@@ -20,6 +20,7 @@ TURNED = 0.12  # by how much more the vertical must stay fixed in the camera tha
 STEADY = 0.75  # mean of a direction in the camera, 1 = fixed
 UPRIGHT = 0.6  # cosine to the image's up of a camera that is not rolled
 FACING = math.cos(math.radians(25))  # of a surface that counts as level
+LEVEL = 0.5  # of the spread of the cameras along z, below which another direction is the vertical
 BIN_M = 0.1
 LEAST_FLOOR = 0.015  # share of points
 BELOW_M, MOST_BELOW = 0.3, 0.06  # share of points that may lie that far below a floor
@@ -65,7 +66,7 @@ def judge(views: Sequence[DepthView], world_from_source: np.ndarray) -> list[Fin
         return []
     surface = surface_of(views)
     vertical = vertical_of(np.stack([view.world_from_camera[:3, :3] for view in views]), surface)
-    floor = floor_of(surface, vertical.up)
+    floor = floor_of(surface, UP) or floor_of(surface, vertical.up)
     rotation = world_from_source[:3, :3]
     found = [_rolled(vertical)] if abs(vertical.roll_deg) >= 45 else []
     if vertical.up @ UP < math.cos(math.radians(OTHER_AXIS_DEG)):
@@ -88,7 +89,8 @@ def vertical_of(rotations: np.ndarray, surface: Surface) -> Vertical:
         return Vertical(UP, length >= STEADY, 0.0)
     nearest = axes()[int(np.argmax(axes() @ image_up))]
     as_read, as_seen = floor_of(surface, UP), floor_of(surface, nearest)
-    if as_read is None and as_seen is not None:
+    level = np.std(surface.cameras @ nearest) < LEVEL * np.std(surface.cameras @ UP)  # cameras seldom climb
+    if as_seen is not None and (as_read is None or level):
         return Vertical(nearest, True, 0.0)
     return Vertical(UP, as_read is not None, roll_deg(rotations, UP))
 

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from prior_sg.services.ingest.core.inspection.conventions import SCALES_M
 from prior_sg.services.ingest.core.inspection.findings import Finding, note, ok, problem
 from prior_sg.services.ingest.core.inspection.sample import SATURATED, Recording, Shot
 
@@ -14,7 +15,6 @@ SQUARE = 0.05  # by which fx and fy may differ
 USUAL_MEDIAN_M = (0.2, 60.0)
 ABSURD_MEDIAN_M = (0.01, 300.0)
 LIKELY_MEDIAN_M = 2.5
-SCALES_M = (1.0, 0.01, 0.001, 0.0002, 0.00025, 0.0005, 0.0001, 1 / 256, 1 / 6553.5)  # metres per unit that occur
 REPEATED = 0.03  # share of measured pixels that one value at the far end may have
 FEW_VALID = 0.2
 
