@@ -15,14 +15,14 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 from rich.table import Table
 
-from prior_sg.deploy.cli import check, priors
+from prior_sg.deploy.cli import check, packing, priors
+from prior_sg.deploy.cli.source_options import add_source_options, read_options, source_settings
 from prior_sg.deploy.evaluation import command as evaluation
 from prior_sg.deploy.running import serve
 from prior_sg.deploy.sample import SAMPLE
 
 if TYPE_CHECKING:
     from prior_sg.schemas.status import ServiceStatus, TopicCount
-    from prior_sg.services.ingest.core.selection import Config
     from prior_sg.services.runtime.client import Client
 
 DEFAULT_CONNECT = "tcp/127.0.0.1:7447"
@@ -75,7 +75,7 @@ def _add_run_options(parser: argparse.ArgumentParser) -> None:
 def _settings(arguments: argparse.Namespace) -> list[str]:
     """Settings that run options stand for, then those given by --set."""
     places = [f"place_graph.places={arguments.places}"] if arguments.places else []
-    return [*places, *_encoder_settings(arguments.encoder), *arguments.set]
+    return [*places, *_encoder_settings(arguments.encoder), *source_settings(arguments), *arguments.set]
 
 
 Command = Callable[[str, str, str], argparse.ArgumentParser]
@@ -125,6 +125,7 @@ def _add_jobs(command: Command) -> None:
     run.add_argument("--out", type=Path, default=Path("out/run"), help="folder for the results")
     run.add_argument("--in-process", action="store_true", help="all services in this process, for debugging")
     _add_run_options(run)
+    add_source_options(run)
 
 
 def _add_live(command: Command) -> None:
@@ -135,6 +136,7 @@ def _add_live(command: Command) -> None:
     up.add_argument("--out", type=Path, default=Path("out/up"), help="folder for the database and logs")
     up.add_argument("--no-router", action="store_true", help="use the router at --connect instead of starting one")
     _add_run_options(up)
+    add_source_options(up)
 
     one = command("serve", "run one service in this process (what containers do)", "prior-sg serve segmenter")
     serve.add_arguments(one)
@@ -174,6 +176,12 @@ def _add_tools(command: Command) -> None:
     explain.add_argument("--json", action="store_true", help="print JSON")
     _add_bus(explain)
 
+    packing.add_arguments(
+        command(
+            "pack", "write a source, read and put right, as one log", "prior-sg pack recordings/home home.mcap --rate 5"
+        )
+    )
+
     record = command("record", "record all topics into a log, until Ctrl-C", "prior-sg record out/log.mcap")
     record.add_argument("log", type=Path)
     record.add_argument("--seconds", type=float, default=0.0, help="stop after this long; 0 = at Ctrl-C")
@@ -194,9 +202,9 @@ def _add_tools(command: Command) -> None:
     health.add_argument("--json", action="store_true", help="print JSON")
     _add_bus(health, robot=False)
 
-    check.add_arguments(
-        command("check", "say what a source is and what is wrong with it", "prior-sg check recordings/home")
-    )
+    inspect = command("check", "say what a source is and what is wrong with it", "prior-sg check recordings/home")
+    check.add_arguments(inspect)
+    add_source_options(inspect)
 
     evaluation.add_arguments(
         command(
@@ -260,7 +268,7 @@ def cmd_run(arguments: argparse.Namespace) -> int:
 
     if not Path(arguments.source).exists():
         raise UserError(f"{arguments.source} does not exist")
-    beside = check.before_start(arguments.source, _ingest_config(arguments), console).beside
+    beside = check.before_start(arguments.source, read_options(arguments), console).beside
     job = Job(
         source=arguments.source,
         out=arguments.out,
@@ -297,7 +305,7 @@ def cmd_up(arguments: argparse.Namespace) -> int:
     make_folder(arguments.out)
     settings = [f"scene_store.path={arguments.out / 'scene.sqlite'}", f"ingest.speed={arguments.speed}"]
     if arguments.source:
-        check.before_start(arguments.source, _ingest_config(arguments), console)
+        check.before_start(arguments.source, read_options(arguments), console)
         settings.append(f"ingest.source={arguments.source}")
     settings += _settings(arguments)
     check_settings(arguments.config, settings)
@@ -321,19 +329,9 @@ def cmd_up(arguments: argparse.Namespace) -> int:
         stop_router()
 
 
-def _ingest_config(arguments: argparse.Namespace) -> "Config":
-    """What ingest is told about the source. Raises ConfigError."""
-    from prior_sg.services.registry import BY_NAME
-
-    return serve.resolved_config(BY_NAME["ingest"], arguments.config, _settings(arguments))
-
-
 def cmd_check(arguments: argparse.Namespace) -> int:
     """What a source is, and what is wrong with it."""
-    from prior_sg.services.registry import BY_NAME
-
-    cfg = serve.resolved_config(BY_NAME["ingest"], arguments.config, arguments.set)
-    return check.run(arguments.source, cfg, as_json=arguments.json, console=console)
+    return check.run(arguments.source, read_options(arguments), as_json=arguments.json, console=console)
 
 
 def cmd_task(arguments: argparse.Namespace) -> int:
@@ -491,6 +489,11 @@ def cmd_explain(arguments: argparse.Namespace) -> int:
     else:
         explain.show(reply, console)
     return 0
+
+
+def cmd_pack(arguments: argparse.Namespace) -> int:
+    """Write a source as one log."""
+    return packing.run(arguments, console)
 
 
 def cmd_record(arguments: argparse.Namespace) -> int:
@@ -666,6 +669,7 @@ def main(argv: list[str] | None = None) -> int:
         UserError,
         check.HopelessSource,
         priors.PriorError,
+        packing.PackError,
         RunError,
         ExportError,
         ChildFailed,

@@ -19,7 +19,7 @@ from prior_sg.schemas.codec import decode, encode
 from prior_sg.schemas.places import VoxelMap
 from prior_sg.schemas.scene import Scene, SceneRequest
 from prior_sg.schemas.topics import SCENE
-from prior_sg.services.ingest.sources import open_source
+from prior_sg.services.ingest.sources import ReadOptions, open_source
 from prior_sg.services.registry import BY_NAME
 from prior_sg.services.runtime.record import attachments
 
@@ -31,9 +31,9 @@ class ExportError(Exception):
     """The file cannot be written as asked; the message says what to do."""
 
 
-def truth_of(source: str) -> dict[str, Any] | None:
-    """The content of the source's regions.json, or None when it has no ground truth."""
-    return open_source(source).ground_truth
+def truth_of(source: str, options: ReadOptions | None = None) -> dict[str, Any] | None:
+    """The content of the source's regions.json, or None when it has no ground truth. Raises SourceError."""
+    return open_source(source, options=options).ground_truth
 
 
 def region_table(scene: Scene) -> Table:

@@ -4,7 +4,6 @@ python -m prior_sg.deploy.sample.make DATASET OUT --provenance SENTENCE
 """
 
 import argparse
-import json
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,22 +11,17 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from prior_sg.schemas.codec import encode
+from prior_sg.deploy.sample.packed import PackError, keyframe_of, write_log
 from prior_sg.schemas.frames import Keyframe
-from prior_sg.schemas.topics import KEYFRAME
 from prior_sg.services.ingest.core.selection import RawFrame
 from prior_sg.services.ingest.sources import Source, SourceError, open_source
 from prior_sg.services.ingest.sources.images import jpeg_segments
-from prior_sg.services.runtime.record import LogError, LogWriter
+from prior_sg.services.runtime.record import LogError
 
 ROBOT = "sample"
 QUALITIES = (None, 92, 85, 75)  # of the JPEG; None = as it is
 PNG_EFFORT = (cv2.IMWRITE_PNG_COMPRESSION, 9)
 JPEG_KEPT = frozenset({0xE0, 0xEE}) | frozenset(range(0xC0, 0xE0))  # JFIF and Adobe headers, and what decoding needs
-
-
-class PackError(RuntimeError):
-    """The folder cannot be packed; the text is one sentence."""
 
 
 def pack(dataset: str | Path, path: str | Path, max_mb: float = 12, provenance: str = "") -> int:
@@ -50,36 +44,15 @@ def pack(dataset: str | Path, path: str | Path, max_mb: float = 12, provenance: 
 
 
 def _write(source: Source, path: Path, quality: int | None, provenance: str) -> None:
-    with LogWriter(path) as log:
-        log.metadata("source", {"provenance": provenance})
-        if source.ground_truth is not None:
-            log.attach("regions.json", "application/json", json.dumps(source.ground_truth).encode())
-        for sequence, keyframe in enumerate(_keyframes(source, quality)):
-            log.add(
-                KEYFRAME,
-                KEYFRAME.key_of(keyframe),
-                encode(keyframe),
-                writer=ROBOT,
-                sequence=sequence,
-                sent_ns=keyframe.stamp_ns,
-                received_ns=keyframe.stamp_ns,
-            )
+    write_log(path, source, _keyframes(source, quality), ROBOT, provenance, source.ground_truth)
 
 
 def _keyframes(source: Source, quality: int | None) -> Iterator[Keyframe]:
     for frame in source:
         if not isinstance(frame, RawFrame):
             raise PackError(f"frame {frame.frame_id} of {source.path} cannot be packed: {frame.reason}")
-        yield Keyframe(
-            robot=ROBOT,
-            frame_id=frame.frame_id,
-            stamp_ns=frame.stamp_ns,
-            intrinsics=frame.intrinsics,
-            world_from_camera=frame.world_from_camera,
-            color=bare_jpeg(frame.color) if quality is None else _recompressed(frame.color, quality),
-            depth=smallest_png(frame.depth),
-            depth_scale_m=frame.depth_scale_m,
-        )
+        color = bare_jpeg(frame.color) if quality is None else _recompressed(frame.color, quality)
+        yield keyframe_of(frame, ROBOT, color, smallest_png(frame.depth))
 
 
 def bare_jpeg(jpeg: bytes) -> bytes:

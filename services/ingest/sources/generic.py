@@ -176,9 +176,8 @@ def _scale(fields: dict[str, Any]) -> float | None:
     """Metres per unit; names other than ours may mean units per metre."""
     if "depth_scale_m" in fields:
         return float(fields["depth_scale_m"])
-    value = next(
-        (float(fields[k]) for k in ("depth_scale", "depth_factor", "depthscale", "scale") if k in fields), None
-    )
+    names = ("depth_scale", "depth_factor", "depthscale", "depthmapfactor", "scale")
+    value = next((float(fields[name]) for name in names if name in fields), None)
     if value is None or not value > 0:
         return None
     return 1 / value if value >= 1 else value

@@ -9,6 +9,7 @@ JPEG_MAGIC = b"\xff\xd8\xff"
 JPEG_FRAME_MARKERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # SOF0 … SOF15 without tables and extensions
 JPEG_SCAN, JPEG_END = 0xDA, 0xD9
 JPEG_MARKER = re.compile(rb"\xff+([^\x00\xff\xd0-\xd7])")  # in scan data: neither stuffing, padding nor a restart
+BARE_MARKERS = frozenset({0xFF, 0x01}) | frozenset(range(0xD0, 0xD8))
 CUT_OFF = "it is cut off"
 
 
@@ -59,7 +60,7 @@ def _jpeg_end(data: bytes) -> int:
         marker = data[start + 1]
         if marker == JPEG_END:
             return start + 2
-        if marker == 0xFF or marker == 0x01 or 0xD0 <= marker <= 0xD7:  # padding, and markers without a segment
+        if marker in BARE_MARKERS:  # padding, and markers without a segment
             start += 1 if marker == 0xFF else 2
             continue
         start += 2 + int.from_bytes(data[start + 2 : start + 4], "big")

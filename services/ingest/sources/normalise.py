@@ -501,12 +501,10 @@ def shifted_truth(truth: Any, origin_m: Sequence[float]) -> Any:
     x_m, y_m, z_m = origin_m
     try:
         regions = [
-            {**region, "polygon_m": [[x - x_m, y - y_m] for x, y in region["polygon_m"]]}
-            for region in truth.get("regions", ())
+            {**region, "polygon_m": [[x - x_m, y - y_m] for x, y in region["polygon_m"]]} for region in truth["regions"]
         ]
         floors = [
-            {**floor, "z_min_m": floor["z_min_m"] - z_m, "z_max_m": floor["z_max_m"] - z_m}
-            for floor in truth.get("floors", ())
+            {**floor, "z_min_m": floor["z_min_m"] - z_m, "z_max_m": floor["z_max_m"] - z_m} for floor in truth["floors"]
         ]
     except (TypeError, KeyError, ValueError, AttributeError):
         return truth

@@ -5,6 +5,7 @@ import json
 import re
 from collections.abc import Sequence
 from decimal import Decimal, InvalidOperation
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +14,9 @@ import numpy as np
 NS_PER = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
 EPOCH_NS = (946_684_800 * 10**9, 4_102_444_800 * 10**9)  # 2000 to 2100: a stamp in between is a date
 EPOCH_SPACING_NS = (500_000, 10**12)  # and then frames lie between half a millisecond and a quarter of an hour apart
-SAID_SPACING_NS = (2_500_000, 10**11)  # a unit that is written down is believed from 400 Hz to one frame in 100 s
-USUAL_SPACING_NS = (5_000_000, 5 * 10**9)  # all else: exactly one unit puts frames 5 ms to 5 s apart
+SAID_SPACING_NS = (2_500_000, 5 * 10**9)  # a unit that is written down is believed from 400 Hz to one frame in 5 s
+USUAL_SPACING_NS = (5_000_000, 5 * 10**9)  # else exactly one unit puts frames 5 ms to 5 s apart
+RARE_SPACING_NS = 10**11  # and slower frames than these have no unit that can be told
 FEW = 4  # fewer stamps tell no rate
 NUMBER = re.compile(r"[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?|[-+]?(?:nan|inf(?:inity)?)", re.IGNORECASE)
 BOMS = ((b"\xff\xfe", "utf-16"), (b"\xfe\xff", "utf-16"))
@@ -156,7 +158,8 @@ def unit_of(values: np.ndarray, said: str) -> str:
     if SAID_SPACING_NS[0] <= spacing * NS_PER[said] <= SAID_SPACING_NS[1]:
         return said
     low, high = USUAL_SPACING_NS
-    return next((unit for unit, factor in NS_PER.items() if low <= spacing * factor < high), "")
+    usual = next((unit for unit, factor in NS_PER.items() if low <= spacing * factor < high), "")
+    return usual or (said if high <= spacing * NS_PER[said] <= RARE_SPACING_NS else "")
 
 
 def _decimal(word: str) -> Decimal | None:
@@ -194,12 +197,12 @@ def order_of(frame_ids: Sequence[int | None], stamps: Sequence[int | None]) -> t
 
 
 def _rises(numbers: Sequence[int | None]) -> bool:
-    return all(a < b for a, b in zip(numbers, numbers[1:], strict=False))  # type: ignore[operator]
+    return all(a < b for a, b in pairwise(numbers))  # type: ignore[operator]
 
 
 def check_stamps(stamps: Sequence[int | None], path: Path) -> None:
     """Raise SourceError when most frames have the stamp of the one before."""
     known = [stamp for stamp in stamps if stamp is not None]
-    repeats = sum(a == b for a, b in zip(known, known[1:], strict=False))
+    repeats = sum(a == b for a, b in pairwise(known))
     if len(known) >= FEW and 2 * repeats > len(known):
         raise SourceError(f"most stamps of {path} repeat the one before: give the frame rate with --rate")
