@@ -81,16 +81,16 @@ def look(
     recording = Recording(source.total)
     state = selection.State(robot="")
     frames = min(source.total, BRIEF_FRAMES) if brief else source.total
-    picker = Picker(frames, BRIEF_PAIRS if brief else PAIRS)
-    color_every = 1 if brief else max(1, min(frames, 2 * PAIRS) // COLORS)
-    for frame in source:
+    wants = Picker(frames, BRIEF_PAIRS if brief else PAIRS).wants
+    color_every = max(1, min(frames, 2 * PAIRS) // COLORS)
+    for frame in source if source.thinned is None else source.thinned(wants):
         recording.read += 1
         if isinstance(frame, selection.BadFrame):
             recording.unreadable[kind_of(frame.reason)] += 1
         else:
             _remember(recording, frame)
             _select(recording, state, frame, cfg)
-            if picker.wants(frame.index, recording.world_from_camera[-1]):
+            if frame.depth if source.thinned else wants(frame.index, recording.world_from_camera[-1]):
                 _decode(recording, frame, with_color=not brief and len(recording.shots) % color_every == 0)
         progress(recording.read, frames)
         if time.monotonic() > end_s or (brief and recording.read >= frames):

@@ -28,6 +28,9 @@ class FrameError(ValueError):
     """One frame cannot be used; the text is the reason."""
 
 
+Wanted = Callable[[int, np.ndarray], bool]  # whether the images of a frame are, by its index and world_from_camera
+
+
 @dataclass(frozen=True)
 class Source:
     """A sequence of posed RGB-D frames. Iterating it reads files; each iteration begins at the first frame."""
@@ -44,6 +47,8 @@ class Source:
     origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # where the frames' world has its zero in the source's
     convention: Convention | None = None  # how written poses were read; None = in a way no option changes
     world_from_source: np.ndarray | None = None  # 4 x 4, levelling and recentring; None = nothing was done
+    thinned: "Callable[[Wanted], Iterator[RawFrame | BadFrame]] | None" = None  # the same frames, but images, which
+    # cost time, only of the wanted ones; the others' files are looked at and their images left empty
 
     def __iter__(self) -> Iterator[RawFrame | BadFrame]:
         return self.frames()

@@ -16,6 +16,7 @@ BROAD_PX = 13  # at WIDTH_PX
 NEAR_PX = 2  # at WIDTH_PX: taken as no shift
 LEAST_EDGES = 400  # pixels over all shots
 SIGNIFICANT, CERTAIN, SEEN = 6.0, 8.0, 4.0  # standard deviations of the scores of all shifts
+ALIKE_PX = 3  # at WIDTH_PX: shifts that two halves of the shots must share
 BETTER = 1.25  # of the score as it is
 FAR = 0.04  # share of the width from which a shift is a problem
 MEND = "register depth to colour, or give the intrinsics of both cameras"
@@ -32,12 +33,20 @@ def judge(shots: Sequence[Shot]) -> list[Finding]:
     here = _middle(found[1.0])
     far = float(np.abs(shift_px).max()) / WIDTH_PX > FAR or abs(zoom - 1) > 2 * FAR
     beside = zoom != 1.0 or np.abs(shift_px).max() > NEAR_PX
-    if beside and best >= (SIGNIFICANT if far else CERTAIN) and best > BETTER * here:
+    clear = beside and best >= (SIGNIFICANT if far else CERTAIN) and best > BETTER * here
+    if clear and _in_both_halves(prepared, zoom, shift_px):
         verdict = problem if far else note
         return [verdict("registration", _said(shift_px, zoom, shots[0].intrinsics.width_px), MEND)]
     if here >= SEEN:
         return [ok("registration", "edges of colour and depth coincide")]
     return [ok("registration", "edges of colour and depth do not say whether the images are registered")]
+
+
+def _in_both_halves(prepared: Sequence[Edges], zoom: float, shift_px: np.ndarray) -> bool:
+    """Whether each half of the shots says the same."""
+    halves = prepared[::2], prepared[1::2]
+    shifts = [_peak(scores(half, zoom))[0] for half in halves if half]
+    return len(shifts) == 2 and all(np.abs(shift - shift_px).max() <= ALIKE_PX for shift in shifts)
 
 
 def _said(shift_px: np.ndarray, zoom: float, width_px: int) -> str:
