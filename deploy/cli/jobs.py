@@ -3,6 +3,7 @@
 import argparse
 from pathlib import Path
 
+from prior_sg.deploy.cli.check import before_start
 from prior_sg.deploy.cli.shared import Commands, add_bus, add_settings, console, names_in
 from prior_sg.deploy.cli.source_options import add_source_options, read_options, source_settings
 from prior_sg.deploy.errors import UserError
@@ -108,11 +109,10 @@ def cmd_run(arguments: argparse.Namespace) -> int:
     """The main job on a source of the user's."""
     from prior_sg.deploy.cli import report
     from prior_sg.deploy.running.job import Job, run
-    from prior_sg.deploy.truth import read_objects, truth_of
 
     if not Path(arguments.source).exists():
         raise UserError(f"{arguments.source} does not exist")
-    truth = truth_of(arguments.source, read_options(arguments))  # also finds out at once whether it can be opened
+    beside = before_start(arguments.source, read_options(arguments), console).beside
     job = Job(
         source=arguments.source,
         out=arguments.out,
@@ -131,5 +131,5 @@ def cmd_run(arguments: argparse.Namespace) -> int:
         ),
     )
     result = run(job, console)
-    report.write(result, job.out, truth, console, read_objects(Path(arguments.source)))
+    report.write(result, job.out, beside.regions, console, beside.objects)
     return 0

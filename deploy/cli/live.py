@@ -4,6 +4,7 @@ import argparse
 import time
 from pathlib import Path
 
+from prior_sg.deploy.cli.check import before_start
 from prior_sg.deploy.cli.jobs import add_run_options, settings_of
 from prior_sg.deploy.cli.shared import Commands, add_bus, console, names_in, open_client
 from prior_sg.deploy.cli.source_options import add_source_options, read_options
@@ -63,7 +64,6 @@ def cmd_up(arguments: argparse.Namespace) -> int:
     from prior_sg.deploy.running.job import make_folder
     from prior_sg.deploy.running.supervisor import Supervisor
     from prior_sg.deploy.settings import check_settings
-    from prior_sg.deploy.truth import truth_of
     from prior_sg.services.registry import BY_NAME, SERVICES
     from prior_sg.services.runtime.zenoh_bus import open_router
 
@@ -74,7 +74,7 @@ def cmd_up(arguments: argparse.Namespace) -> int:
     make_folder(arguments.out)
     settings = [f"scene_store.path={arguments.out / 'scene.sqlite'}", f"ingest.speed={arguments.speed}"]
     if arguments.source:
-        truth_of(arguments.source, read_options(arguments))  # finds out at once whether it can be opened
+        before_start(arguments.source, read_options(arguments), console)
         settings.append(f"ingest.source={arguments.source}")
     settings += settings_of(arguments)
     check_settings(arguments.config, settings)

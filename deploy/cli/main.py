@@ -6,7 +6,7 @@ import signal
 import sys
 import threading
 
-from prior_sg.deploy.cli import jobs, live, packing, priors, tools
+from prior_sg.deploy.cli import check, jobs, live, packing, priors, tools
 from prior_sg.deploy.cli.shared import Commands, with_example
 from prior_sg.deploy.errors import UserError
 from prior_sg.deploy.running.serve import HOPELESS
@@ -21,7 +21,7 @@ def build_parser() -> argparse.ArgumentParser:
         **with_example("prior-sg demo"),
     )
     commands = Commands(parser, "command", "COMMAND")
-    for module in (jobs, live, packing, tools, priors):
+    for module in (jobs, live, check, packing, tools, priors):
         module.add_commands(commands)
     return parser
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from prior_sg.deploy.settings import resolved_config
 
 if TYPE_CHECKING:
-    from prior_sg.services.ingest.core.options import ReadOptions
+    from prior_sg.services.ingest.core.config import Config
 
 GROUP = "how the source is read, where its files do not say or say it wrongly"
 
@@ -95,7 +95,7 @@ def source_settings(arguments: argparse.Namespace) -> list[str]:
     return [f"ingest.{option.setting}={_value(option, text)}" for option, text in given if text is not None]
 
 
-def read_options(arguments: argparse.Namespace) -> "ReadOptions":
+def read_options(arguments: argparse.Namespace) -> "Config":
     """What the options, `--config` and `--set` say, for a command that reads a source itself. Raises ConfigError."""
     from prior_sg.services.registry import BY_NAME
 

@@ -13,6 +13,7 @@ from prior_sg.schemas.frames import Intrinsics
 from prior_sg.services.ingest.core.selection import BadFrame, Correction, RawFrame
 from prior_sg.services.ingest.sources.images import ImageError
 from prior_sg.services.ingest.sources.pixels import eight_bit, measured, stored
+from prior_sg.services.ingest.sources.poses import Convention
 from prior_sg.services.ingest.sources.tables import SourceError, read_json
 
 __all__ = ["FrameError", "Source", "SourceError"]
@@ -25,6 +26,9 @@ SATURATED = 65535.0  # the largest value of 16 bits: sensors and tools write it 
 
 class FrameError(ValueError):
     """One frame cannot be used; the text is the reason."""
+
+
+Wanted = Callable[[int, np.ndarray], bool]  # whether the images of a frame are, by its index and world_from_camera
 
 
 @dataclass(frozen=True)
@@ -41,6 +45,10 @@ class Source:
     why: tuple[str, ...] = ()  # how the layout was recognised
     notes: tuple[str, ...] = ()  # everything that was changed or assumed on reading
     origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # where the frames' world has its zero in the source's
+    convention: Convention | None = None  # how written poses were read; None = in a way no option changes
+    world_from_source: np.ndarray | None = None  # 4 x 4, levelling and recentring; None = nothing was done
+    thinned: "Callable[[Wanted], Iterator[RawFrame | BadFrame]] | None" = None  # the same frames, but images, which
+    # cost time, only of the wanted ones; the others' files are looked at and their images left empty
 
     def __iter__(self) -> Iterator[RawFrame | BadFrame]:
         return self.frames()
@@ -101,6 +109,7 @@ class Found:
     depth_invalid: tuple[float, ...] = (SATURATED,)
     ground_truth: dict[str, Any] | None = None
     corrections: Sequence[Correction] = ()  # in the source's world
+    convention: Convention | None = None  # how written poses are read; None = in a way no option changes
     why: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     assumed_hz: float = 0.0  # frames per second where the layout has no stamps and nobody told; 0 = stamps are real

@@ -74,6 +74,7 @@ def load(path: Path, options: ReadOptions) -> Found:
         entries,
         ground_truth=truth_beside(path),
         corrections=corrections,
+        convention=convention,
         why=(f"{CAMERA} and {TRAJECTORY} lie in it",),
         notes=tuple(notes),
     )

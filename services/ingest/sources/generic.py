@@ -114,6 +114,7 @@ def load(path: Path, options: ReadOptions) -> Found:
         ],
         up=up,
         ground_truth=truth_beside(path),
+        convention=convention,
         why=(f"{', '.join(f'{folder.name}/' for folder in folders if folder)} lie in it, and no other layout fits",),
         notes=(*notes, *said, *timed),
         assumed_hz=assumed_hz,

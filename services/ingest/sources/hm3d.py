@@ -75,6 +75,7 @@ def load(path: Path, options: ReadOptions) -> Found:
         [entry(number) for number in sorted(colors.keys() | depths.keys() | poses.keys())],
         up=UP,
         ground_truth=truth_beside(path),
+        convention=convention,
         why=(f"{COLORS}/, {DEPTHS}/ and {POSES}/ hold files named SCENE_NNNNNN, and no camera lies beside them",),
         assumed_hz=0.0 if options.rate_hz else RATE_HZ,
     )

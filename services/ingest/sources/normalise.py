@@ -21,6 +21,7 @@ from prior_sg.services.ingest.sources.base import (
     FrameError,
     Images,
     Source,
+    Wanted,
     color_pixels,
     depth_pixels,
     levelling,
@@ -94,6 +95,27 @@ class Normaliser:
             raise
         except ValueError as error:
             raise FrameError(str(error)) from error
+
+    def bare(  # noqa: PLR0917
+        self, index: int, total: int, frame_id: int, stamp_ns: int, source_from_camera: np.ndarray, images: Images
+    ) -> RawFrame:
+        """The frame without its images, of which only the files' headers and ends are looked at. Raises UNUSABLE."""
+        kinds = (images.color, self.sizes.color, "colour"), (images.depth, self.sizes.depth, "depth")
+        for data, expected, name in kinds:
+            if isinstance(data, bytes) and is_sized(data):
+                width_px, height_px, _ = measured(trimmed(data))
+                self._check_size((width_px, height_px), expected, name)
+        return RawFrame(
+            frame_id=frame_id,
+            stamp_ns=stamp_ns,
+            intrinsics=self.intrinsics,
+            world_from_camera=self.pose(source_from_camera),
+            color=b"",
+            depth=b"",
+            depth_scale_m=self.depth.scale_m,
+            index=index,
+            total=total,
+        )
 
     def pose(self, source_from_camera: np.ndarray) -> np.ndarray:
         """world_from_camera (4, 4), or of several (n, 4, 4). Raises PoseError."""
@@ -202,15 +224,22 @@ def finish(found: Found, options: ReadOptions) -> Source:
         why=found.why,
         notes=(*found.notes, *paced, *_rounded(poses), *notes),
         origin_m=normaliser.origin_m,
+        convention=found.convention,
+        world_from_source=normaliser.world_from_source,
+        thinned=lambda wanted: _frames(normaliser, entries, wanted),
     )
 
 
-def _frames(normaliser: Normaliser, entries: Sequence[Entry]) -> Iterator[RawFrame | BadFrame]:
+def _frames(
+    normaliser: Normaliser, entries: Sequence[Entry], wanted: Wanted | None = None
+) -> Iterator[RawFrame | BadFrame]:
     total = len(entries)
     for index, entry in enumerate(entries):
         try:
             pose = entry.pose()
-            yield normaliser.frame(index, total, entry.frame_id, entry.stamp_ns, pose, entry.images())
+            whole = wanted is None or wanted(index, normaliser.pose(pose))
+            make = normaliser.frame if whole else normaliser.bare
+            yield make(index, total, entry.frame_id, entry.stamp_ns, pose, entry.images())
         except UNUSABLE as error:
             yield BadFrame(frame_id=entry.frame_id, reason=str(error), index=index, total=total)
 

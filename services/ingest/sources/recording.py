@@ -15,7 +15,7 @@ from prior_sg.schemas.frames import Intrinsics, Keyframe, PoseUpdate
 from prior_sg.schemas.topics import KEYFRAME, POSE_UPDATE
 from prior_sg.services.ingest.core.options import ReadOptions
 from prior_sg.services.ingest.core.selection import BadFrame, Correction, RawFrame
-from prior_sg.services.ingest.sources.base import Camera, Found, Images, Source, SourceError
+from prior_sg.services.ingest.sources.base import Camera, Found, Images, Source, SourceError, Wanted
 from prior_sg.services.ingest.sources.normalise import LOOKED_AT, UNUSABLE, Normaliser, prepare, shifted_truth
 from prior_sg.services.ingest.sources.poses import Convention
 from prior_sg.services.runtime.record import Content, LogError, attachments, contents, read_log
@@ -66,6 +66,9 @@ def load(path: Path, options: ReadOptions) -> Source:
         why=("it is an MCAP log of ours",),
         notes=notes,
         origin_m=normaliser.origin_m,
+        convention=Convention().changed(options),
+        world_from_source=normaliser.world_from_source,
+        thinned=lambda wanted: _frames(recorded, normaliser_of, options, wanted),
     )
 
 
@@ -110,7 +113,7 @@ def _images(keyframe: Keyframe) -> Images:
 
 
 def _frames(
-    recorded: Log, normaliser_of: Callable[[Rig], Normaliser], options: ReadOptions
+    recorded: Log, normaliser_of: Callable[[Rig], Normaliser], options: ReadOptions, wanted: Wanted | None = None
 ) -> Iterator[RawFrame | BadFrame]:
     total, convention = recorded.total, Convention().changed(options)
     for index, payload in enumerate(_payloads(recorded.path, recorded.key)):
@@ -121,7 +124,8 @@ def _frames(
             stamp_ns = round(index * options.frame_ns(1)) if options.rate_hz else keyframe.stamp_ns
             pose = convention.of_matrix(np.array(keyframe.world_from_camera))
             normaliser = normaliser_of((keyframe.intrinsics, keyframe.depth_scale_m))
-            yield normaliser.frame(index, total, frame_id, stamp_ns, pose, _images(keyframe))
+            make = normaliser.frame if wanted is None or wanted(index, normaliser.pose(pose)) else normaliser.bare
+            yield make(index, total, frame_id, stamp_ns, pose, _images(keyframe))
         except (DecodeError, SourceError, *UNUSABLE) as error:
             yield BadFrame(frame_id=frame_id, reason=str(error), index=index, total=total)
 

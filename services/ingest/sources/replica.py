@@ -69,6 +69,7 @@ def load(path: Path, options: ReadOptions) -> Found:
             for number in sorted(colors.keys() | depths.keys())
         ],
         ground_truth=truth_beside(path),
+        convention=convention,
         why=(f"{POSES} and {IMAGES}/ lie in it",),
         assumed_hz=0.0 if options.rate_hz else RATE_HZ,
     )

@@ -90,6 +90,7 @@ def load(path: Path, options: ReadOptions) -> Found:
         MILLIMETRE,
         [entry(number) for number in sorted(colors.keys() | depths.keys() | poses.keys())],
         ground_truth=truth_beside(path),
+        convention=convention,
         why=(f"{COLOR_CAMERA} and {DEPTH_CAMERA} lie in it",),
         assumed_hz=0.0 if options.rate_hz else RATE_HZ,
     )

@@ -62,6 +62,7 @@ def load(path: Path, options: ReadOptions) -> Found:
         ],
         up=UP,
         ground_truth=truth_beside(path),
+        convention=convention,
         why=(f"it holds {POSES}",),
         assumed_hz=0.0 if options.rate_hz else RATE_HZ,
     )

@@ -72,6 +72,7 @@ def load(path: Path, options: ReadOptions) -> Found:
         entries,
         up=UP,
         ground_truth=truth_beside(path),
+        convention=convention,
         why=(f"{POSES}, {COLORS}/ and {DEPTHS}/ lie in it",),
         assumed_hz=0.0 if options.rate_hz else RATE_HZ,
     )

@@ -88,6 +88,7 @@ def load(path: Path, options: ReadOptions) -> Found:
         depth_scale_m,
         entries,
         ground_truth=truth_beside(path),
+        convention=convention,
         why=(f"{COLORS}, {DEPTHS} and {POSES} lie in it",),
         notes=tuple(filter(None, (said, poses_said, depth_shift, pose_shift))),
     )
