@@ -18,6 +18,12 @@ if TYPE_CHECKING:
 
 def add_commands(commands: Commands) -> None:
     """`export`, `explain`, `record`, `replay`, `topics`, `health`, `eval` and `bench`."""
+    _add_results(commands)
+    _add_logs(commands)
+    _add_system(commands)
+
+
+def _add_results(commands: Commands) -> None:
     export = commands.add(
         "export",
         cmd_export,
@@ -44,6 +50,8 @@ def add_commands(commands: Commands) -> None:
     explain.add_argument("--json", action="store_true", help="print JSON")
     add_bus(explain)
 
+
+def _add_logs(commands: Commands) -> None:
     record = commands.add(
         "record", cmd_record, "record all topics into a log, until Ctrl-C", "prior-sg record out/log.mcap"
     )
@@ -62,6 +70,8 @@ def add_commands(commands: Commands) -> None:
     replay.add_argument("service")
     replay.add_argument("--diff", action="store_true", help="compare with what was recorded; exit 1 on differences")
 
+
+def _add_system(commands: Commands) -> None:
     topics = commands.add(
         "topics",
         cmd_topics,
