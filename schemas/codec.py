@@ -18,6 +18,8 @@ from typing import Annotated, Any, ClassVar, TypeVar, get_args, get_origin, get_
 import msgspec
 import numpy as np
 
+from prior_sg.schemas.names import fault_of_robot
+
 ARRAY_EXT_CODE = 1
 DTYPES = (
     "float16",
@@ -80,8 +82,10 @@ class Message(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     schemas/migrations.py."""
 
     VERSION: ClassVar[int] = 1
+    OF_A_ROBOT: ClassVar[bool] = True  # its field `robot`, if it has one, never means the fleet
 
     def __post_init__(self) -> None:
+        _check_plain(self)
         lengths: dict[str, int] = {}
         for field, shape in _array_fields(type(self)):
             shape.check(field, getattr(self, field), lengths)
@@ -98,6 +102,20 @@ class Message(msgspec.Struct, frozen=True, kw_only=True, eq=False):
 
 
 M = TypeVar("M", bound=Message)
+
+
+def _check_plain(message: Message) -> None:
+    """Whole numbers fit 64 bits, as arrays and databases hold them; a robot has a name that can stand in a key."""
+    for field in _whole_numbers(type(message)):
+        if not -(2**63) <= getattr(message, field) < 2**63:
+            raise ValueError(f"{field}: does not fit 64 bits")
+    if message.OF_A_ROBOT and (fault := fault_of_robot(getattr(message, "robot", "robot"))):
+        raise ValueError(fault)
+
+
+@cache
+def _whole_numbers(message_type: type[Message]) -> tuple[str, ...]:
+    return tuple(field.name for field in msgspec.structs.fields(message_type) if field.type is int)
 
 
 @cache

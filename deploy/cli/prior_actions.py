@@ -79,7 +79,7 @@ def wanted(arguments: argparse.Namespace, cfg: Config) -> Prior:
 def verdict(prior: Prior, cfg: Config, library: Library) -> str:
     """What speaks for a prior's origin."""
     if not prior.provenance.signature and prior.provenance.source == "library" and not prior.provenance.parent_digest:
-        task = Task(robot="", stamp_ns=0, environment=prior.environment, task=prior.task, regions=prior.vocabulary)
+        task = Task(robot="cli", stamp_ns=0, environment=prior.environment, task=prior.task, regions=prior.vocabulary)
         try:
             said = library.answer(task, cfg)
             same = msgspec.structs.replace(said, provenance=prior.provenance).digest() == prior.digest()
