@@ -3,7 +3,8 @@
 import argparse
 from pathlib import Path
 
-from prior_sg.deploy.cli.shared import Commands, add_bus, add_settings, console, names_in
+from prior_sg.deploy.cli.shared import Commands, add_bus, add_settings, console
+from prior_sg.deploy.edge import names_in
 from prior_sg.deploy.errors import UserError
 from prior_sg.deploy.sample import SAMPLE
 from prior_sg.deploy.settings import DEMO_ENVIRONMENT, DEMO_TASK

@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from prior_sg.deploy.cli.jobs import add_run_options, settings_of
-from prior_sg.deploy.cli.shared import Commands, add_bus, console, names_in, open_client
+from prior_sg.deploy.cli.shared import Commands, add_bus, console, open_client
+from prior_sg.deploy.edge import names_in
 from prior_sg.deploy.errors import UserError
 from prior_sg.deploy.running import serve
 

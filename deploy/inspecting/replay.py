@@ -1,5 +1,6 @@
 """Feeds a recorded log to one service again, in the order it consumed its inputs, and compares what comes out."""
 
+import contextlib
 import logging
 import math
 from collections.abc import Iterator
@@ -15,10 +16,11 @@ from prior_sg.schemas.frames import Keyframe
 from prior_sg.schemas.migrations import journalled
 from prior_sg.schemas.status import Consumed, Started, Tick
 from prior_sg.schemas.topics import JOURNAL, KEYFRAME, QUERIES, TOPICS, Topic
+from prior_sg.services.refusals import InputRefused
 from prior_sg.services.registry import BY_NAME
 from prior_sg.services.runtime import config
 from prior_sg.services.runtime.record import LogError, Logged, read_log
-from prior_sg.services.runtime.service import Ask, Identity, Service
+from prior_sg.services.runtime.service import Ask, Identity, Output, Service
 
 logger = logging.getLogger(__name__)
 TOPIC_BY_NAME = {topic.name: topic for topic in TOPICS}
@@ -138,7 +140,7 @@ def replay_life(log: Log, life: Life) -> Iterator[tuple[Topic, Message]]:
     state = service.init(cfg, Identity(life.started.robot, life.instance, life.started.epoch))
     try:
         for entry in life.inputs:
-            for output in service.step(state, log.input(entry), cfg):
+            for output in _step(service, state, log.input(entry), cfg):
                 if not isinstance(output, Ask):
                     yield output[0], copied(output[1])
     finally:
@@ -151,9 +153,15 @@ def final_state(log: Log, life: Life) -> tuple[Any, Any]:
     cfg = recorded_config(log, life)
     state = service.init(cfg, Identity(life.started.robot, life.instance, life.started.epoch))
     for entry in life.inputs:
-        for _ in service.step(state, log.input(entry), cfg):
+        for _ in _step(service, state, log.input(entry), cfg):
             pass
     return state, cfg
+
+
+def _step(service: Service, state: Any, message: Message, cfg: Any) -> Iterator[Output]:
+    """As a host steps: an input that was refused changed nothing."""
+    with contextlib.suppress(InputRefused):
+        yield from service.step(state, message, cfg)
 
 
 def compare(log: Log, life: Life) -> Comparison:
