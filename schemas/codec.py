@@ -116,9 +116,8 @@ def _check_plain(value: msgspec.Struct) -> None:
             raise ValueError(f"{field}: does not fit 64 bits")
     for field in real:
         numbers = getattr(value, field)
-        if not all(
-            map(math.isfinite, numbers if isinstance(numbers, tuple) else () if numbers is None else (numbers,))
-        ):
+        numbers = numbers if isinstance(numbers, tuple) else (numbers,)
+        if not all(number is None or math.isfinite(number) for number in numbers):
             raise ValueError(f"{field}: not finite")
 
 
@@ -242,9 +241,9 @@ def prepare() -> None:
     for kind in message_types():
         _array_fields(kind)
         _numbers(kind)
+        _decoder(kind)
     for part in Part.__subclasses__():
         _numbers(part)
-        _decoder(kind)
 
 
 def encode(message: Message) -> bytes:
