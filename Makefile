@@ -3,6 +3,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 LLM := .venv-llm
 LLM_PORT ?= 18080
+WORKERS ?= 2
 
 .PHONY: demo test test-llm check bench clean
 .DEFAULT_GOAL := demo
@@ -12,8 +13,9 @@ demo: $(VENV)/installed
 
 test: check
 	$(BIN)/coverage erase
-	$(BIN)/coverage run -m pytest
-	$(BIN)/coverage report --include='services/*/*.py,schemas/*.py' --omit='services/*/service.py,services/runtime/*'
+	PSG_TEST_COVERAGE=1 $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
+	$(BIN)/coverage combine --quiet
+	$(BIN)/coverage report --include='services/**/*.py,schemas/*.py' --omit='services/*/service.py,services/runtime/**'
 
 # A real language model of 270 M parameters behind a server on loopback. Building the server takes many minutes, once.
 test-llm: $(VENV)/installed-dev $(LLM)/installed
@@ -35,7 +37,7 @@ bench: $(VENV)/installed-dev
 $(VENV)/installed: pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed; set PYTHON=...")'
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e .
+	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[encode,dsg,fast-cut]'
 	find schemas services deploy -name '*.nb[ci]' -delete # loops compiled for another version may name what it lacks now
 	touch $@
 

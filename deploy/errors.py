@@ -1,5 +1,7 @@
 """What goes wrong for a user and is told in one sentence."""
 
+from prior_sg.services.errors import PriorSgError
 
-class UserError(Exception):
+
+class UserError(PriorSgError):
     """What the user asked cannot be done; the message says what to do instead."""

@@ -11,7 +11,7 @@ import numpy as np
 from prior_sg.schemas.places import VoxelMap
 from prior_sg.schemas.regions import NO_REGION
 from prior_sg.services.geometry import inside_polygon
-from prior_sg.services.ingest.sources import open_source
+from prior_sg.services.ingest.sources import ReadOptions, open_source
 
 
 @dataclass(frozen=True)
@@ -62,9 +62,9 @@ class GroundTruth:
         return ids
 
 
-def truth_of(source: str | Path) -> dict[str, Any] | None:
+def truth_of(source: str | Path, options: ReadOptions | None = None) -> dict[str, Any] | None:
     """The content of the source's regions.json, or None when it has no ground truth. Raises SourceError."""
-    return open_source(source).ground_truth
+    return open_source(source, options=options).ground_truth
 
 
 @dataclass(frozen=True)

@@ -99,7 +99,7 @@ class Message(msgspec.Struct, frozen=True, kw_only=True, eq=False):
         """Raise ValueError when the fields contradict each other; overridden where a type alone does not say enough."""
 
     def __eq__(self, other: object) -> bool:
-        return type(self) is type(other) and encode(self) == encode(other)  # type: ignore[arg-type]
+        return type(self) is type(other) and encode(self) == encode(other)
 
     def __hash__(self) -> int:
         return hash(encode(self))
@@ -221,11 +221,11 @@ def _ext_hook(code: int, data: memoryview) -> Any:
 _encoder = msgspec.msgpack.Encoder(enc_hook=_enc_hook)
 
 
-_decoders: dict[Any, msgspec.msgpack.Decoder] = {}
+_decoders: dict[Any, msgspec.msgpack.Decoder[Any]] = {}
 _building = threading.Lock()  # msgspec's descriptions of types, which decoders share, are not safe to build at once
 
 
-def _decoder(message_type: Any) -> msgspec.msgpack.Decoder:
+def _decoder(message_type: Any) -> msgspec.msgpack.Decoder[Any]:
     found = _decoders.get(message_type)
     if found is None:
         with _building:
@@ -256,18 +256,20 @@ def decode(message_type: type[M], payload: bytes | memoryview) -> M:
     if isinstance(payload, Refused):
         raise DecodeError(payload.reason)
     try:
-        return _decoder(message_type).decode(payload)
+        message: M = _decoder(message_type).decode(payload)
     except (msgspec.MsgspecError, ValueError, TypeError, OverflowError, RecursionError) as error:
         raise DecodeError(f"{schema_name(message_type)}: {error}") from error
+    return message
 
 
 def decode_plain(payload: bytes | memoryview, schema: str) -> dict[str, Any]:
     """The fields in `payload` by name, whatever they are; its arrays point into it. Raises DecodeError, which names
     `schema`."""
     try:
-        return _decoder(dict[str, Any]).decode(payload)
+        fields: dict[str, Any] = _decoder(dict[str, Any]).decode(payload)
     except (msgspec.MsgspecError, ValueError, TypeError, OverflowError, RecursionError) as error:
         raise DecodeError(f"{schema}: {error}") from error
+    return fields
 
 
 def encode_plain(fields: dict[str, Any]) -> bytes:

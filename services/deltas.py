@@ -1,6 +1,12 @@
-"""Following a stream of deltas: tell the next one from a repeat, a gap and a restarted writer (pure)."""
+"""Following a stream of deltas: tell the next one from a repeat, a gap and a restarted writer; and the poses that
+updates have corrected (pure)."""
 
+from dataclasses import dataclass, field
 from typing import Generic, Literal, Protocol, TypeVar
+
+import numpy as np
+
+from prior_sg.schemas.frames import PoseUpdate
 
 Verdict = Literal["apply", "stale", "gap"]
 
@@ -57,3 +63,27 @@ class Follower(Generic[D]):
         self._waiting = {name: kept for name, kept in self._waiting.items() if name > (self.epoch, self.revision)}
         self.needs_snapshot = bool(self._waiting)
         return ready
+
+
+@dataclass
+class PoseCorrections:
+    """Newest corrected pose of each frame, also of frames that are still to come."""
+
+    world_from_camera: dict[int, np.ndarray] = field(default_factory=dict)  # (4, 4) by frame id
+    revisions: dict[int, int] = field(default_factory=dict)  # of the newest update by the epoch of its writer
+
+    def take(self, update: PoseUpdate) -> dict[int, np.ndarray] | None:
+        """The poses (4, 4) by frame id that an update gives; None where it is a repeat or older than one before."""
+        if update.revision <= self.revisions.get(update.epoch, -1):
+            return None
+        self.revisions[update.epoch] = update.revision
+        poses = dict(zip(update.frame_ids.tolist(), np.array(update.world_from_camera), strict=True))
+        self.world_from_camera.update(poses)
+        return poses
+
+    def pose(self, frame_id: int, otherwise: np.ndarray) -> np.ndarray:
+        """The corrected pose of a frame, or `otherwise`, as it was announced."""
+        return self.world_from_camera.get(frame_id, otherwise)
+
+    def __contains__(self, frame_id: int) -> bool:
+        return frame_id in self.world_from_camera

@@ -28,7 +28,8 @@ def inverse(pose: np.ndarray) -> np.ndarray:
 
 def transform(b_from_a: np.ndarray, points_a: np.ndarray) -> np.ndarray:
     """Points (n, 3) from frame a to frame b."""
-    return points_a @ b_from_a[:3, :3].T + b_from_a[:3, 3]
+    points_b: np.ndarray = points_a @ b_from_a[:3, :3].T + b_from_a[:3, 3]
+    return points_b
 
 
 def rotation_angle_rad(b_from_a: np.ndarray) -> float:
@@ -60,4 +61,5 @@ def inside_polygon(points: np.ndarray, polygon: np.ndarray) -> np.ndarray:
     bx, by = np.roll(ax, -1), np.roll(ay, -1)
     spans = (ay > y) != (by > y)
     slope = np.divide(bx - ax, by - ay, out=np.zeros_like(ax, dtype=float), where=by != ay)
-    return (spans & (x < ax + (y - ay) * slope)).sum(axis=1) % 2 == 1
+    inside: np.ndarray = (spans & (x < ax + (y - ay) * slope)).sum(axis=1) % 2 == 1
+    return inside

@@ -1,24 +1,32 @@
-"""Depth images as they arrive, and what can be wrong with them (pure)."""
+"""Colour and depth of a keyframe, decoded, and what can be wrong with them (pure)."""
 
 import cv2
 import numpy as np
 
 from prior_sg.schemas.frames import Intrinsics, Keyframe
 
+MAX_PRINCIPAL_OFFSET = 0.45  # share of the image by which the principal point may be off its middle: crops
+
 
 class ImageFault(ValueError):
     """A keyframe's images cannot be used; the text is the reason."""
 
 
+def color_of(keyframe: Keyframe) -> np.ndarray:
+    """Colour (h, w, 3) uint8, RGB. Raises ImageFault."""
+    image = _decoded(keyframe.color, "colour", cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION)
+    _check_size(image, keyframe.intrinsics, "colour")
+    return image
+
+
 def depth_of(keyframe: Keyframe, max_principal_offset: float) -> np.ndarray:
     """Depth (h, w) float32 in metres, 0 = no measurement or masked. Raises ImageFault.
 
-    The principal point of a camera lies near the middle of its image; farther from it than `max_principal_offset`
-    (share of the image), the intrinsics belong to another image size.
+    The principal point of a camera lies in its image, of a crop not in the middle; farther from this than
+    `max_principal_offset` (share of the image), the intrinsics belong to another image size.
     """
     camera = keyframe.intrinsics
-    image = _decoded(keyframe.depth, "depth")
-    _check_size(image, camera, "depth")
+    image = _single_channel(keyframe.depth, camera, "depth")
     if image.dtype != np.uint16:
         raise ImageFault(f"the depth image has {8 * image.dtype.itemsize} bits per pixel instead of 16")
     for name, center, size in (("x", camera.cx_px, camera.width_px), ("y", camera.cy_px, camera.height_px)):
@@ -28,17 +36,29 @@ def depth_of(keyframe: Keyframe, max_principal_offset: float) -> np.ndarray:
                 "the intrinsics belong to another image size"
             )
     if keyframe.mask:
-        mask = _decoded(keyframe.mask, "mask")
-        _check_size(mask, camera, "mask")
-        image = np.where(mask == 0, image, 0)
+        image = np.where(_single_channel(keyframe.mask, camera, "mask") == 0, image, 0)
     if not image.any():
         raise ImageFault("the depth image holds no measurement")
     return image.astype(np.float32) * np.float32(keyframe.depth_scale_m)
 
 
-def _decoded(data: bytes, name: str) -> np.ndarray:
+def blank_of(keyframe: Keyframe) -> tuple[np.ndarray, np.ndarray]:
+    """Colour and depth without any measurement, in place of images that cannot be used; shapes as of those."""
+    size = (keyframe.intrinsics.height_px, keyframe.intrinsics.width_px)
+    return np.zeros((*size, 3), np.uint8), np.zeros(size, np.float32)
+
+
+def _single_channel(data: bytes, camera: Intrinsics, name: str) -> np.ndarray:
+    image = _decoded(data, name, cv2.IMREAD_UNCHANGED)
+    if image.ndim != 2:
+        raise ImageFault(f"the {name} image has {image.shape[2]} channels instead of one")
+    _check_size(image, camera, name)
+    return image
+
+
+def _decoded(data: bytes, name: str, mode: int) -> np.ndarray:
     try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), mode)
     except cv2.error:  # empty, or a header that promises an absurd size
         image = None
     if image is None:
@@ -47,9 +67,7 @@ def _decoded(data: bytes, name: str) -> np.ndarray:
 
 
 def _check_size(image: np.ndarray, camera: Intrinsics, name: str) -> None:
-    if image.ndim != 2:
-        raise ImageFault(f"the {name} image has {image.shape[2]} channels instead of one")
-    height_px, width_px = image.shape
+    height_px, width_px = image.shape[:2]
     if (width_px, height_px) != (camera.width_px, camera.height_px):
         raise ImageFault(
             f"the {name} image has {width_px} x {height_px} pixels, "

@@ -1,5 +1,7 @@
 """The only list of services."""
 
+from typing import Any
+
 from prior_sg.schemas.topics import POSE_UPDATE, PRIOR_REVISION, TASK, Topic
 from prior_sg.services.feature_pyramid.service import SERVICE as FEATURE_PYRAMID
 from prior_sg.services.ingest.service import SERVICE as INGEST
@@ -9,9 +11,9 @@ from prior_sg.services.runtime.service import Service
 from prior_sg.services.scene_store.service import SERVICE as SCENE_STORE
 from prior_sg.services.segmenter.service import SERVICE as SEGMENTER
 
-SERVICES: tuple[Service, ...] = (INGEST, PLACE_GRAPH, FEATURE_PYRAMID, PRIOR_GATEWAY, SEGMENTER, SCENE_STORE)
+SERVICES: tuple[Service[Any, Any], ...] = (INGEST, PLACE_GRAPH, FEATURE_PYRAMID, PRIOR_GATEWAY, SEGMENTER, SCENE_STORE)
 
 # Topics that people and their programs write or read, through the command line.
 OPERATOR_WRITES: tuple[Topic, ...] = (TASK, POSE_UPDATE, PRIOR_REVISION)
 
-BY_NAME: dict[str, Service] = {service.name: service for service in SERVICES}
+BY_NAME: dict[str, Service[Any, Any]] = {service.name: service for service in SERVICES}

@@ -1,5 +1,6 @@
 import os
 
+import coverage
 import numpy as np
 import pytest
 
@@ -22,3 +23,16 @@ def endpoint():
     stop = open_router(address)
     yield address
     stop()
+
+
+def pytest_configure(config):
+    """`make test` measures coverage in xdist's workers, not in the services that tests start, which it would slow."""
+    if hasattr(config, "workerinput") and "PSG_TEST_COVERAGE" in os.environ:
+        config.measured = coverage.Coverage(data_suffix=True)
+        config.measured.start()
+
+
+def pytest_unconfigure(config):
+    if measured := getattr(config, "measured", None):
+        measured.stop()
+        measured.save()

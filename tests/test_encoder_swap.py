@@ -9,7 +9,7 @@ from prior_sg.deploy.running.supervisor import Supervisor
 from prior_sg.schemas.codec import decode
 from prior_sg.schemas.priors import Task
 from prior_sg.schemas.topics import INGEST_STATE, PYRAMID, REGION_DELTA, TASK
-from prior_sg.services.runtime.client import Client
+from prior_sg.services.runtime.client import BusClient
 from prior_sg.services.runtime.zenoh_bus import ZenohBus
 from tests.help.world import Reader
 from tests.test_pipeline import shortened
@@ -75,7 +75,7 @@ def system(tmp_path, endpoint):
 
 def test_a_new_encoder_takes_over_and_the_old_one_may_go(system, endpoint):
     first, second = system
-    with Client(ZenohBus(endpoint)) as client:
+    with BusClient(ZenohBus(endpoint)) as client:
         watch = Watch(client)
         for name in ("prior_gateway", "segmenter", "place_graph", "feature_pyramid"):
             first.start(name)

@@ -36,7 +36,7 @@ from prior_sg.schemas.topics import (
     TOPICS,
     worker_keys,
 )
-from prior_sg.services.runtime.client import Client
+from prior_sg.services.runtime.client import BusClient
 from prior_sg.services.runtime.jobs.dispatcher import CREDITS
 from prior_sg.services.runtime.record import LogWriter, read_log, summary
 from prior_sg.services.runtime.zenoh_bus import ZenohBus
@@ -72,7 +72,7 @@ class Trouble(threading.Thread):
         self.did, self.health, self.task_output = [], None, ""
 
     def run(self):
-        with Client(ZenohBus(self.endpoint)) as client:
+        with BusClient(ZenohBus(self.endpoint)) as client:
             frames, messages = [], {}
 
             def see(sample):

@@ -20,7 +20,7 @@ from prior_sg.schemas.regions import RegionDelta
 from prior_sg.schemas.topics import INGEST_STATE, KEYFRAME, PLACE_DELTA, PYRAMID, REGION_DELTA
 from prior_sg.services.registry import SERVICES
 from prior_sg.services.runtime.bus import Sample
-from prior_sg.services.runtime.client import Client
+from prior_sg.services.runtime.client import BusClient
 from prior_sg.services.runtime.zenoh_bus import ZenohBus, free_endpoint, open_router
 
 ROBOT = "bench"
@@ -161,7 +161,7 @@ def _longest_gap(sent_s: list[float], start_s: float, end_s: float) -> float:
 
 
 @contextmanager
-def _running(source: Path) -> Iterator[tuple[Supervisor, Supervisor, Client]]:
+def _running(source: Path) -> Iterator[tuple[Supervisor, Supervisor, BusClient]]:
     """A router, supervisors of the services and of the newcomer, and a client; all end with the block."""
     endpoint = free_endpoint("tcp/127.0.0.1:0")
     stop_router = open_router(endpoint)
@@ -179,7 +179,7 @@ def _running(source: Path) -> Iterator[tuple[Supervisor, Supervisor, Client]]:
             Supervisor(endpoint, ROBOT, out / "new", [f"feature_pyramid.space={NEW}"]),
         )
         try:
-            with Client(ZenohBus(endpoint)) as client:
+            with BusClient(ZenohBus(endpoint)) as client:
                 yield (*supervisors, client)
         finally:
             for supervisor in supervisors:
@@ -187,7 +187,7 @@ def _running(source: Path) -> Iterator[tuple[Supervisor, Supervisor, Client]]:
             stop_router()
 
 
-def _start(supervisor: Supervisor, client: Client) -> None:
+def _start(supervisor: Supervisor, client: BusClient) -> None:
     """All services, the source last: the stream must not begin before its readers stand."""
     names = [service.name for service in SERVICES if service.name != "ingest"]
     for name in names:

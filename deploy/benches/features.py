@@ -26,10 +26,10 @@ from prior_sg.schemas.frames import Keyframe
 from prior_sg.schemas.topics import ENCODE, PYRAMID
 from prior_sg.services.feature_pyramid.core import crops as core
 from prior_sg.services.feature_pyramid.core.config import Config
-from prior_sg.services.feature_pyramid.decode import read_color, read_depth
 from prior_sg.services.feature_pyramid.encoders.base import Options, load_encoder
 from prior_sg.services.feature_pyramid.encoders.conse import classifier_file, resized
 from prior_sg.services.feature_pyramid.encoders.onnx_session import Session
+from prior_sg.services.images import color_of, depth_of
 from prior_sg.services.runtime.bus import Sample
 from prior_sg.services.runtime.jobs.board import Ended
 from prior_sg.services.runtime.jobs.pool import JobPool
@@ -119,8 +119,8 @@ def sample_crops(keyframes: list[Keyframe], count: int, side_px: int) -> np.ndar
     crops: list[np.ndarray] = []
     cfg = Config(smallest_crop_px=core.PUBLISHED_CROP_PX)
     for frame in keyframes:
-        selection = core.select_crops(read_depth(frame), frame.intrinsics, cfg)
-        crops += [resized(crop, side_px) for crop in selection.crops.cut(read_color(frame))]
+        selection = core.select_crops(depth_of(frame, cfg.max_principal_offset), frame.intrinsics, cfg)
+        crops += [resized(crop, side_px) for crop in selection.crops.cut(color_of(frame))]
         if len(crops) >= count:
             break
     return np.stack(crops[:count])

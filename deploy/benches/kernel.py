@@ -13,18 +13,18 @@ import numpy as np
 
 from prior_sg.deploy.running.supervisor import THREAD_VARIABLES
 from prior_sg.schemas.frames import Intrinsics
-from prior_sg.services.segmenter.core.evidence import kernel as descriptors
+from prior_sg.services.segmenter.core.evidence.kernel import Evidence, Frame, KernelConfig, Targets, integrate
 
 PLACES, CROPS, DIM = 2_000, 60, 1024
 QUERY_RADIUS_M = 0.75
 ROUNDS = 25
 
 
-def observation(rng: np.random.Generator) -> tuple[descriptors.Frame, np.ndarray]:
+def observation(rng: np.random.Generator) -> tuple[Frame, np.ndarray]:
     """A keyframe with 60 crops in three layers, and places that all lie in its view."""
     camera = Intrinsics(640, 480, 500.0, 500.0, 319.5, 239.5)
     sides_px = np.repeat([224, 352, 480], [40, 15, 5])
-    frame = descriptors.Frame(
+    frame = Frame(
         camera_from_world=np.eye(4),
         intrinsics=camera,
         centers_px=rng.uniform(110, 370, (CROPS, 2)).astype(np.float32),
@@ -54,15 +54,15 @@ def measured() -> tuple[dict, dict]:
     """
     rng = np.random.default_rng(0)
     frame, positions_m = observation(rng)
-    evidence = descriptors.Evidence()
+    evidence = Evidence()
     evidence.add(rng.permutation(PLACES).tolist())
-    targets = descriptors.Targets(evidence.of(list(range(PLACES))), positions_m)
+    targets = Targets(evidence.of(list(range(PLACES))), positions_m)
     weights = rng.random((PLACES, CROPS)).astype(np.float32)
     embeddings = frame.embeddings.astype(np.float32)
-    cfg = descriptors.KernelConfig()
+    cfg = KernelConfig()
 
     def whole() -> np.ndarray:
-        return descriptors.integrate(evidence, frame, targets, QUERY_RADIUS_M, cfg)
+        return integrate(evidence, frame, targets, QUERY_RADIUS_M, cfg)
 
     def product() -> np.ndarray:
         return weights @ embeddings

@@ -22,8 +22,9 @@ from prior_sg.services.prior_gateway.core import learning
 from prior_sg.services.prior_gateway.core.config import Config as GatewayConfig
 from prior_sg.services.prior_gateway.outside import library
 from prior_sg.services.segmenter.core import inference, prior_evidence, update
-from prior_sg.services.segmenter.core.regions.components import components
-from prior_sg.services.segmenter.core.state import Config, State, empty
+from prior_sg.services.segmenter.core.config import Config
+from prior_sg.services.segmenter.core.regions.components import numbered
+from prior_sg.services.segmenter.core.state import State, empty
 
 REGIONS = [
     *("kitchen", "dining room", "living room", "bedroom", "bathroom", "hallway"),
@@ -159,15 +160,15 @@ def label(state: State, home: Home, prior: Prior) -> None:
         for output in list(update.update(state, message, CFG)):
             if isinstance(output, TextRequest):
                 list(update.update(state, homes.text(output, prior), CFG))
-    assert state.alignment is not None and state.alignment.digest == prior.digest()
+    assert state.aim.in_force is not None and state.aim.in_force.digest == prior.digest()
     inference.see_objects(state, home.objects, CFG)
     list(update.update(state, Tick(stamp_ns=1), CFG))
 
 
 def f1_s(truth: np.ndarray, state: State) -> float:
     """F1_S of the regions; every place stands for the same volume. `truth` (place,) labels."""
-    places = state.places
-    true_ids = components(truth, state.graph.edges)
+    places = state.map.places
+    true_ids = numbered(truth, state.map.graph.edges)
     _, rows = np.unique(places.regions, return_inverse=True)
     shared = np.zeros((rows.max() + 1, true_ids.max() + 1), np.int64)
     np.add.at(shared, (rows, true_ids), 1)

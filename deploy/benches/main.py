@@ -19,10 +19,11 @@ from prior_sg.deploy.sample import SAMPLE
 from prior_sg.deploy.settings import DEMO_ENVIRONMENT, DEMO_TASK
 from prior_sg.schemas.frames import Keyframe
 from prior_sg.schemas.priors import PriorRequest, Task
-from prior_sg.schemas.topics import PRIORS, TEXT, Query
+from prior_sg.schemas.topics import KEYFRAME, PRIOR, PRIORS, TASK, TEXT
 from prior_sg.services.ingest.sources import open_source
 from prior_sg.services.registry import BY_NAME
-from prior_sg.services.runtime.service import Ask, Identity
+from prior_sg.services.runtime.runner import Pipeline, Runner
+from prior_sg.services.runtime.service import Identity
 
 
 def machine() -> dict[str, Any]:
@@ -69,45 +70,26 @@ def bus() -> tuple[dict, dict]:
     return bus_bench(_sample_keyframes()[0])
 
 
-class Pipeline:
-    """Mapping, encoding and segmenting in one thread, for timing what lies between a keyframe and its regions."""
-
-    def __init__(self) -> None:
-        names = ("place_graph", "feature_pyramid", "segmenter", "prior_gateway")
-        self.services = {name: BY_NAME[name] for name in names}
-        self.configs: dict[str, Any] = {name: service.config() for name, service in self.services.items()}
-        self.states = {
-            name: service.init(self.configs[name], Identity("bench", "b", 1)) for name, service in self.services.items()
-        }
-
-    def step(self, name: str, message: Any) -> list[Any]:
-        """What one step publishes; questions of the segmenter to the encoder are answered on the spot."""
-        published: list[Any] = []
-        for output in list(self.services[name].step(self.states[name], message, self.configs[name])):
-            if not isinstance(output, Ask):
-                published.append(output[1])
-            elif output.query is TEXT:
-                self.step(name, self.answer("feature_pyramid", TEXT, output.request))
-        return published
-
-    def answer(self, name: str, query: Query, request: Any) -> Any:
-        """One service's answer."""
-        return self.services[name].answers[query](self.states[name], request, self.configs[name])
-
-
 def e2e() -> tuple[dict, dict]:
     """Keyframe in hand → region delta that follows from it, encoder time excluded, without transport."""
-    pipeline, keyframes = Pipeline(), _sample_keyframes()
+    keyframes = _sample_keyframes()
     request = PriorRequest(environment=DEMO_ENVIRONMENT, task=DEMO_TASK)
-    prior = pipeline.answer("prior_gateway", PRIORS, request).priors[0]
-    pipeline.step("segmenter", Task(robot="bench", stamp_ns=0, environment=request.environment, task=request.task))
-    pipeline.step("segmenter", prior)
+    prior = Runner(BY_NAME["prior_gateway"]).answer(PRIORS, request).priors[0]
+    encoder, place_graph, segmenter = (
+        Runner(BY_NAME[name], identity=Identity("bench", name, 1))
+        for name in ("feature_pyramid", "place_graph", "segmenter")
+    )
+    segmenter.answers[TEXT] = encoder
+    pipeline = Pipeline((place_graph, segmenter))
+    pipeline.publish(TASK, Task(robot="bench", stamp_ns=0, environment=request.environment, task=request.task))
+    pipeline.publish(PRIOR, prior)
     spent = []
     for keyframe in keyframes:
-        pyramids = pipeline.step("feature_pyramid", keyframe)
+        encoded = encoder.feed(keyframe)
         started_s = time.perf_counter()
-        for message in pipeline.step("place_graph", keyframe) + pyramids:
-            pipeline.step("segmenter", message)
+        pipeline.publish(KEYFRAME, keyframe)
+        for topic, message in encoded:
+            pipeline.publish(topic, message)
         spent.append(1e3 * (time.perf_counter() - started_s))
     return _percentiles(spent[3:]), {"keyframes": len(keyframes), "transport": "none (see bench bus)"}
 

@@ -1,27 +1,33 @@
 """The place graph: time per keyframe, split by stage, against the size of the map, and memory."""
 
 import cProfile
-import pstats
 import resource
 import time
-from pathlib import Path
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import msgspec
 import numpy as np
 
 from prior_sg.schemas.frames import Keyframe
+from prior_sg.services import images
+from prior_sg.services.place_graph.core.ledger import PlaceLedger
+from prior_sg.services.place_graph.core.openings import Openings
+from prior_sg.services.place_graph.core.skeleton import distance, places
+from prior_sg.services.place_graph.core.skeleton.graph import PlaceGraph
+from prior_sg.services.place_graph.core.volume import tsdf
 from prior_sg.services.registry import BY_NAME
+from prior_sg.services.runtime.runner import Runner
 from prior_sg.services.runtime.service import Identity
 
-PLACE_STAGES = {  # functions of the place graph whose time makes a stage
-    "decode": ("images.depth_of",),
-    "fuse": ("tsdf.integrate",),
-    "distances": ("distance.refresh",),
-    "places": ("places.extract",),
-    "edges": ("graph.PlaceGraph.update",),
-    "frontiers": ("frontiers.Openings.renew",),
-    "publish": ("published.Published.update",),
+PLACE_STAGES: dict[str, Callable[..., Any]] = {  # the function of the place graph whose time makes a stage
+    "decode": images.depth_of,
+    "fuse": tsdf.integrate,
+    "distances": distance.refresh,
+    "places": places.extract,
+    "edges": PlaceGraph.update,
+    "frontiers": Openings.renew,
+    "publish": PlaceLedger.update,
 }
 LAP_M, MANY_PLACES = 25.6, 10_000  # a lap of the sample lies so far beside the one before, in whole blocks of voxels
 
@@ -44,43 +50,41 @@ def place_bench(keyframes: list[Keyframe]) -> tuple[dict, dict]:
     return metrics, {"keyframes": len(keyframes), "image": "640x480", "voxel_m": 0.2, "clock": "processor time"}
 
 
+def _place_graph(**settings: Any) -> Runner:
+    service = BY_NAME["place_graph"]
+    return Runner(service, service.config(**settings), Identity("bench", "b", 1))
+
+
 def _lap_ms(keyframes: list[Keyframe], voxel_m: float) -> tuple[list[float], dict[str, float]]:
     """Milliseconds of each keyframe, and of each stage on average."""
-    service = BY_NAME["place_graph"]
-    cfg: Any = service.config(voxel_m=voxel_m)
-    state: Any = service.init(cfg, Identity("bench", "b", 1))
+    runner = _place_graph(voxel_m=voxel_m)
     spent: list[float] = []
     profile = cProfile.Profile(time.process_time)
     for keyframe in keyframes:
         started_s = time.process_time()
-        list(service.step(state, keyframe, cfg))
+        runner.feed(keyframe)
         spent.append(1e3 * (time.process_time() - started_s))
-    state = service.init(cfg, Identity("bench", "b", 1))
+    runner = _place_graph(voxel_m=voxel_m)
     profile.enable()
     for keyframe in keyframes:
-        list(service.step(state, keyframe, cfg))
+        runner.feed(keyframe)
     profile.disable()
-    seconds: dict[str, float] = {}
-    for (file, _, function), (*_, cumulative, _) in pstats.Stats(profile).stats.items():  # type: ignore[attr-defined]
-        seconds[f"{Path(file).stem}.{function}"] = cumulative
-    stages = {
-        f"stage_ms_{stage}": 1e3 * sum(seconds.get(_bare(name), 0.0) for name in names) / len(keyframes)
-        for stage, names in PLACE_STAGES.items()
-    }
-    return spent, stages
+    spent_s = stages_s(profile, PLACE_STAGES)
+    return spent, {f"stage_ms_{stage}": 1e3 * seconds / len(keyframes) for stage, seconds in spent_s.items()}
 
 
-def _bare(name: str) -> str:
-    """Module and function, without the class: what the profiler knows."""
-    module, *_, function = name.split(".")
-    return f"{module}.{function}"
+def stages_s(profile: cProfile.Profile, stages: Mapping[str, Callable[..., Any]]) -> dict[str, float]:
+    """Seconds that each stage's function took, what it calls included. Raises RuntimeError if one was never called."""
+    called = {entry.code: entry.totaltime for entry in profile.getstats()}
+    missing = [stage for stage, function in stages.items() if function.__code__ not in called]
+    if missing:
+        raise RuntimeError(f"the place graph never calls the functions of these stages: {', '.join(missing)}")
+    return {stage: called[function.__code__] for stage, function in stages.items()}
 
 
 def _growth(keyframes: list[Keyframe]) -> dict[str, float]:
     """Time of a lap on a large map over that of the same lap on a small one, keyframe by keyframe."""
-    service = BY_NAME["place_graph"]
-    cfg: Any = service.config(voxel_m=0.2, min_component_size=1)
-    state: Any = service.init(cfg, Identity("bench", "b", 1))
+    runner = _place_graph(voxel_m=0.2, min_component_size=1)
     laps: list[list[float]] = []
     sizes: list[int] = []
     while not sizes or sizes[-1] < MANY_PLACES:
@@ -91,15 +95,15 @@ def _growth(keyframes: list[Keyframe]) -> dict[str, float]:
             pose[:2, 3] += LAP_M * np.array(divmod(len(laps), 8))
             moved = msgspec.structs.replace(keyframe, frame_id=number, stamp_ns=number * 10**11, world_from_camera=pose)
             started_s = time.process_time()
-            list(service.step(state, moved, cfg))
+            runner.feed(moved)
             spent.append(time.process_time() - started_s)
         laps.append(spent)
-        sizes.append(len(state.graph.places))
+        sizes.append(len(runner.state.graph.places))
     few, many = (np.median(laps[part], axis=0) for part in (slice(0, 5), slice(-5, None)))
     return {
         "growth": float(np.median(many / few)),
         "growth_total": float(many.sum() / few.sum()),
         "growth_places_small": float(sizes[0]),
         "growth_places_large": float(sizes[-1]),
-        "map_mb_at_10000": state.grid.size_bytes / 1e6,
+        "map_mb_at_10000": runner.state.grid.size_bytes / 1e6,
     }

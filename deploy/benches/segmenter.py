@@ -6,13 +6,16 @@ from typing import Any
 
 import numpy as np
 
+from prior_sg.schemas.codec import Message
 from prior_sg.schemas.features import Pyramid, TextEmbeddings, TextRequest
 from prior_sg.schemas.frames import Intrinsics
 from prior_sg.schemas.places import PlaceDelta
 from prior_sg.schemas.priors import ObjectPrior, Prior, Provenance, RegionPrior, Task
 from prior_sg.schemas.status import Tick
+from prior_sg.schemas.topics import TEXT
 from prior_sg.services.registry import BY_NAME
-from prior_sg.services.runtime.service import Ask, Identity
+from prior_sg.services.runtime.runner import Runner
+from prior_sg.services.runtime.service import Identity
 
 ROBOT, LABELS, DIM = "bench", 12, 384
 STEP_M, ROOM_STEPS = 0.7, 8  # places stand this far apart; a room is a square of so many
@@ -104,19 +107,13 @@ class Bench:
     """One segmenter that follows a hall; its questions are answered on the spot."""
 
     def __init__(self, hall: Hall) -> None:
-        self.hall, self.service = hall, BY_NAME["segmenter"]
-        self.cfg: Any = self.service.config()
-        self.state = self.service.init(self.cfg, Identity(ROBOT, "bench", 1))
+        self.hall = hall
+        self.runner = Runner(BY_NAME["segmenter"], identity=Identity(ROBOT, "bench", 1), answers={TEXT: self._text})
+        self.cfg: Any = self.runner.cfg
 
-    def step(self, message: Any) -> int:
+    def step(self, message: Message) -> int:
         """Feed one message; how many deltas came out."""
-        deltas = 0
-        for output in list(self.service.step(self.state, message, self.cfg)):
-            if not isinstance(output, Ask):
-                deltas += 1
-            elif isinstance(output.request, TextRequest):
-                deltas += self.step(self._text(output.request))
-        return deltas
+        return len(self.runner.feed(message))
 
     def _text(self, request: TextRequest) -> TextEmbeddings:
         count = len(request.concepts)
@@ -149,7 +146,8 @@ class Bench:
             adjacency=adjacency,
             provenance=Provenance(source="bench"),
         )
-        stamp_ns = 1 + (self.state.task.stamp_ns if self.state.task else 0)
+        task: Task | None = self.runner.state.task
+        stamp_ns = 1 + (task.stamp_ns if task else 0)
         return [Task(robot=ROBOT, stamp_ns=stamp_ns, environment="hall", task=name), prior]
 
     def fill(self, keyframes: int) -> None:

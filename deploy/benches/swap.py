@@ -12,10 +12,9 @@ from typing import Any
 import numpy as np
 
 from prior_sg.deploy.benches.fields import LABELS, place_field
-from prior_sg.services.segmenter.core.energy import swap
 from prior_sg.services.segmenter.core.energy.bound import lower_bound
-from prior_sg.services.segmenter.core.energy.mrf import Field
-from prior_sg.services.segmenter.core.energy.solver import Solver
+from prior_sg.services.segmenter.core.energy.mrf import Field, energy
+from prior_sg.services.segmenter.core.energy.solver import Solver, minimise
 from prior_sg.services.segmenter.core.map.arcs import Arcs, arcs_of
 
 SIZES = (500, 2_000, 10_000, 50_000)
@@ -30,7 +29,7 @@ CHANGED_PLACES = 100  # of the streams that show whether an update's time depend
 
 def swap_bench() -> tuple[dict[str, Any], dict[str, Any]]:
     """All figures and the settings."""
-    swap.minimise(bench_field(50, 0), np.zeros(50, np.int64))  # loads the compiled code
+    minimise(bench_field(50, 0), np.zeros(50, np.int64))  # loads the compiled code
     metrics: dict[str, Any] = {}
     for places in SIZES:
         metrics |= suffixed(cold(places), places)
@@ -70,14 +69,14 @@ def cold(places: int) -> dict[str, float]:
 
     spent: dict[str, list[float]] = {"ours": [], "theirs": []}
     for _ in range(REPEATS):
-        seconds, our_labels = timed(lambda: swap.minimise(field, start))
+        seconds, our_labels = timed(lambda: minimise(field, start))
         spent["ours"].append(seconds)
         seconds, their_labels = timed(theirs)
         spent["theirs"].append(seconds)
     ours_s, theirs_s = statistics.median(spent["ours"]), statistics.median(spent["theirs"])
     return {
         "cold_time_ratio_gco": ours_s / theirs_s,
-        "cold_energy_ratio_gco": swap.energy(field, our_labels) / swap.energy(field, their_labels),
+        "cold_energy_ratio_gco": energy(field, our_labels) / energy(field, their_labels),
         "cold_ms": 1e3 * ours_s,
         "gco_ms": 1e3 * theirs_s,
     }
@@ -90,9 +89,9 @@ def dual_bound() -> dict[str, float]:
         for seed in range(BOUND_FIELDS):
             field, solver = bench_field(places, seed), Solver()
             bound, start = lower_bound(field), field.unary.argmin(axis=1)
-            fresh.append(swap.energy(field, swap.minimise(field, start)) / bound)
+            fresh.append(energy(field, minimise(field, start)) / bound)
             solver.take(field, start)
-            idle.append(swap.energy(field, solver.drain()) / bound)
+            idle.append(energy(field, solver.drain()) / bound)
     return {
         "dual_bound_ratio": statistics.mean(fresh),
         "dual_bound_ratio_worst": max(fresh),
@@ -124,9 +123,9 @@ def stream(places: int, changed: int, steps: int, against_cold: bool = True, rew
         seconds, updated = timed(lambda: solver.update(field, labels, dirty=dirty))  # noqa: B023 (called at once)
         update_s.append(seconds)
         if against_cold:
-            seconds, fresh = timed(lambda: swap.minimise(field, field.unary.argmin(axis=1)))  # noqa: B023 (at once)
+            seconds, fresh = timed(lambda: minimise(field, field.unary.argmin(axis=1)))  # noqa: B023 (at once)
             cold_s.append(seconds)
-            gaps.append(swap.energy(field, updated) / swap.energy(field, fresh) - 1.0)
+            gaps.append(energy(field, updated) / energy(field, fresh) - 1.0)
         seconds, labels = timed(solver.drain)
         drain_s.append(seconds)
     figures = {

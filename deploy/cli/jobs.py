@@ -3,10 +3,12 @@
 import argparse
 from pathlib import Path
 
+from prior_sg.deploy.cli.check import before_start
 from prior_sg.deploy.cli.shared import Commands, add_bus, add_settings, console
+from prior_sg.deploy.cli.source_options import add_source_options, read_options, source_settings
 from prior_sg.deploy.edge import names_in
 from prior_sg.deploy.errors import UserError
-from prior_sg.deploy.sample import SAMPLE
+from prior_sg.deploy.sample import COARSE, SAMPLE
 from prior_sg.deploy.settings import DEMO_ENVIRONMENT, DEMO_TASK
 
 
@@ -44,6 +46,7 @@ def add_commands(commands: Commands) -> None:
     run.add_argument("--out", type=Path, default=Path("out/run"), help="folder for the results")
     run.add_argument("--in-process", action="store_true", help="all services in this process, for debugging")
     add_run_options(run)
+    add_source_options(run)
 
 
 def _at_least_one(text: str) -> int:
@@ -74,7 +77,7 @@ def add_run_options(parser: argparse.ArgumentParser) -> None:
 def settings_of(arguments: argparse.Namespace) -> list[str]:
     """Settings that run options stand for, then those given by --set."""
     places = [f"place_graph.places={arguments.places}"] if arguments.places else []
-    return [*places, *_encoder_settings(arguments.encoder), *arguments.set]
+    return [*places, *_encoder_settings(arguments.encoder), *source_settings(arguments), *arguments.set]
 
 
 def _encoder_settings(choice: str) -> list[str]:
@@ -92,6 +95,8 @@ def cmd_demo(arguments: argparse.Namespace) -> int:
     from prior_sg.deploy.truth import truth_of
 
     arguments.source, arguments.environment = str(SAMPLE), DEMO_ENVIRONMENT
+    if SAMPLE == COARSE:
+        console.print("sample: the coarse one of the package; a checkout has the full one, which scores higher")
     if not (arguments.regions or arguments.open) and arguments.task == DEMO_TASK:
         truth = truth_of(arguments.source) or {"regions": []}
         arguments.regions = ",".join(dict.fromkeys(region["label"] for region in truth["regions"]))
@@ -105,11 +110,10 @@ def cmd_run(arguments: argparse.Namespace) -> int:
     """The main job on a source of the user's."""
     from prior_sg.deploy.cli import report
     from prior_sg.deploy.running.job import Job, run
-    from prior_sg.deploy.truth import read_objects, truth_of
 
     if not Path(arguments.source).exists():
         raise UserError(f"{arguments.source} does not exist")
-    truth = truth_of(arguments.source)  # also finds out at once whether the source is of a known layout
+    beside = before_start(arguments.source, read_options(arguments), console).beside
     job = Job(
         source=arguments.source,
         out=arguments.out,
@@ -128,5 +132,5 @@ def cmd_run(arguments: argparse.Namespace) -> int:
         ),
     )
     result = run(job, console)
-    report.write(result, job.out, truth, console, read_objects(Path(arguments.source)))
+    report.write(result, job.out, beside.regions, console, beside.objects)
     return 0

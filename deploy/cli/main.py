@@ -7,7 +7,7 @@ import sys
 import threading
 from typing import TYPE_CHECKING
 
-from prior_sg.deploy.cli import jobs, live, priors, tools
+from prior_sg.deploy.cli import check, jobs, live, packing, priors, tools
 from prior_sg.deploy.cli.shared import Commands, with_example
 from prior_sg.deploy.edge import check_arguments, check_encoding
 from prior_sg.deploy.errors import UserError
@@ -35,7 +35,7 @@ def build_parser() -> argparse.ArgumentParser:
         **with_example("prior-sg demo"),
     )
     commands = Commands(parser, "command", "COMMAND")
-    for module in (jobs, live, tools, priors):
+    for module in (jobs, live, check, packing, tools, priors):
         module.add_commands(commands)
     return parser
 

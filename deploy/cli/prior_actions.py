@@ -25,7 +25,7 @@ from prior_sg.services.prior_gateway.outside.library import environments, load
 from prior_sg.services.prior_gateway.outside.signing import Signer
 from prior_sg.services.registry import BY_NAME
 from prior_sg.services.runtime.bus import LocalBus, Sample
-from prior_sg.services.runtime.client import Client, NoPriorError
+from prior_sg.services.runtime.client import BusClient, NoPriorError
 
 LIBRARY_SIGN = "made by the curated library of this version"
 
@@ -96,7 +96,7 @@ def make(arguments: argparse.Namespace, console: Terminal) -> int:
     gateway = InProcess("cli", Path(), list(arguments.set), arguments.config)
     gateway.start("prior_gateway")
     try:
-        with Client(LocalBus(gateway.hub)) as client, console.status("asking for the prior") as status:
+        with BusClient(LocalBus(gateway.hub)) as client, console.status("asking for the prior") as status:
             while "prior_gateway" not in client.alive(0.05).values():
                 gateway.check()
             prior = client.give_task(task, arguments.timeout, lambda reason: status.update(reason or "asking"))

@@ -13,7 +13,7 @@ from prior_sg.deploy.evaluation.metrics import evaluate
 from prior_sg.deploy.evaluation.object_metrics import NO_DETECTOR, OBJECT_SHARES, object_scores
 from prior_sg.deploy.inspecting.replay import Log, message_differences, undisturbed
 from prior_sg.deploy.running.job import Result
-from prior_sg.deploy.showing.export import map_png, places_png, scene_json, spark_dsg_graph
+from prior_sg.deploy.showing.export import map_png, places_png, scene_json
 from prior_sg.deploy.terminal import Terminal
 from prior_sg.deploy.truth import GroundTruth, TrueObject
 from prior_sg.schemas.codec import decode, encode
@@ -21,7 +21,9 @@ from prior_sg.schemas.places import VoxelMap
 from prior_sg.schemas.scene import Scene, SceneRequest
 from prior_sg.schemas.topics import SCENE
 from prior_sg.services.registry import BY_NAME
+from prior_sg.services.runtime import extras
 from prior_sg.services.runtime.record import attachments
+from prior_sg.services.runtime.runner import Runner
 
 SUFFIXES = {"json": (".json",), "spark-dsg": (".json", ".sparkdsg"), "png": (".png",)}
 MAIN_METRICS = ("f1_s", "f1_g", "miou_s", "miou_g", "miou_s_penalised", "accuracy")
@@ -70,9 +72,15 @@ def write(
     )
     if metrics := compare(result, truth, objects, console):
         (out / "metrics.json").write_text(json.dumps(metrics, indent=1))
-    for kind, name in (("json", "scene.json"), ("spark-dsg", "dsg.json"), ("png", "map.png")):
+    files = {"scene.json": "json", "dsg.json": "spark-dsg", "map.png": "png"}
+    try:
+        extras.require("dsg", "dsg.json")
+    except extras.ExtraMissing as error:
+        console.print(f"without dsg.json: {error}")
+        del files["dsg.json"]
+    for name, kind in files.items():
         export(scene, result.voxels, kind, out / name, truth)
-    names = ", ".join(("scene.json", "dsg.json", "map.png", "map-3d.png", result.log_path.name))
+    names = ", ".join((*files, "map-3d.png", result.log_path.name))
     console.print(f"written to {out}: {names} ({result.seconds:.0f} s)")
 
 
@@ -112,6 +120,8 @@ def _write(scene: Scene, voxels: VoxelMap | None, kind: str, path: Path, truth: 
     if kind == "json":
         path.write_text(json.dumps(scene_json(scene), indent=1))
     elif kind == "spark-dsg":
+        from prior_sg.deploy.showing.dsg import spark_dsg_graph
+
         spark_dsg_graph(scene).save(str(path))
     else:
         map_png(scene, voxels, path, GroundTruth.from_json(truth) if truth else None)
@@ -126,21 +136,9 @@ def picture_of_places(path: Path) -> Path:
 def scene_in(database: Path, robot: str) -> Scene:
     """The scene of one robot in a database file of the store, which may be in use."""
     store = BY_NAME["scene_store"]
-    cfg = store.config(path=str(database))
-    return _scene_of(cfg, robot)
-
-
-def _scene_of(cfg: Any, robot: str) -> Scene:
-    from prior_sg.services.runtime.service import Identity
-
-    store = BY_NAME["scene_store"]
-    state = store.init(cfg, Identity("*", "reader", 0))
-    try:
-        scene = store.answers[SCENE](state, SceneRequest(robot=robot), cfg)
-        assert isinstance(scene, Scene)
+    with Runner(store, store.config(path=str(database))) as runner:
+        scene: Scene = runner.answer(SCENE, SceneRequest(robot=robot))
         return scene
-    finally:
-        store.close(state)
 
 
 def final_scene_difference(log: Log, path: Path) -> str:
@@ -149,11 +147,8 @@ def final_scene_difference(log: Log, path: Path) -> str:
     if saved is None:
         return "the log holds no final scene (it was not written by `run` or `demo`)"
     recorded = decode(Scene, saved)
-    state = undisturbed(log)
-    try:
-        again = log.service.answers[SCENE](state, SceneRequest(robot=recorded.robot), None)
-    finally:
-        log.service.close(state)
+    with undisturbed(log) as store:
+        again: Scene = store.answer(SCENE, SceneRequest(robot=recorded.robot))
     if encode(again) == encode(recorded):
         return ""
     return "final scene: " + "; ".join(message_differences(recorded, again) or ["bytes differ below the tolerance"])

@@ -8,7 +8,7 @@ from prior_sg.deploy.settings import DEFAULT_ROBOT, connect_in_force
 from prior_sg.deploy.terminal import Terminal
 
 if TYPE_CHECKING:
-    from prior_sg.services.runtime.client import Client
+    from prior_sg.services.runtime.client import BusClient
 
 console = Terminal()
 
@@ -49,9 +49,9 @@ def add_settings(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--set", action="append", default=[], metavar="SERVICE.FIELD=VALUE", help="one setting")
 
 
-def open_client(connect: str) -> "Client":
+def open_client(connect: str) -> "BusClient":
     """A client on the bus. Raises BusError."""
-    from prior_sg.services.runtime.client import Client
+    from prior_sg.services.runtime.client import BusClient
     from prior_sg.services.runtime.zenoh_bus import ZenohBus
 
-    return Client(ZenohBus(connect, wait_s=2.0))
+    return BusClient(ZenohBus(connect, wait_s=2.0))

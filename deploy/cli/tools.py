@@ -206,6 +206,8 @@ def cmd_topics(arguments: argparse.Namespace) -> int:
     """Show, check or renew what is generated from the registry."""
     from prior_sg.deploy.inspecting import topics
 
+    if (arguments.write or arguments.check) and not topics.in_checkout():
+        raise UserError("--check and --write are about the documents of a source checkout; run them in one")
     if arguments.write:
         console.print("renewed " + ", ".join(topics.write()))
     elif arguments.check:

@@ -11,23 +11,22 @@ import numpy as np
 
 from prior_sg.deploy.evaluation import oracles, priors
 from prior_sg.deploy.evaluation.kinds import BASELINES, ORACLES, OURS, SWEEPS
-from prior_sg.deploy.evaluation.perception import ROBOT, EvaluationError, Perception
+from prior_sg.deploy.evaluation.perception import EvaluationError, Perception
 from prior_sg.deploy.truth import GroundTruth, TrueObject
-from prior_sg.schemas.codec import Message
-from prior_sg.schemas.features import Pyramid, TextEmbeddings, TextRequest
-from prior_sg.schemas.objects import Detections, ObjectDelta
-from prior_sg.schemas.places import PlaceDelta
+from prior_sg.schemas.features import Pyramid, TextEmbeddings
+from prior_sg.schemas.objects import Detections
 from prior_sg.schemas.priors import Prior, Task
-from prior_sg.schemas.regions import RegionDelta
-from prior_sg.schemas.scene import Scene
+from prior_sg.schemas.scene import Scene, SceneRequest
 from prior_sg.schemas.status import Tick
+from prior_sg.schemas.topics import DETECTIONS, PLACE_DELTA, PRIOR, PYRAMID, SCENE, TASK, TEXT
 from prior_sg.services.registry import BY_NAME
-from prior_sg.services.runtime.service import Ask, Identity
-from prior_sg.services.scene_store.core import graph as store
+from prior_sg.services.runtime.runner import Pipeline, Runner
+from prior_sg.services.runtime.service import Identity
+from prior_sg.services.segmenter.core.aim import region_concepts
+from prior_sg.services.segmenter.core.config import Config
 from prior_sg.services.segmenter.core.experts import REGISTRY
 from prior_sg.services.segmenter.core.inference import see_objects
-from prior_sg.services.segmenter.core.state import Config, State
-from prior_sg.services.segmenter.core.update import region_concepts
+from prior_sg.services.segmenter.core.state import State
 
 NEVER_M, ANY_SCALE = 1e6, 1e9
 
@@ -69,38 +68,39 @@ class Variant:
         """Places, all pyramids and detections, then task and prior; the field is solved when all that is known."""
         prior, perception = self.prior(case), case.perception
         config = msgspec.structs.replace(self.config, space=perception.space)
-        task = Task(robot=ROBOT, stamp_ns=0, environment=prior.environment, task=prior.task, regions=prior.vocabulary)
-        segmenter = Segmenter(config, lambda concepts: self.text(perception.text(concepts)))
-        segmenter.read([perception.places, *self.pyramids(case), *self.detections(case)])
-        self.seen(case, segmenter.state)
-        return segmenter.read([task, prior, Tick(stamp_ns=1), Tick(stamp_ns=2)])
+        robot = perception.places.robot
+        task = Task(robot=robot, stamp_ns=0, environment=prior.environment, task=prior.task, regions=prior.vocabulary)
+        with labelling(config, robot, lambda concepts: self.text(perception.text(concepts))) as pipeline:
+            pipeline.publish(PLACE_DELTA, perception.places)
+            for pyramid in self.pyramids(case):
+                pipeline.publish(PYRAMID, pyramid)
+            for detections in self.detections(case):
+                pipeline.publish(DETECTIONS, detections)
+            segmenter = pipeline.of("segmenter")
+            self.seen(case, segmenter.state)
+            pipeline.publish(TASK, task)
+            pipeline.publish(PRIOR, prior)
+            for stamp_ns in (1, 2):
+                pipeline.feed(segmenter, Tick(stamp_ns=stamp_ns))
+            return scene_of(pipeline, robot)
 
 
-class Segmenter:
-    """The segmenter without a bus, its text questions answered on the spot."""
+def labelling(config: Config, robot: str, text: Callable[[list[list[str]]], TextEmbeddings]) -> Pipeline:
+    """A segmenter and a store in memory; questions for text are answered by a function of the concepts."""
+    segmenter, store = BY_NAME["segmenter"], BY_NAME["scene_store"]
+    identity = Identity(robot, "segmenter", 1)
+    return Pipeline(
+        (
+            Runner(segmenter, config, identity, {TEXT: lambda request: text(request.concepts)}),
+            Runner(store, store.config(path=":memory:")),
+        )
+    )
 
-    def __init__(self, config: Config, text: Callable[[list[list[str]]], TextEmbeddings]) -> None:
-        self.config, self.text = config, text
-        self.state: State = BY_NAME["segmenter"].init(config, Identity(ROBOT, "segmenter", 1))
-        self._graph = store.Graph(ROBOT)
 
-    def read(self, messages: Sequence[Message]) -> Scene:
-        """The scene after these messages."""
-        waiting = list(messages)
-        while waiting:
-            message = waiting.pop(0)
-            if isinstance(message, PlaceDelta):
-                store.apply_places(self._graph, message)
-                store.note_cameras(self._graph, message)
-            for output in list(BY_NAME["segmenter"].step(self.state, message, self.config)):
-                if isinstance(output, Ask):
-                    if isinstance(output.request, TextRequest):
-                        waiting.insert(0, self.text(output.request.concepts))
-                elif isinstance(output[1], ObjectDelta):
-                    store.apply_objects(self._graph, output[1])
-                elif isinstance(output[1], RegionDelta):
-                    store.apply_regions(self._graph, output[1])
-        return store.scene(self._graph)
+def scene_of(pipeline: Pipeline, robot: str) -> Scene:
+    """What the store holds of a robot."""
+    scene: Scene = pipeline.of("scene_store").answer(SCENE, SceneRequest(robot=robot))
+    return scene
 
 
 def ours(config: Config) -> Method:
@@ -206,11 +206,11 @@ def _true_pyramids(case: Case, object_phrases: int) -> list[Pyramid]:
 def _see_truth(case: Case, state: State, object_phrases: int) -> None:
     """Observed places inside a true region are as if its text had been seen there."""
     labels = {region.id: region.label for region in case.truth.regions}
-    concepts, evidence = _concepts(case, object_phrases), state.evidence
-    slots = evidence.of(state.graph.ids.tolist())
-    for slot, region in zip(slots.tolist(), case.truth.region_of(state.graph.positions_m).tolist(), strict=True):
-        if evidence.frames[slot] and labels.get(region) in concepts:
-            evidence.sums[slot] = concepts[labels[region]]
+    concepts, graph = _concepts(case, object_phrases), state.map.graph
+    names = [labels.get(region, "") for region in case.truth.region_of(graph.positions_m).tolist()]
+    rows = [row for row, name in enumerate(names) if name in concepts]
+    if rows:
+        state.seen.pretend(graph.ids[rows], np.array([concepts[names[row]] for row in rows]))
 
 
 def _see_true_objects(case: Case, state: State, config: Config) -> None:

@@ -144,7 +144,7 @@ def _image(title: str, scene: Scene, voxels: VoxelMap, sequence: Dataset, labels
     )
     image = cv2.imdecode(
         np.frombuffer(draw_map(drawn, voxels, [r.polygon_m for r in sequence.truth.regions]), np.uint8),
-        cv2.IMREAD_COLOR,
+        cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION,
     )
     assert image is not None
     scale = PICTURE_WIDTH_PX / image.shape[1]

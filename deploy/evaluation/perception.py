@@ -18,7 +18,7 @@ import msgspec
 from prior_sg.deploy.errors import UserError
 from prior_sg.deploy.settings import Layers
 from prior_sg.deploy.truth import GroundTruth
-from prior_sg.schemas.codec import Message, decode, encode
+from prior_sg.schemas.codec import decode, encode
 from prior_sg.schemas.features import Pyramid, TextEmbeddings, TextRequest
 from prior_sg.schemas.frames import Keyframe
 from prior_sg.schemas.objects import Detections
@@ -28,6 +28,7 @@ from prior_sg.services.feature_pyramid.detectors.load import is_prompted
 from prior_sg.services.ingest.sources import Source, open_source
 from prior_sg.services.registry import BY_NAME
 from prior_sg.services.runtime.config import resolve
+from prior_sg.services.runtime.runner import Runner
 from prior_sg.services.runtime.service import Identity
 
 ROBOT = "eval"
@@ -135,35 +136,29 @@ class Perceiver:
         return resolve(BY_NAME[name].config, name, layers)
 
     def _places(self, source: Source) -> list[bytes]:
-        service, cfg = BY_NAME["place_graph"], self._config("place_graph")
-        state = service.init(cfg, Identity(ROBOT, "place_graph", 1))
+        runner = self._runner("place_graph", self._config("place_graph"))
         for keyframe in self._keyframes(source, "places"):
-            for _ in service.step(state, keyframe, cfg):
-                pass
-        replies: list[Message] = [
-            service.answers[PLACE_SNAPSHOT](state, SnapshotRequest(robot=ROBOT), cfg),
-            service.answers[VOXEL_MAP](state, MapRequest(robot=ROBOT), cfg),
-        ]
-        return [encode(reply) for reply in replies]
+            runner.feed(keyframe)
+        requests = ((PLACE_SNAPSHOT, SnapshotRequest(robot=ROBOT)), (VOXEL_MAP, MapRequest(robot=ROBOT)))
+        return [encode(runner.answer(query, request)) for query, request in requests]
 
     def _features(self, source: Source, cfg: Any) -> list[bytes]:
         """Pyramid and detections of each keyframe in turn."""
-        worker, step = self._worker(cfg), BY_NAME["feature_pyramid"].step
+        worker = self._worker(cfg)
         made: list[bytes] = []
         for frame in self._keyframes(source, "features"):
-            messages = {output[0].name: output[1] for output in step(worker, frame, cfg) if isinstance(output, tuple)}
-            made += [encode(messages[PYRAMID.name]), encode(messages[DETECTIONS.name])]
+            messages = dict(worker.feed(frame))
+            made += [encode(messages[PYRAMID]), encode(messages[DETECTIONS])]
         return made
 
     def _keyframes(self, source: Source, what: str) -> Iterator[Keyframe]:
         """The keyframes that ingest selects, each with a report of how far the source is."""
-        service, cfg = BY_NAME["ingest"], self._config("ingest")
-        state = service.init(cfg, Identity(ROBOT, "ingest", 1))
+        runner = self._runner("ingest", self._config("ingest"))
         for index, frame in enumerate(source):
             self.report(f"{sequence_name(source.path)}: {what}", index, source.total)
-            for output in service.step(state, frame, cfg):
-                if isinstance(output, tuple) and output[0] is KEYFRAME and isinstance(output[1], Keyframe):
-                    yield output[1]
+            for topic, message in runner.feed(frame):
+                if topic is KEYFRAME and isinstance(message, Keyframe):
+                    yield message
         self.report(f"{sequence_name(source.path)}: {what}", source.total, source.total)
 
     def _text(self, concepts: Sequence[Sequence[str]], cfg: Any) -> TextEmbeddings:
@@ -171,18 +166,21 @@ class Perceiver:
         key = {"request": request, "code": self._code["feature_pyramid"]}
         content = self.cache.get("text", key)
         if content is None:
-            content = [encode(BY_NAME["feature_pyramid"].answers[TEXT](self._worker(cfg), request, cfg))]
+            content = [encode(self._worker(cfg).answer(TEXT, request))]
             self.cache.put("text", key, content)
         return decode(TextEmbeddings, content[0])
 
-    def _worker(self, cfg: Any) -> Any:
-        """The encoder of these settings; weights are loaded when something is not on disk yet."""
+    def _worker(self, cfg: Any) -> Runner:
+        """A worker with these settings; its weights, which settings share, are loaded when something is not on disk."""
         detector = (cfg.detector, cfg.detector_masks, cfg.detector_threshold, cfg.segments)
         key = (cfg.space, cfg.runtime, cfg.device, cfg.threads, cfg.batch_size, *detector)
         if key not in self._workers:
             self.report(f"loading {cfg.space}", 0, 0)
-            self._workers[key] = BY_NAME["feature_pyramid"].init(cfg, Identity(ROBOT, "worker", 1))
-        return self._workers[key]
+            self._workers[key] = self._runner("feature_pyramid", cfg).state
+        return self._runner("feature_pyramid", cfg, self._workers[key])
+
+    def _runner(self, name: str, cfg: Any, state: Any = None) -> Runner:
+        return Runner(BY_NAME[name], cfg, Identity(ROBOT, name, 1), state=state)
 
 
 def sequence_name(path: Path) -> str:

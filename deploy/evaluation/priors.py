@@ -12,7 +12,7 @@ from prior_sg.schemas.places import PlaceDelta
 from prior_sg.schemas.priors import Prior, PriorList, PriorRequest, RegionPrior
 from prior_sg.schemas.topics import PRIORS
 from prior_sg.services.registry import BY_NAME
-from prior_sg.services.runtime.service import Identity
+from prior_sg.services.runtime.runner import Runner
 
 LEAST, MOST = 1e-3, 1 - 1e-3  # probabilities stay inside, so that their logits exist
 PSEUDO_COUNT = 0.1  # of pairs of regions that touch, and of those that do not
@@ -20,11 +20,8 @@ PSEUDO_COUNT = 0.1  # of pairs of regions that touch, and of those that do not
 
 def library_prior(environment: str, task: str, names: Sequence[str]) -> Prior:
     """The gateway's prior for a fixed vocabulary. Raises EvaluationError."""
-    service = BY_NAME["prior_gateway"]
-    cfg = service.config()
-    state = service.init(cfg, Identity("*", "prior_gateway", 1))
-    reply = service.answers[PRIORS](state, PriorRequest(environment=environment, task=task, regions=list(names)), cfg)
-    assert isinstance(reply, PriorList)
+    request = PriorRequest(environment=environment, task=task, regions=list(names))
+    reply: PriorList = Runner(BY_NAME["prior_gateway"]).answer(PRIORS, request)
     if not reply.priors:
         raise EvaluationError(f"no prior for the environment {environment!r}: {reply.reason}")
     return reply.priors[0]

@@ -11,7 +11,6 @@ from prior_sg.deploy.inspecting import replay
 from prior_sg.deploy.terminal import Terminal
 from prior_sg.schemas.regions import PosteriorReply, PosteriorRequest
 from prior_sg.schemas.topics import POSTERIOR
-from prior_sg.services.registry import BY_NAME
 from prior_sg.services.runtime.record import LogError
 
 ROWS = 6  # labels shown, the most probable first
@@ -19,15 +18,14 @@ ROWS = 6  # labels shown, the most probable first
 
 def from_log(path: Path, robot: str, place_id: int) -> PosteriorReply:
     """The answer of the log's last segmenter of this robot, at the end of the log. Raises LogError."""
-    log, service = replay.open_log(path, "segmenter"), BY_NAME["segmenter"]
+    log = replay.open_log(path, "segmenter")
     lives = [life for life in log.lives if life.started.robot == robot]
     if not lives:
         robots = sorted({life.started.robot for life in log.lives})
         raise LogError(f"{path} holds no segmenter of {robot}; name one of {', '.join(robots)} with --robot")
-    state, cfg = replay.final_state(log, lives[-1])
-    reply = service.answers[POSTERIOR](state, PosteriorRequest(robot=robot, place_id=place_id), cfg)
-    assert isinstance(reply, PosteriorReply)
-    return reply
+    with replay.final(log, lives[-1]) as segmenter:
+        reply: PosteriorReply = segmenter.answer(POSTERIOR, PosteriorRequest(robot=robot, place_id=place_id))
+        return reply
 
 
 def show(reply: PosteriorReply, console: Terminal) -> None:

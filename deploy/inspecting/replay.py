@@ -1,6 +1,5 @@
 """Feeds a recorded log to one service again, in the order it consumed its inputs, and compares what comes out."""
 
-import contextlib
 import logging
 import math
 from collections.abc import Iterator
@@ -11,7 +10,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from prior_sg.schemas.codec import DecodeError, Message, copied, decode, encode
+from prior_sg.schemas.codec import DecodeError, Message, decode, encode
 from prior_sg.schemas.frames import Keyframe
 from prior_sg.schemas.migrations import journalled
 from prior_sg.schemas.status import Consumed, Started, Tick
@@ -20,7 +19,8 @@ from prior_sg.services.refusals import InputRefused
 from prior_sg.services.registry import BY_NAME
 from prior_sg.services.runtime import config
 from prior_sg.services.runtime.record import LogError, Logged, read_log
-from prior_sg.services.runtime.service import Ask, Identity, Output, Service
+from prior_sg.services.runtime.runner import Runner
+from prior_sg.services.runtime.service import Identity, Service
 
 logger = logging.getLogger(__name__)
 TOPIC_BY_NAME = {topic.name: topic for topic in TOPICS}
@@ -135,33 +135,31 @@ def recorded_config(log: Log, life: Life) -> Any:
 
 def replay_life(log: Log, life: Life) -> Iterator[tuple[Topic, Message]]:
     """The outputs of one life, made again from its recorded inputs and config."""
-    service = log.service
-    cfg = recorded_config(log, life)
-    state = service.init(cfg, Identity(life.started.robot, life.instance, life.started.epoch))
-    try:
+    with revived(log, life) as runner:
         for entry in life.inputs:
-            for output in _step(service, state, log.input(entry), cfg):
-                if not isinstance(output, Ask):
-                    yield output[0], copied(output[1])
-    finally:
-        service.close(state)
+            yield from _fed(runner, log.input(entry))
 
 
-def final_state(log: Log, life: Life) -> tuple[Any, Any]:
-    """State and config of one life after its recorded inputs; the caller closes the state."""
-    service = log.service
-    cfg = recorded_config(log, life)
-    state = service.init(cfg, Identity(life.started.robot, life.instance, life.started.epoch))
+def revived(log: Log, life: Life) -> Runner:
+    """The service as it was when this life began; the caller closes it. Replies come from the log, as inputs."""
+    identity = Identity(life.started.robot, life.instance, life.started.epoch)
+    return Runner(log.service, recorded_config(log, life), identity, wire=True)
+
+
+def final(log: Log, life: Life) -> Runner:
+    """The service after the recorded inputs of one life; the caller closes it."""
+    runner = revived(log, life)
     for entry in life.inputs:
-        for _ in _step(service, state, log.input(entry), cfg):
-            pass
-    return state, cfg
+        _fed(runner, log.input(entry))
+    return runner
 
 
-def _step(service: Service, state: Any, message: Message, cfg: Any) -> Iterator[Output]:
+def _fed(runner: Runner, message: Message) -> list[tuple[Topic, Message]]:
     """As a host steps: an input that was refused changed nothing."""
-    with contextlib.suppress(InputRefused):
-        yield from service.step(state, message, cfg)
+    try:
+        return list(runner.feed(message))
+    except InputRefused:
+        return []
 
 
 def compare(log: Log, life: Life) -> Comparison:
@@ -226,19 +224,17 @@ def _differences(path: str, before: Any, after: Any, tolerance: float) -> Iterat
         yield f"{path}: {before!r} became {after!r}"
 
 
-def undisturbed(log: Log) -> Any:
-    """A fresh state of the service that has read everything recorded on its topics, in the order of the log.
+def undisturbed(log: Log) -> Runner:
+    """A fresh service that has read everything recorded on its topics, in the order of the log.
 
     The caller closes it. What a service that was never interrupted would hold.
     """
     service = log.service
-    cfg = service.replay_config(service.config())
-    state = service.init(cfg, Identity("*", "undisturbed", 0))
+    runner = Runner(service, service.replay_config(service.config()), Identity("*", "undisturbed", 0))
     for logged in log.order:
         if logged.topic in service.reads:
-            for _ in service.step(state, decode(logged.topic.type, logged.payload), cfg):
-                pass
-    return state
+            runner.feed(decode(logged.topic.type, logged.payload))
+    return runner
 
 
 def open_log(path: Path, service: str) -> Log:

@@ -102,6 +102,11 @@ def replace_generated(text: str, document: str) -> str:
     return text[: text.index(BEGIN)] + generated(document) + text[text.index(END) + len(END) :]
 
 
+def in_checkout() -> bool:
+    """Whether the documents are there, which no installed package has."""
+    return all((ROOT / file).exists() for file in (*DOCUMENTS, COMPOSE))
+
+
 def write() -> list[str]:
     """Renew every generated part; returns the files."""
     for document in DOCUMENTS:

@@ -29,7 +29,7 @@ from prior_sg.schemas.scene import Scene, SceneRequest
 from prior_sg.schemas.topics import INGEST_STATE, KEYFRAME, PLACE_DELTA, PYRAMID, REGION_DELTA, SCENE, VOXEL_MAP
 from prior_sg.services.registry import SERVICES
 from prior_sg.services.runtime.bus import Bus, LocalBus, Sample
-from prior_sg.services.runtime.client import Client, NoPriorError
+from prior_sg.services.runtime.client import BusClient, NoPriorError
 from prior_sg.services.runtime.zenoh_bus import ZenohBus, free_endpoint, open_router
 
 QUIET_S = 1.5
@@ -150,7 +150,7 @@ def run(job: Job, console: Terminal) -> Result:
 
 def _run_on(bus: Bus, supervisor: "Supervisor | InProcess", job: Job, console: Terminal) -> Result:
     started_s = time.monotonic()
-    with Client(bus) as client:
+    with BusClient(bus) as client:
         recorder = Recorder(client, job.out / "log.mcap")
         try:
             return Run(job, console, client, recorder, supervisor).stream(started_s)
@@ -166,7 +166,7 @@ class Run:
         self,
         job: Job,
         console: Terminal,
-        client: Client,
+        client: BusClient,
         recorder: Recorder,
         supervisor: "Supervisor | InProcess",
     ) -> None:

@@ -13,7 +13,7 @@ from prior_sg.schemas.status import Consumed
 from prior_sg.schemas.topics import TOPICS, Topic
 from prior_sg.services.registry import SERVICES
 from prior_sg.services.runtime.bus import Sample
-from prior_sg.services.runtime.client import Client
+from prior_sg.services.runtime.client import BusClient
 from prior_sg.services.runtime.record import LogError, LogWriter
 
 FLUSH_S = 1.0
@@ -25,7 +25,7 @@ Tap = Callable[[Sample, Message], None]
 class Recorder:
     """Subscribes at once; writes on its own thread until `close`. `taps` see every valid message on that thread."""
 
-    def __init__(self, client: Client, path: Path) -> None:
+    def __init__(self, client: BusClient, path: Path) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         self._log = LogWriter(path)
         self.taps: list[Tap] = []

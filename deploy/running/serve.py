@@ -9,8 +9,9 @@ import signal
 import sys
 import time
 import uuid
-from collections.abc import Iterator
+from pathlib import Path
 
+from prior_sg import services
 from prior_sg.deploy.edge import check_arguments
 from prior_sg.deploy.errors import UserError
 from prior_sg.deploy.settings import DEFAULT_ROBOT, connect_in_force, resolved_config
@@ -30,21 +31,15 @@ HOPELESS = (ConfigError, BusError, ServiceError, LogError)  # their messages say
 EXIT_HOPELESS = 2  # starting again would fail again
 
 
-class ServiceNames:
-    """The names of all services, looked up when somebody asks: services need packages that clients do without."""
-
-    def __iter__(self) -> Iterator[str]:
-        from prior_sg.services.registry import BY_NAME
-
-        return iter(sorted(BY_NAME))
-
-    def __contains__(self, name: object) -> bool:
-        return name in list(self)
+def service_names() -> list[str]:
+    """All services, by their folders: importing them takes packages that a mere client does without."""
+    files = Path(services.__file__).parent.glob("*/service.py")
+    return sorted(file.parent.name for file in files if file.parent.name != "runtime")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """What a service process can be told."""
-    parser.add_argument("service", choices=ServiceNames(), help="which service to run")
+    parser.add_argument("service", choices=service_names(), help="which service to run")
     parser.add_argument("--robot", default=DEFAULT_ROBOT, help="name of the robot whose streams it serves")
     parser.add_argument("--connect", default=connect_in_force(), help="Zenoh router")
     parser.add_argument("--instance", default="", help="name of this process; default: a random one")

@@ -45,6 +45,7 @@ class Child:
         """Start the process; its log is appended to."""
         command = [
             sys.executable,
+            "-P",  # nothing in the working directory is taken for a module of ours
             "-m",
             "prior_sg.deploy.running.serve",
             self.service,

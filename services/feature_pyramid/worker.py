@@ -1,5 +1,6 @@
 """What a worker holds, and how a keyframe passes through it: read on a thread of its own, then encoded in batches."""
 
+import logging
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -10,15 +11,16 @@ from prior_sg.schemas.codec import Message
 from prior_sg.schemas.features import Pyramid
 from prior_sg.schemas.frames import Keyframe
 from prior_sg.schemas.objects import Detections
-from prior_sg.services import intent
+from prior_sg.services import images, intent
 from prior_sg.services.feature_pyramid.core.config import Config
 from prior_sg.services.feature_pyramid.core.crops import Selection, coarse_surface, select_crops
 from prior_sg.services.feature_pyramid.core.lift import lift, object_crops
 from prior_sg.services.feature_pyramid.core.upright import quarter_turns, turned
-from prior_sg.services.feature_pyramid.decode import BrokenImage, blank, read_color, read_depth
 from prior_sg.services.feature_pyramid.detectors.base import Detector, Found, Shot
 from prior_sg.services.feature_pyramid.encoders.base import Encoder
-from prior_sg.services.intent import Vocabulary
+from prior_sg.services.intent import Intent
+
+log = logging.getLogger(__name__)
 
 
 class View(NamedTuple):
@@ -30,7 +32,7 @@ class View(NamedTuple):
     points_camera_m: list[np.ndarray]  # of each object, (point, 3)
     crops: list[np.ndarray]  # RGB, uint8 (side, side, 3), upright: those selected, then one of each object
     surface_m: np.ndarray
-    broken: bool
+    fault: str  # why its images cannot be used; empty = they can
 
 
 @dataclass
@@ -40,7 +42,7 @@ class Worker:
     instance: str
     encoder: Encoder
     detector: Detector
-    vocabulary: Vocabulary = field(default_factory=Vocabulary)
+    vocabulary: Intent = field(default_factory=Intent)
     broken: int = 0
     reader: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(1, thread_name_prefix="reader"))
     views: dict[tuple[str, int], Future[View]] = field(default_factory=dict)  # by robot and frame
@@ -63,7 +65,9 @@ def look_at(state: Worker, frame: Keyframe, cfg: Config) -> tuple[View, np.ndarr
     if seen is None or seen.sought != sought:  # made ready before the prior changed
         state.encoded.pop(key, None)
         seen = view(frame, state.detector, sought, cfg)
-    state.broken += seen.broken
+    if seen.fault:
+        state.broken += 1
+        log.warning("keyframe not encoded", extra={"frame": frame.frame_id, "reason": seen.fault})
     return seen, state.encoded.pop(key) if key in state.encoded else encode(state, seen)
 
 
@@ -77,17 +81,16 @@ def sought_by(state: Worker, robot: str, cfg: Config) -> tuple[str, ...]:
 def view(frame: Keyframe, detector: Detector, sought: tuple[str, ...], cfg: Config) -> View:
     """Decode a keyframe, select its crops by depth, and detect; neither crops nor objects when an image is broken."""
     try:
-        color, depth_m, broken = read_color(frame), read_depth(frame), False
-    except BrokenImage:
-        color, depth_m = blank(frame)
-        broken = True
+        color, depth_m, fault = images.color_of(frame), images.depth_of(frame, cfg.max_principal_offset), ""
+    except images.ImageFault as found_fault:
+        (color, depth_m), fault = images.blank_of(frame), str(found_fault)
     camera = frame.intrinsics
     selection = select_crops(depth_m, camera, cfg)
-    found = [] if broken else detector.detect(Shot(color, depth_m, camera, frame.world_from_camera), sought)
+    found = [] if fault else detector.detect(Shot(color, depth_m, camera, frame.world_from_camera), sought)
     found, points_camera_m = lift(found, depth_m, camera, cfg)
     cut = selection.crops.cut(color) + object_crops(found, camera.width_px, camera.height_px).cut(color)
     crops = [turned(crop, quarter_turns(frame.world_from_camera)) for crop in cut]
-    return View(selection, sought, found, points_camera_m, crops, coarse_surface(depth_m, cfg.surface_cell_px), broken)
+    return View(selection, sought, found, points_camera_m, crops, coarse_surface(depth_m, cfg.surface_cell_px), fault)
 
 
 def encode(state: Worker, seen: View) -> np.ndarray:

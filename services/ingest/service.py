@@ -11,6 +11,7 @@ from prior_sg.schemas.frames import PoseUpdate
 from prior_sg.schemas.status import JobDone, Tick
 from prior_sg.schemas.topics import ARCHIVE, BACKFILL, CAMERA_STATE, ENCODE, INGEST_STATE, KEYFRAME, POSE_UPDATE
 from prior_sg.services.ingest.core import selection
+from prior_sg.services.ingest.core.config import Config
 from prior_sg.services.ingest.sources import Source, SourceError, open_source
 from prior_sg.services.runtime.service import Identity, Output, Service
 
@@ -30,12 +31,12 @@ class Port(Protocol):
         """Return when fewer than `window` keyframes are under way at every reader."""
 
 
-def init(cfg: selection.Config, identity: Identity) -> selection.State:
+def init(cfg: Config, identity: Identity) -> selection.State:
     """An empty state."""
     return selection.State(robot=identity.robot, epoch=identity.epoch)
 
 
-def step(state: selection.State, message: Message, cfg: selection.Config) -> Iterator[Output]:
+def step(state: selection.State, message: Message, cfg: Config) -> Iterator[Output]:
     """Take one frame, one finished job, corrected poses, or the end of the source."""
     match message:
         case selection.RawFrame():
@@ -62,13 +63,15 @@ def step(state: selection.State, message: Message, cfg: selection.Config) -> Ite
             yield selection.progress(state)
 
 
-async def drive(port: Port, cfg: selection.Config) -> None:
+async def drive(port: Port, cfg: Config) -> None:
     """Feed the source's frames, paced by their stamps, by the pipeline's room, or by both. Raises SourceError."""
     if not cfg.source:
         log.info("no source is configured: set ingest.source to a dataset folder or an MCAP log")
         return
     source = await asyncio.to_thread(_open, cfg)
     log.info("reading", extra={"source": cfg.source, "layout": source.layout, "frames": source.total})
+    for note in source.notes:
+        log.info("source", extra={"note": note})
     events = source.events()
     pace = Pace(cfg.speed)
     while (event := await asyncio.to_thread(next, events, None)) is not None:
@@ -99,8 +102,8 @@ class Pace:
         await asyncio.sleep(max(0.0, due_s - now_s))
 
 
-def _open(cfg: selection.Config) -> Source:
-    source = open_source(cfg.source, world_up=cfg.world_up, floor_m=cfg.floor_m, robot=cfg.source_robot)
+def _open(cfg: Config) -> Source:
+    source = open_source(cfg.source, options=cfg)
     if source.total == 0:
         raise SourceError(f"{cfg.source} holds no frames")
     return source
@@ -124,7 +127,7 @@ SERVICE = Service(
     name="ingest",
     purpose="reads a posed RGB-D source and selects keyframes",
     scope="robot",
-    config=selection.Config,
+    config=Config,
     init=init,
     step=step,
     reads=(POSE_UPDATE, BACKFILL),

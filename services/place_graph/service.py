@@ -7,18 +7,20 @@ from prior_sg.schemas.codec import Message
 from prior_sg.schemas.frames import ArchiveReply, ArchiveRequest, Keyframe, PoseUpdate
 from prior_sg.schemas.places import MapRequest, PlaceDelta, SnapshotRequest, VoxelMap
 from prior_sg.schemas.topics import ARCHIVE, KEYFRAME, PLACE_DELTA, PLACE_SNAPSHOT, POSE_UPDATE, VOXEL_MAP
-from prior_sg.services.place_graph.core import update
+from prior_sg.services.place_graph.core import publishing, update
+from prior_sg.services.place_graph.core.config import Config
+from prior_sg.services.place_graph.core.state import State, empty
 from prior_sg.services.runtime.service import Ask, Identity, Output, Service
 
 log = logging.getLogger(__name__)
 
 
-def init(cfg: update.Config, identity: Identity) -> update.State:
+def init(cfg: Config, identity: Identity) -> State:
     """An empty map."""
-    return update.empty(identity.robot, identity.epoch, cfg)
+    return empty(identity.robot, identity.epoch, cfg)
 
 
-def step(state: update.State, message: Message, cfg: update.Config) -> Iterator[Output]:
+def step(state: State, message: Message, cfg: Config) -> Iterator[Output]:
     """One keyframe gives one delta, with or without changes; a repeated keyframe gives nothing. A process that joins in
     mid-stream fetches what it has missed from the archive, page by page."""
     match message:
@@ -40,7 +42,7 @@ def _ask_archive(robot: str, first_frame_id: int, end_frame_id: int) -> Ask:
     return Ask(ARCHIVE, ArchiveRequest(robot=robot, first_frame_id=first_frame_id, end_frame_id=end_frame_id))
 
 
-def _map(state: update.State, keyframe: Keyframe, cfg: update.Config) -> Iterator[Output]:
+def _map(state: State, keyframe: Keyframe, cfg: Config) -> Iterator[Output]:
     if keyframe.frame_id not in state.seen:
         yield from _told(update.integrate(state, keyframe, cfg))
 
@@ -53,19 +55,19 @@ def _told(delta: PlaceDelta | None) -> Iterator[Output]:
         yield PLACE_DELTA, delta
 
 
-def _snapshot(state: update.State, request: SnapshotRequest, cfg: update.Config) -> PlaceDelta:
-    return update.snapshot(state, cfg)
+def _snapshot(state: State, request: SnapshotRequest, cfg: Config) -> PlaceDelta:
+    return publishing.snapshot(state, cfg)
 
 
-def _voxel_map(state: update.State, request: MapRequest, cfg: update.Config) -> VoxelMap:
-    return update.voxel_map(state, cfg)
+def _voxel_map(state: State, request: MapRequest, cfg: Config) -> VoxelMap:
+    return publishing.voxel_map(state, cfg)
 
 
 SERVICE = Service(
     "place_graph",
     purpose=__doc__ or "",
     scope="robot",
-    config=update.Config,
+    config=Config,
     init=init,
     step=step,
     reads=(KEYFRAME, POSE_UPDATE),

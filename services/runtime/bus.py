@@ -13,12 +13,13 @@ from fnmatch import fnmatchcase
 from typing import Protocol
 
 from prior_sg.schemas.topics import Topic
+from prior_sg.services.errors import PriorSgError
 
 HEADER = struct.Struct("<Qq")
 WRITER = re.compile(r"[\w.:-]+(/[\w.:-]+)*")
 
 
-class BusError(Exception):
+class BusError(PriorSgError):
     """The bus cannot do what was asked; the message says what to do."""
 
 
@@ -132,7 +133,7 @@ class Hub:
     """What the local buses of one process share."""
 
     lock: threading.RLock = field(default_factory=threading.RLock)
-    ids: itertools.count = field(default_factory=itertools.count)
+    ids: "itertools.count[int]" = field(default_factory=itertools.count)
     subscribers: list[tuple[int, Topic, str, OnSample]] = field(default_factory=list)
     history: dict[str, list[Sample]] = field(default_factory=dict)
     servers: dict[str, tuple[int, OnRequest]] = field(default_factory=dict)

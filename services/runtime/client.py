@@ -12,6 +12,7 @@ from prior_sg.schemas.codec import DecodeError, Message, decode, encode
 from prior_sg.schemas.priors import Prior, PriorRequest, Task
 from prior_sg.schemas.status import ServiceStatus, StatusRequest
 from prior_sg.schemas.topics import PRIOR, PRIORS, TASK, Query, Topic, alive_key, status_key
+from prior_sg.services.errors import PriorSgError
 from prior_sg.services.runtime.bus import Answer, Bus, BusError, Sample, pack_header
 
 R = TypeVar("R", bound=Message)
@@ -19,11 +20,11 @@ POLL_S = 0.5
 PATIENT_POLLS = 4
 
 
-class NoPriorError(Exception):
+class NoPriorError(PriorSgError):
     """The task has no prior; the message is the gateway's reason."""
 
 
-class Client:
+class BusClient:
     """Use as a context manager; leaves the bus at the end."""
 
     def __init__(self, bus: Bus) -> None:
@@ -33,7 +34,7 @@ class Client:
         self._alive: dict[str, str] = {}
         self._watching = False
 
-    def __enter__(self) -> "Client":
+    def __enter__(self) -> "BusClient":
         return self
 
     def __exit__(

@@ -8,11 +8,13 @@ from typing import Any, Literal, TypeVar, Union, get_args, get_origin
 
 import msgspec
 
+from prior_sg.services.errors import PriorSgError
+
 ENVIRONMENT_PREFIX = "PSG_"
 C = TypeVar("C", bound=msgspec.Struct)
 
 
-class ConfigError(Exception):
+class ConfigError(PriorSgError):
     """A setting is wrong; the message names it and says what is allowed."""
 
 

@@ -17,12 +17,11 @@ MODULES = {  # by extra; what the build file lists there, by the names that code
         "onnx",
         "onnxruntime",
     ),
-    "objects": ("torchvision",),
     "clip": ("open_clip",),
     "dsg": ("spark_dsg",),
     "fast-cut": ("maxflow",),
 }
-CONTAINS = {"encode": ("map",), "objects": ("encode", "map"), "clip": ("encode", "map")}
+CONTAINS = {"encode": ("map",), "clip": ("encode", "map")}
 
 
 class ExtraMissing(ServiceError):

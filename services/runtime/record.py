@@ -35,6 +35,7 @@ from mcap.writer import MCAP0_MAGIC, Writer
 from prior_sg.schemas.codec import DecodeError, schema_name
 from prior_sg.schemas.migrations import current
 from prior_sg.schemas.topics import TOPICS, Topic
+from prior_sg.services.errors import PriorSgError
 
 CHUNK_BYTES = 1 << 20
 FLUSH_NS = 1_000_000_000  # of received time: what a killed process can lose
@@ -44,7 +45,7 @@ DAMAGE = (McapError, ValueError, struct.error, zstandard.ZstdError, RuntimeError
 logger = logging.getLogger(__name__)
 
 
-class LogError(RuntimeError):
+class LogError(PriorSgError):
     """A log cannot be written or read; the text is one sentence for the user."""
 
 
@@ -120,14 +121,14 @@ class LogWriter:
     def flush(self) -> None:
         """Hand all messages so far to the operating system: they survive the end of this process."""
         with self._disk_errors():
-            self._writer.flush()
+            self._writer.flush()  # type: ignore[no-untyped-call]
             self._end = self._file.tell()
 
     def close(self) -> None:
         """Write the index and close the file; closing twice does nothing."""
         if not self._file.closed:
             with self._disk_errors(), self._file:
-                self._writer.finish()
+                self._writer.finish()  # type: ignore[no-untyped-call]
 
     def __enter__(self) -> "LogWriter":
         return self

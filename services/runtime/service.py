@@ -8,13 +8,18 @@ import msgspec
 
 from prior_sg.schemas.codec import Message
 from prior_sg.schemas.topics import Query, Topic
+from prior_sg.services.errors import PriorSgError
 
 State = TypeVar("State")
 Config = TypeVar("Config", bound=msgspec.Struct)
 
 
-class ServiceError(RuntimeError):
+class ServiceError(PriorSgError):
     """A service cannot run as it is configured; the message is one sentence that says what to do."""
+
+
+class UndeclaredError(Exception):
+    """A service wrote or asked what its declaration does not name: a fault in the service."""
 
 
 @dataclass(frozen=True)
@@ -83,3 +88,18 @@ class Service(Generic[State, Config]):
     close: Callable[[State], None] = lambda state: None
     replay_tolerance: float = 1e-6  # by which floats of a replay may differ; networks differ with threads and machine
     replay_config: Callable[[Config], Config] = lambda cfg: cfg  # for a replay, which touches nothing outside
+
+    def check_write(self, topic: Topic) -> None:
+        """Raise UndeclaredError unless the service declares this topic."""
+        if topic not in self.writes:
+            raise UndeclaredError(f"{self.name} wrote {topic.name}, which it does not declare")
+
+    def check_ask(self, ask: Ask) -> None:
+        """Raise UndeclaredError unless the service declares this question or errand."""
+        if ask.query not in (*self.asks, *self.errands):
+            raise UndeclaredError(f"{self.name} asked {ask.query.name}, which it does not declare")
+
+    def answer_key(self, query: Query, robot: str, cfg: Config) -> str:
+        """The key expression on which a process of this service answers a question."""
+        fields = {name: robot if name == "robot" else "*" for name in query.request.__struct_fields__}
+        return query.key.format(**(fields | self.key_fields(cfg)))

@@ -24,10 +24,12 @@ from prior_sg.services.scene_store.core import graph as core
 
 log = logging.getLogger(__name__)
 APPLICATION_ID = 0x70736753  # "psgS", in the header of the file
-LAYOUT_VERSION = 4
+LAYOUT_VERSION = 5
 
 LAYOUT = """
 CREATE TABLE robots (id INTEGER PRIMARY KEY, name TEXT NOT NULL UNIQUE);
+CREATE TABLE origins (
+    robot INTEGER PRIMARY KEY REFERENCES robots, x_m REAL NOT NULL, y_m REAL NOT NULL, z_m REAL NOT NULL);
 CREATE TABLE cursors (
     robot INTEGER NOT NULL REFERENCES robots, topic TEXT NOT NULL,
     epoch INTEGER NOT NULL, revision INTEGER NOT NULL, stamp_ns INTEGER NOT NULL,
@@ -86,6 +88,9 @@ UPGRADES = {  # statements that bring a file of the version before to this one
     robot INTEGER NOT NULL REFERENCES robots, id INTEGER NOT NULL, label TEXT NOT NULL,
     x_m REAL NOT NULL, y_m REAL NOT NULL, z_m REAL NOT NULL, message BLOB NOT NULL,
     PRIMARY KEY (robot, id)) WITHOUT ROWID;
+""",
+    5: """CREATE TABLE IF NOT EXISTS origins (
+    robot INTEGER PRIMARY KEY REFERENCES robots, x_m REAL NOT NULL, y_m REAL NOT NULL, z_m REAL NOT NULL);
 """,
 }
 
@@ -173,6 +178,8 @@ class Database:
             "frame_id, epoch, revision, x_m, y_m, z_m FROM cameras", robot
         ):
             graph.sightings[frame] = core.Sighting(epoch, revision, tuple(xyz))
+        for origin_m in self._select("x_m, y_m, z_m FROM origins", robot):
+            graph.origin_m = origin_m
         self._load_regions(graph, robot)
         for number, message in self._select("id, message FROM objects", robot):
             graph.objects[number] = msgspec.msgpack.decode(message, type=SceneObject)
@@ -243,6 +250,7 @@ class Database:
             self._put_details(robot, graph, changes)
             edges = sorted(changes.edges & graph.edges.keys())
             self._put("edges", ((robot, *edge, graph.edges[edge]) for edge in edges))
+            self._put("origins", [(robot, *graph.origin_m)])
             self._put_cameras(robot, cameras)
             self._put_cursor(robot, "place", graph.place_cursor, graph)
 

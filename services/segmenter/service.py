@@ -1,5 +1,6 @@
 """Reads places, pyramids, detections, corrected poses, tasks and priors; writes regions, beliefs and objects."""
 
+import logging
 from collections.abc import Iterator
 
 from prior_sg.schemas.codec import Message
@@ -28,10 +29,13 @@ from prior_sg.schemas.topics import (
     TEXT,
     topic_of,
 )
-from prior_sg.services.runtime.service import Ask, Identity, Output, Service
+from prior_sg.services.runtime.service import Ask, Identity, Output, Service, ServiceError
 from prior_sg.services.segmenter.core import report, update
-from prior_sg.services.segmenter.core.state import Config, State, empty
+from prior_sg.services.segmenter.core.config import Config
+from prior_sg.services.segmenter.core.energy.maxflow import NoSuchLibrary, min_cut_in_use
+from prior_sg.services.segmenter.core.state import State, empty
 
+log = logging.getLogger(__name__)
 QUESTIONS = {
     SnapshotRequest: PLACE_SNAPSHOT,
     TextRequest: TEXT,
@@ -41,7 +45,11 @@ QUESTIONS = {
 
 
 def init(cfg: Config, identity: Identity) -> State:
-    """Nothing is known yet."""
+    """Nothing is known yet. Raises ServiceError when the library for cuts is not there."""
+    try:
+        log.info(f"large cuts by {min_cut_in_use(cfg.solver.min_cut)}")
+    except NoSuchLibrary as error:
+        raise ServiceError(f"segmenter.solver: {error}") from error
     return empty(cfg, identity.robot, identity.epoch)
 
 
@@ -59,7 +67,7 @@ def answer_snapshot(state: State, request: SnapshotRequest, cfg: Config) -> Regi
 
 def answer_objects(state: State, request: SnapshotRequest, cfg: Config) -> ObjectDelta:
     """All objects published so far."""
-    return state.object_ledger.snapshot(state.robot, state.epoch)
+    return state.objects.ledger.snapshot(state.robot, state.epoch)
 
 
 def answer_posterior(state: State, request: PosteriorRequest, cfg: Config) -> PosteriorReply:

@@ -37,6 +37,7 @@ KEYFRAME = frames.Keyframe(
     depth_scale_m=0.002,
     mask=b"m",
     space="s",
+    origin_m=(512e3, 5.4e6, 312.0),
 )
 TASK = priors.Task(robot="r", stamp_ns=2**60, environment="home", task="tidy up", regions=["kitchen", "Küche"])
 PRIOR = priors.Prior(
@@ -204,6 +205,7 @@ EXAMPLES: list[Message] = [
         ellipses=f4([2, 1, 0.5]),
         hull_counts=i8(3),
         hulls_m=f4([0, 0], [1, 0], [0, 1]),
+        origin_m=(512e3, 5.4e6, 312.0),
     ),
     places.SnapshotRequest(robot="r"),
     places.MapRequest(robot="r"),
@@ -336,6 +338,7 @@ EXAMPLES: list[Message] = [
         ellipses=f4([2, 1, 0.5]),
         hull_counts=i8(3),
         hulls_m=f4([0, 0], [1, 0], [0, 1]),
+        origin_m=(512e3, 5.4e6, 312.0),
     ),
     status.Consumed(
         robot="r",

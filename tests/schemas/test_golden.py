@@ -40,6 +40,14 @@ def test_every_version_ever_written_can_be_read(kind):
         assert isinstance(decode(kind, current(kind, golden, f"{kind.__name__}/{version}")), kind)
 
 
+@pytest.mark.parametrize("name", ["Keyframe", "PlaceDelta", "Scene"])
+def test_what_was_written_before_worlds_had_an_offset_has_none(name):
+    message = next(example for example in EXAMPLES if by_name(example) == name)
+    fields = msgpack.unpackb(encode(message), ext_hook=msgpack.ExtType)
+    del fields["origin_m"]
+    assert decode(type(message), msgpack.packb(fields)) == msgspec.structs.replace(message, origin_m=(0.0, 0.0, 0.0))
+
+
 def test_the_digest_of_a_prior_stays():
     prior = next(example for example in EXAMPLES if by_name(example) == "Prior")
     assert prior.digest() == "eab9114663fcaab470acb71942c653fc"

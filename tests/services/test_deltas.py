@@ -2,10 +2,12 @@
 
 from dataclasses import dataclass
 
+import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from prior_sg.services.deltas import Follower
+from prior_sg.schemas.frames import PoseUpdate
+from prior_sg.services.deltas import Follower, PoseCorrections
 
 
 @dataclass(frozen=True)
@@ -67,3 +69,33 @@ def test_every_permutation_ends_complete(order):
     for revision in order:
         seen += [d.revision for d in follower.take(Delta(1, revision))]
     assert seen == list(range(10)) and not follower.needs_snapshot
+
+
+def moved_to(x_m, *, epoch, revision, frame_ids=(7,)):
+    pose = np.eye(4)
+    pose[0, 3] = x_m
+    return PoseUpdate(
+        robot="r",
+        epoch=epoch,
+        revision=revision,
+        stamp_ns=1,
+        frame_ids=np.array(frame_ids, np.int64),
+        world_from_camera=np.stack([pose] * len(frame_ids)),
+    )
+
+
+def test_a_pose_update_counts_once_and_only_if_newer_than_the_newest_of_its_epoch():
+    corrections = PoseCorrections()
+    assert sorted(corrections.take(moved_to(1.0, epoch=1, revision=3, frame_ids=(7, 8)))) == [7, 8]
+    assert corrections.take(moved_to(2.0, epoch=1, revision=3)) is None
+    assert corrections.take(moved_to(2.0, epoch=1, revision=2)) is None
+    assert corrections.pose(7, np.eye(4))[0, 3] == 1.0
+    assert corrections.take(moved_to(4.0, epoch=2, revision=0)) is not None  # another writer
+    assert corrections.pose(7, np.eye(4))[0, 3] == 4.0 and corrections.pose(8, np.eye(4))[0, 3] == 1.0
+
+
+def test_a_frame_without_a_correction_keeps_the_pose_it_was_announced_with():
+    corrections, announced = PoseCorrections(), np.full((4, 4), 5.0)
+    corrections.take(moved_to(1.0, epoch=1, revision=0))
+    assert 7 in corrections and 9 not in corrections
+    assert corrections.pose(9, announced) is announced

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from prior_sg.schemas.regions import NO_REGION
-from prior_sg.services.segmenter.core.regions.components import components
+from prior_sg.services.segmenter.core.regions.components import numbered
 
 from .common import NO_LABEL, Answer, Inputs, similarities
 
@@ -30,6 +30,6 @@ def segment(inputs: Inputs, cfg: Config) -> Answer:
     features, observed = inputs.descriptors
     best = similarities(features, inputs.text, cfg.standardised).argmax(axis=1)
     kept = observed[inputs.edges].all(axis=1)
-    regions = np.where(observed, components(best, inputs.edges[kept]), NO_REGION)
+    regions = np.where(observed, numbered(best, inputs.edges[kept]), NO_REGION)
     labels = [inputs.names[label] if seen else NO_LABEL for label, seen in zip(best, observed, strict=True)]
     return Answer(labels, regions)

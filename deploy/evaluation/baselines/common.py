@@ -15,6 +15,7 @@ from prior_sg.schemas.places import PlaceDelta, VoxelMap
 from prior_sg.schemas.regions import NO_REGION, Region
 from prior_sg.schemas.scene import Scene
 from prior_sg.services.segmenter.core.evidence import kernel
+from prior_sg.services.segmenter.core.evidence.archive import FrameArchive, integrate_all
 from prior_sg.services.segmenter.core.regions.components import footprint_m2
 
 NO_LABEL = ""
@@ -86,13 +87,13 @@ class Inputs:
     @cached_property
     def descriptors(self) -> tuple[np.ndarray, np.ndarray]:
         """Our method's d_vis (place, dim) and whether each place (place,) was observed at all."""
-        archive, evidence, cfg = kernel.Archive(), kernel.Evidence(), kernel.KernelConfig()
+        archive, evidence, cfg = FrameArchive(), kernel.Evidence(), kernel.KernelConfig()
         for pyramid in self.pyramids:
             archive.add(pyramid.frame_id, kernel.compact(pyramid))
         rows = list(range(len(self.place_ids)))
         evidence.add(rows)
         targets = kernel.Targets(evidence.of(rows), self.positions_m)
-        kernel.integrate_all(evidence, archive, targets, self.query_radius_m, cfg)
+        integrate_all(evidence, archive, targets, self.query_radius_m, cfg)
         return evidence.descriptors(targets.slots), evidence.frames[targets.slots] > 0
 
 

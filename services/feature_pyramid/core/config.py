@@ -4,6 +4,7 @@ import msgspec
 
 from prior_sg.schemas.features import DEFAULT_SPACE
 from prior_sg.services.feature_pyramid.core.segments import SegmentsConfig
+from prior_sg.services.images import MAX_PRINCIPAL_OFFSET
 
 
 class Config(msgspec.Struct, frozen=True, kw_only=True):
@@ -17,6 +18,7 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
     overlap: float = 0.5  # least share of a crop's side that its neighbour covers too
     min_area_m2: float = 2.25  # A_min: crops that see less physical area are not encoded
     surface_cell_px: int = 8  # cell size of the coarse depth surface
+    max_principal_offset: float = MAX_PRINCIPAL_OFFSET  # as of place_graph: beyond it, a keyframe is not encoded
     batch_size: int = 0  # crops per forward pass, of one or several keyframes; 0 = what suits encoder and device
     threads: int = 0  # of the neural network library; 0 = its own choice (OMP_NUM_THREADS)
     detector: str = "segments"  # of objects; or none, grounding_dino:MODEL, owlv2:MODEL (a folder or a published name)

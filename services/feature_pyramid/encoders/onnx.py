@@ -51,6 +51,9 @@ class Manifest(msgspec.Struct, frozen=True, kw_only=True):
     logit_scale: float = 100.0  # the trained one, after the exponential
 
 
+_MANIFEST = msgspec.json.Decoder(Manifest)  # built at import: services of one process load encoders side by side
+
+
 def space_of(choice: str) -> str:
     """The embedding space: the manifest's name and digest. Raises EncoderUnavailable."""
     folder = _folder(choice)
@@ -113,7 +116,7 @@ def _folder(choice: str) -> Path:
 
 def _manifest(folder: Path) -> Manifest:
     try:
-        return msgspec.json.decode((folder / MANIFEST).read_bytes(), type=Manifest)
+        return _MANIFEST.decode((folder / MANIFEST).read_bytes())
     except msgspec.DecodeError as error:
         raise EncoderUnavailable(f"{folder / MANIFEST} is not valid: {error}; see docs/encoders.md.") from error
 

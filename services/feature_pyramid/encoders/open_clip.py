@@ -105,7 +105,7 @@ def library() -> Any:
     try:
         torchvision_parts.load()
     except ImportError as error:
-        raise EncoderUnavailable("open_clip is not installed; run `pip install open-clip-torch`.") from error
+        raise EncoderUnavailable("open_clip is not installed; run `pip install 'prior-sg[clip]'`.") from error
     return package("open_clip", "open-clip-torch")
 
 

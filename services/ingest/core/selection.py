@@ -3,14 +3,14 @@
 A frame is refused when it cannot follow its predecessors: its stamp or number does not rise, or its pose jumps faster
 than the camera can move. Of the others a frame becomes a keyframe when the camera has moved or turned enough since the
 last keyframe, or enough time has passed. Keyframes go to the map (KEYFRAME), to the pool of encoders (ENCODE), and into
-a ring from which late readers may ask for them again (ARCHIVE).
+an archive from which late readers may ask for them again (ARCHIVE).
 """
 
 import math
-from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Annotated, Literal
+from itertools import islice
+from typing import Annotated
 
 import msgspec
 import numpy as np
@@ -31,33 +31,10 @@ from prior_sg.schemas.frames import (
 from prior_sg.schemas.status import JobDone
 from prior_sg.schemas.topics import CAMERA_STATE, ENCODE, INGEST_STATE, KEYFRAME, POSE_UPDATE, Topic
 from prior_sg.services.geometry import inverse, rotation_angle_rad
+from prior_sg.services.ingest.core.archive import KeyframeArchive
+from prior_sg.services.ingest.core.config import Config
 
-ON_THE_WAY = 16  # keyframes whose pyramids may overtake each other
 Written = tuple[Topic, Message]
-
-
-class Config(msgspec.Struct, frozen=True, kw_only=True):
-    """Where frames come from and which of them become keyframes.
-
-    The paper does not publish its selection; this one is chosen on the development sequences so that neighbouring
-    keyframes overlap by more than half at 60 to 75 degrees of view.
-    """
-
-    source: str = ""  # a folder of a layout in docs/sources.md, or an MCAP log; empty = no source
-    source_robot: str = ""  # of a log with several robots: the one to read; empty = the first
-    world_up: list[float] = msgspec.field(default_factory=list)  # up in the source's world; empty = as the layout says
-    floor_m: float = 0.0  # height of the floor in the source's world, measured along world_up; becomes z = 0
-    speed: float = 0.0  # times real time, by stamps; 0 = as fast as the pipeline drains
-    when_behind: Literal["wait", "skip"] = "wait"  # wait for slow workers, or keep pace and encode only the newest
-    window: int = (
-        8  # keyframes under way before the source waits, or older ones are skipped; below the publisher's cache
-    )
-    every_frame: bool = False  # make every frame a keyframe
-    min_translation_m: float = 0.25  # camera motion since the last keyframe that makes the next
-    min_rotation_deg: float = 12.0  # the same for turning
-    max_interval_s: float = 2.0  # the same for time, so that a resting camera still reports; 0 = never
-    max_speed_m_s: float = 10.0  # faster camera motion is a jump of the tracker, and refused; 0 = believe everything
-    archive_mb: float = 256.0  # compressed keyframes kept for ARCHIVE, oldest dropped first
 
 
 class RawFrame(Message, frozen=True, kw_only=True):
@@ -73,6 +50,7 @@ class RawFrame(Message, frozen=True, kw_only=True):
     index: int  # position in the source, from 0
     total: int  # frames in the source, 0 = unknown (live)
     mask: bytes = b""
+    origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def check(self) -> None:
         check_pose(self.world_from_camera)
@@ -138,8 +116,7 @@ class State:
     corrections: int = 0  # pose updates published
     encoding: set[int] = field(default_factory=set)  # numbers of keyframes whose job is not done
     ended: bool = False
-    archive: deque[Keyframe] = field(default_factory=deque)
-    archive_bytes: int = 0
+    archive: KeyframeArchive = field(default_factory=KeyframeArchive)
 
 
 def refusal(state: State, frame: RawFrame, cfg: Config) -> str | None:
@@ -180,7 +157,7 @@ def accept(state: State, frame: RawFrame, cfg: Config) -> Iterator[Written]:
     if due(state.keyframe, frame, cfg):
         state.keyframe = state.last
         keyframe = _keyframe(state, frame)
-        _archive(state, keyframe, cfg)
+        state.archive.put(keyframe, cfg.archive_mb * 1e6)
         state.keyframes += 1
         state.encoding.add(keyframe.frame_id)
         yield KEYFRAME, keyframe
@@ -211,23 +188,13 @@ def encoded(state: State, done: JobDone) -> Iterator[Written]:
 
 
 def backfill(state: State, wish: Backfill) -> Iterator[Written]:
-    """Encode archived keyframes again, in one space: those that the asking reader lacks. They give way to new ones.
-
-    Unless the reader has settled, the newest ones are left out: their pyramids may be on the way to it. Those older
-    than all it knows are not: they were there before it, or before the workers of that space.
-    """
-    known = set(wish.frame_ids.tolist())
-    oldest, newest = min(known, default=0), max(known, default=-1)
-    later = [keyframe for keyframe in state.archive if oldest <= keyframe.frame_id <= newest]
-    unwanted = known if wish.settled else known | {keyframe.frame_id for keyframe in later[-ON_THE_WAY:]}
-    for keyframe in state.archive:
-        wanted = wish.settled or keyframe.frame_id <= newest
-        if wanted and keyframe.frame_id not in unwanted:
-            yield ENCODE, msgspec.structs.replace(keyframe, space=wish.space)
+    """Encode archived keyframes again, in one space: those that the asking reader lacks. They give way to new ones."""
+    for keyframe in state.archive.lacked(wish):
+        yield ENCODE, msgspec.structs.replace(keyframe, space=wish.space)
 
 
 def announce(state: State, correction: Correction) -> Iterator[Written]:
-    """Publish corrected poses of the source; the ring follows when the update comes back, as anybody's does."""
+    """Publish corrected poses of the source; the archive follows when the update comes back, as anybody's does."""
     yield (
         POSE_UPDATE,
         PoseUpdate(
@@ -244,11 +211,7 @@ def announce(state: State, correction: Correction) -> Iterator[Written]:
 
 def correct(state: State, update: PoseUpdate) -> None:
     """Give archived keyframes their corrected poses, so that whoever fetches them later maps them where they are."""
-    poses = dict(zip(update.frame_ids.tolist(), update.world_from_camera, strict=True))
-    for position, keyframe in enumerate(state.archive):
-        if keyframe.frame_id in poses:
-            pose = np.array(poses[keyframe.frame_id])
-            state.archive[position] = msgspec.structs.replace(keyframe, world_from_camera=pose)
+    state.archive.correct(dict(zip(update.frame_ids.tolist(), update.world_from_camera, strict=True)))
 
 
 def end(state: State) -> Iterator[Written]:
@@ -273,12 +236,13 @@ def progress(state: State) -> Written:
 
 
 def archived(state: State, request: ArchiveRequest, cfg: Config) -> ArchiveReply:
-    """Keyframes of the ring within the requested numbers, oldest first."""
-    wanted = (k for k in state.archive if request.first_frame_id <= k.frame_id < request.end_frame_id)
+    """Archived keyframes within the requested numbers, oldest first."""
     return ArchiveReply(
         robot=state.robot,
-        oldest_frame_id=state.archive[0].frame_id if state.archive else -1,
-        keyframes=[keyframe for _, keyframe in zip(range(request.limit), wanted, strict=False)],
+        oldest_frame_id=state.archive.oldest_frame_id,
+        keyframes=list(
+            islice(state.archive.between(request.first_frame_id, request.end_frame_id), max(0, request.limit))
+        ),
     )
 
 
@@ -305,15 +269,5 @@ def _keyframe(state: State, frame: RawFrame) -> Keyframe:
         depth=frame.depth,
         depth_scale_m=frame.depth_scale_m,
         mask=frame.mask,
+        origin_m=frame.origin_m,
     )
-
-
-def _archive(state: State, keyframe: Keyframe, cfg: Config) -> None:
-    state.archive.append(keyframe)
-    state.archive_bytes += _size(keyframe)
-    while state.archive_bytes > cfg.archive_mb * 1e6:
-        state.archive_bytes -= _size(state.archive.popleft())
-
-
-def _size(keyframe: Keyframe) -> int:
-    return len(keyframe.color) + len(keyframe.depth) + len(keyframe.mask)

@@ -1,11 +1,16 @@
 """Sources of posed RGB-D frames: one loader per file, and the one place that tells layouts apart."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
+import msgspec
+
+from prior_sg.services.ingest.core.options import ReadOptions
 from prior_sg.services.ingest.sources import (
     coda,
     dataset,
+    generic,
     hm3d,
     icl_nuim,
     recording,
@@ -16,27 +21,63 @@ from prior_sg.services.ingest.sources import (
     tum,
 )
 from prior_sg.services.ingest.sources.base import Source, SourceError
+from prior_sg.services.ingest.sources.normalise import finish
 
-__all__ = ["Source", "SourceError", "open_source"]
+__all__ = ["LAYOUT_NAMES", "ReadOptions", "Source", "SourceError", "open_source"]
 
-LAYOUTS = (dataset, seven_scenes, tum, icl_nuim, replica, scannet, hm3d, tartanground, coda)
+LAYOUTS = (dataset, seven_scenes, tum, icl_nuim, replica, scannet, hm3d, tartanground, coda, generic)
+LAYOUT_NAMES = (*(layout.NAME for layout in LAYOUTS), recording.NAME)
 
 
-def open_source(path: str | Path, world_up: Sequence[float] = (), floor_m: float = 0.0, robot: str = "") -> Source:
+def open_source(
+    path: str | Path,
+    world_up: Sequence[float] = (),
+    floor_m: float = 0.0,
+    robot: str = "",
+    options: ReadOptions | None = None,
+) -> Source:
     """The source at `path`, by its layout.
 
-    `world_up` (x, y, z) is the direction that points up in the source's world, empty for what its layout says;
-    `floor_m` is the height of its floor in that direction. Poses come out in a world with z up and the floor at zero;
-    ground truth stays in the world as it comes out when neither is given. `robot` picks one robot of a log, empty for
-    the first. Raises SourceError.
+    `options` say how it is read where its files do not, or say it wrongly. `world_up` (x, y, z) is the direction that
+    points up in the source's world, empty for what its layout says; `floor_m` is the height of its floor in that
+    direction. Poses come out in a world with z up and the floor at zero; ground truth stays in the world as it comes
+    out when neither is given. `robot` picks one robot of a log, empty for the first; these three go before `options`.
+    Raises SourceError.
     """
     path = Path(path)
+    options = _with(options or ReadOptions(), world_up, floor_m, robot)
     if not path.exists():
         raise SourceError(f"the source {path} does not exist: give a dataset folder, a 7-Scenes folder or an MCAP log")
+    if options.layout:
+        return _as_told(path, options)
     if path.is_file() and path.suffix == ".mcap":
-        return recording.load(path, world_up, floor_m, robot)
+        return recording.load(path, options)
     for layout in LAYOUTS:
         if layout.fits(path):
-            return layout.load(path, world_up, floor_m)
+            return finish(layout.load(path, options), options)
     looks = ", ".join(layout.LOOKS for layout in LAYOUTS)
     raise SourceError(f"{path} is no known source: looked for {looks}, or a file ending in .mcap (log)")
+
+
+def _with(options: ReadOptions, world_up: Sequence[float], floor_m: float, robot: str) -> ReadOptions:
+    """The options with what was given beside them."""
+    return msgspec.structs.replace(
+        options,
+        world_up=list(world_up) or options.world_up,
+        floor_m=floor_m or options.floor_m,
+        source_robot=robot or options.source_robot,
+    )
+
+
+def _as_told(path: Path, options: ReadOptions) -> Source:
+    """The source in the layout that was named. Raises SourceError."""
+    if options.layout == recording.NAME:
+        return recording.load(path, options)
+    layout = next((layout for layout in LAYOUTS if options.layout == layout.NAME), None)
+    if layout is None:
+        raise SourceError(f"there is no layout {options.layout!r}; known: {', '.join(LAYOUT_NAMES)}")
+    try:
+        found = layout.load(path, options)
+    except OSError as error:
+        raise SourceError(f"{path} cannot be read as {layout.NAME}: {error.strerror}") from error
+    return finish(replace(found, why=("as told",)), options)

@@ -1,35 +1,34 @@
-"""What every source is, and the arithmetic all of them share."""
+"""What every source is, what a layout's loader finds, and the small readers all of them share."""
 
-import json
 import math
 import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from prior_sg.schemas.frames import Intrinsics
-from prior_sg.services.geometry import pose_from_quaternion
 from prior_sg.services.ingest.core.selection import BadFrame, Correction, RawFrame
-from prior_sg.services.ingest.sources.images import ImageError, image_size
-from prior_sg.services.runtime.service import ServiceError
+from prior_sg.services.ingest.sources.images import ImageError
+from prior_sg.services.ingest.sources.pixels import eight_bit, measured, stored
+from prior_sg.services.ingest.sources.poses import Convention
+from prior_sg.services.ingest.sources.tables import SourceError, read_json
+
+__all__ = ["FrameError", "Source", "SourceError"]
 
 UP = (0.0, 0.0, 1.0)
 CAMERA, REGIONS = "camera.json", "regions.json"
 MILLIMETRE = 0.001
-DEPTH_MAX = 65535
-
-
-class SourceError(ServiceError):
-    """A source cannot be opened; the text is one sentence for the user."""
+SATURATED = 65535.0  # the largest value of 16 bits: sensors and tools write it where they measured nothing
 
 
 class FrameError(ValueError):
     """One frame cannot be used; the text is the reason."""
+
+
+Wanted = Callable[[int, np.ndarray], bool]  # whether the images of a frame are, by its index and world_from_camera
 
 
 @dataclass(frozen=True)
@@ -43,6 +42,13 @@ class Source:
     frames: Callable[[], Iterator[RawFrame | BadFrame]]
     ground_truth: dict[str, Any] | None = None  # content of regions.json
     corrections: Callable[[], Iterator[Correction]] = lambda: iter(())  # corrected poses, stamps not falling
+    why: tuple[str, ...] = ()  # how the layout was recognised
+    notes: tuple[str, ...] = ()  # everything that was changed or assumed on reading
+    origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # where the frames' world has its zero in the source's
+    convention: Convention | None = None  # how written poses were read; None = in a way no option changes
+    world_from_source: np.ndarray | None = None  # 4 x 4, levelling and recentring; None = nothing was done
+    thinned: "Callable[[Wanted], Iterator[RawFrame | BadFrame]] | None" = None  # the same frames, but images, which
+    # cost time, only of the wanted ones; the others' files are looked at and their images left empty
 
     def __iter__(self) -> Iterator[RawFrame | BadFrame]:
         return self.frames()
@@ -62,85 +68,56 @@ class Source:
 
 
 @dataclass(frozen=True)
-class Rig:
-    """What is the same for all frames of a source."""
+class Camera:
+    """A camera as a source's files or its publisher describe it."""
 
     intrinsics: Intrinsics
-    depth_scale_m: float
-    total: int
-    world_from_source: np.ndarray | None  # None = the source's world has z up and its floor at zero already
+    model: str = ""  # of the lens; empty = pinhole without coefficients, opencv with them
+    distortion: tuple[float, ...] = ()
+    published: bool = False  # a constant of the publisher's, whatever size the images have
 
-    def frame(
-        self,
-        index: int,
-        frame_id: int,
-        stamp_ns: int,
-        source_from_camera: np.ndarray,
-        *,
-        color: bytes,
-        depth: bytes,
-        mask: bytes = b"",
-    ) -> RawFrame:
-        """A frame whose images fit the camera and whose pose is a rigid motion. Raises FrameError."""
-        check_images(self.intrinsics, color, depth)
-        pose = np.asarray(source_from_camera, np.float64)
-        if not np.isfinite(pose).all():
-            raise FrameError("its pose is not finite")
-        try:
-            return RawFrame(
-                frame_id=frame_id,
-                stamp_ns=stamp_ns,
-                intrinsics=self.intrinsics,
-                world_from_camera=pose if self.world_from_source is None else self.world_from_source @ pose,
-                color=color,
-                depth=depth,
-                mask=mask,
-                depth_scale_m=self.depth_scale_m,
-                index=index,
-                total=self.total,
-            )
-        except ValueError as error:
-            raise FrameError(str(error)) from error
+
+@dataclass(frozen=True)
+class Images:
+    """The pictures of one frame as their files hold them; depth may be an array of metres (h, w) already."""
+
+    color: bytes
+    depth: bytes | np.ndarray
+    mask: bytes = b""
 
 
 @dataclass(frozen=True)
 class Entry:
-    """One frame before it is read: `read` gives source_from_camera, colour and depth, or raises FrameError."""
+    """One frame before it is read: `pose` gives source_from_camera, both raise FrameError."""
 
     frame_id: int
     stamp_ns: int
-    read: Callable[[], tuple[np.ndarray, bytes, bytes]]
+    pose: Callable[[], np.ndarray]
+    images: Callable[[], Images]
 
 
-def sequence(layout: str, path: Path, rig: Rig, entries: Sequence[Entry]) -> Source:
-    """A source of these entries, with the ground truth of a regions.json beside them. Raises SourceError."""
-    ground_truth = read_json(path / REGIONS) if (path / REGIONS).is_file() else None
-    return Source(layout, path, rig.intrinsics, len(entries), lambda: _frames(rig, entries), ground_truth)
+@dataclass(frozen=True)
+class Found:
+    """What a layout's loader found, before the normalising step."""
+
+    layout: str
+    path: Path
+    camera: Camera
+    depth_scale_m: float
+    entries: Sequence[Entry]
+    up: tuple[float, float, float] = UP  # in the source's world
+    depth_invalid: tuple[float, ...] = (SATURATED,)
+    ground_truth: dict[str, Any] | None = None
+    corrections: Sequence[Correction] = ()  # in the source's world
+    convention: Convention | None = None  # how written poses are read; None = in a way no option changes
+    why: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+    assumed_hz: float = 0.0  # frames per second where the layout has no stamps and nobody told; 0 = stamps are real
 
 
-def _frames(rig: Rig, entries: Sequence[Entry]) -> Iterator[RawFrame | BadFrame]:
-    for index, entry in enumerate(entries):
-        try:
-            pose, color, depth = entry.read()
-            yield rig.frame(index, entry.frame_id, entry.stamp_ns, pose, color=color, depth=depth)
-        except FrameError as error:
-            yield BadFrame(frame_id=entry.frame_id, reason=str(error), index=index, total=rig.total)
-
-
-def check_images(intrinsics: Intrinsics, color: bytes, depth: bytes) -> None:
-    """Raise FrameError unless both images are whole, of the camera's size, and depth has 16 bits."""
-    expected = (intrinsics.width_px, intrinsics.height_px)
-    for name, data, bits in (("colour", color, 8), ("depth", depth, 16)):
-        try:
-            width_px, height_px, depth_bits = image_size(data)
-        except ImageError as error:
-            raise FrameError(f"the {name} image is damaged: {error}") from error
-        if (width_px, height_px) != expected:
-            raise FrameError(
-                f"the {name} image has {width_px} x {height_px} pixels, the camera {expected[0]} x {expected[1]}"
-            )
-        if depth_bits != bits:
-            raise FrameError(f"the {name} image has {depth_bits} bits per channel instead of {bits}")
+def truth_beside(path: Path) -> dict[str, Any] | None:
+    """Content of a regions.json in the folder. Raises SourceError."""
+    return read_json(path / REGIONS) if (path / REGIONS).is_file() else None
 
 
 def read_bytes(path: Path) -> bytes:
@@ -151,46 +128,66 @@ def read_bytes(path: Path) -> bytes:
         raise FrameError(f"{path.name} cannot be read: {error.strerror}") from error
 
 
-def read_json(path: Path) -> Any:
-    """A JSON file's content. Raises SourceError."""
+def color_pixels(data: bytes) -> np.ndarray:
+    """Colour (h, w) or (h, w, 3) of 8 bits of an image file. Raises FrameError."""
     try:
-        return json.loads(path.read_text())
-    except (OSError, ValueError) as error:
-        raise SourceError(f"{path} cannot be read: {error}") from error
+        return eight_bit(data)
+    except ImageError as error:
+        raise FrameError(f"the colour image is damaged: {error}") from error
 
 
-def camera_of(path: Path, camera: Any) -> Intrinsics:
-    """The camera of a JSON object with width, height, fx, fy, cx, cy; `path` is for the reader of an error."""
+def depth_pixels(data: bytes) -> np.ndarray:
+    """Numbers of a depth image as they are stored. Raises FrameError."""
     try:
-        return Intrinsics(
+        return stored(data)
+    except ImageError as error:
+        raise FrameError(f"the depth image is damaged: {error}") from error
+
+
+def camera_of(path: Path, camera: Any) -> Camera:
+    """The camera of a JSON object with width, height, fx, fy, cx, cy, and `model` and `distortion` where it has them.
+
+    `path` is for the reader of an error. Raises SourceError.
+    """
+    try:
+        intrinsics = Intrinsics(
             int(camera["width"]), int(camera["height"]), *(float(camera[name]) for name in ("fx", "fy", "cx", "cy"))
         )
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise SourceError(f"{path} is not a camera: {error!r}") from error
+    return Camera(intrinsics, *lens_of(path, camera))
 
 
-def table(path: Path, columns: int) -> list[list[str]]:
-    """Rows of a text file of words; empty lines and lines that begin with # are left out. Raises SourceError."""
+LENS_NAMES = {
+    "pinhole": ("pinhole", "simple_pinhole", "none", "ideal"),
+    "opencv": (
+        "opencv", "full_opencv", "plumb_bob", "radtan", "radial_tangential", "brown", "brown_conrady",
+        "rational_polynomial", "rational", "perspective",
+    ),
+    "fisheye": ("fisheye", "opencv_fisheye", "equidistant", "kannala_brandt", "kannala_brandt4", "kb4"),
+}  # fmt: skip
+LENS_KEYS = {"opencv": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"), "fisheye": ("k1", "k2", "k3", "k4")}
+
+
+def lens_of(path: Path, camera: dict[str, Any]) -> tuple[str, tuple[float, ...]]:
+    """Model and coefficients of a camera's lens, of a list, of named numbers, or of none. Raises SourceError."""
+    said = next((camera[k] for k in ("model", "camera_model", "distortion_model") if camera.get(k)), "")
+    word = re.sub(r"[\s-]+", "_", str(said).strip().lower())
+    model = next((name for name, words in LENS_NAMES.items() if word in words), "")
+    if word and not model:
+        known = ", ".join(LENS_NAMES)
+        raise SourceError(f"{path} names the lens {str(said)[:40]!r}, which is not known: give --camera-model {known}")
+    values = next((camera[k] for k in ("distortion", "distortion_coefficients", "dist_coeffs") if k in camera), None)
     try:
-        lines = path.read_text().splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise SourceError(f"{path} cannot be read: {error}") from error
-    rows = [line.split() for line in lines if line.strip() and not line.startswith("#")]
-    short = next((row for row in rows if len(row) < columns), None)
-    if short is not None:
-        raise SourceError(f"{path} has a line with {len(short)} instead of {columns} columns: {' '.join(short)[:80]}")
-    return rows
-
-
-def stamp_ns(word: str, path: Path) -> int:
-    """Nanoseconds, exact, of a stamp written in seconds; `path` is for the reader of an error. Raises SourceError."""
-    try:
-        stamp = round(Decimal(word) * 10**9)
-        if abs(stamp) < 2**63:
-            return stamp
-    except (InvalidOperation, ValueError, OverflowError):
-        pass
-    raise SourceError(f"{path} has a line that does not begin with a stamp in seconds: {word}")
+        if values is None or isinstance(values, dict):
+            named = {str(k).lower(): v for k, v in (camera if values is None else values).items()}
+            keys = LENS_KEYS[model if model in LENS_KEYS else "opencv"]
+            last = max((i for i, key in enumerate(keys) if named.get(key)), default=-1)
+            count = next((n for n in (0, 4, 5, 8) if n > last), 8)
+            values = [named.get(key) or 0.0 for key in keys[:count]]
+        return model, tuple(float(value) for value in np.ravel(values).tolist())
+    except (TypeError, ValueError) as error:
+        raise SourceError(f"{path} has a distortion that is not a list of numbers: {error}") from error
 
 
 def numbered(folder: Path, pattern: str) -> dict[int, Path]:
@@ -206,63 +203,20 @@ def file_of(files: dict[int, Path], number: int, kind: str) -> bytes:
     return read_bytes(files[number])
 
 
+def images_of(colors: dict[int, Path], depths: dict[int, Path], number: int) -> Images:
+    """The pictures with this number. Raises FrameError."""
+    return Images(file_of(colors, number, "colour"), file_of(depths, number, "depth"))
+
+
 def first_size(files: Sequence[Path]) -> tuple[int, int]:
     """Width and height, pixels, of the first image that can be read. Raises SourceError."""
     for file in files:
         try:
-            width_px, height_px, _ = image_size(read_bytes(file))
+            width_px, height_px, _ = measured(read_bytes(file))
             return width_px, height_px
         except (FrameError, ImageError):
             continue
     raise SourceError(f"no image in {files[0].parent if files else 'the source'} can be read")
-
-
-def matrix_pose(text: str | bytes) -> np.ndarray:
-    """The 4 x 4 matrix of sixteen numbers, row by row. Raises FrameError."""
-    try:
-        matrix = np.array(text.split(), float).reshape(4, 4)
-    except ValueError as error:
-        raise FrameError(f"its pose is not sixteen numbers: {error}") from error
-    if not np.isfinite(matrix).all():
-        raise FrameError("its pose is not finite")
-    return matrix
-
-
-def quaternion_pose(words: Sequence[str], *, scalar_first: bool = False) -> np.ndarray:
-    """The 4 x 4 matrix of tx ty tz qx qy qz qw, or tx ty tz qw qx qy qz. Raises FrameError."""
-    try:
-        numbers = np.array(words[:7], float)
-    except ValueError as error:
-        raise FrameError(f"its pose is not seven numbers: {error}") from error
-    quaternion_xyzw = np.roll(numbers[3:], -1) if scalar_first else numbers[3:]
-    if not np.isfinite(numbers).all() or not np.linalg.norm(quaternion_xyzw) > 0:
-        raise FrameError("its pose is not finite")
-    return pose_from_quaternion(numbers[:3], quaternion_xyzw)
-
-
-def decode_image(data: bytes, kind: str) -> np.ndarray:
-    """Pixels of an image file as they are stored (OpenCV's channel order). Raises FrameError."""
-    try:
-        image_size(data)  # OpenCV would fill up an image that is cut off
-    except ImageError as error:
-        raise FrameError(f"the {kind} image is damaged: {error}") from error
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    if image is None:
-        raise FrameError(f"the {kind} image is damaged: it cannot be decoded")
-    return image
-
-
-def encode_image(image: np.ndarray, extension: str) -> bytes:
-    """An image file, .png or .jpg."""
-    settings = [cv2.IMWRITE_JPEG_QUALITY, 95] if extension == ".jpg" else []
-    return cv2.imencode(extension, image, settings)[1].tobytes()
-
-
-def millimetre_png(depth_m: np.ndarray) -> bytes:
-    """A depth image (h, w), metres, as a 16 bit PNG in millimetres; what does not fit becomes 0, no measurement."""
-    depth_mm = np.rint(depth_m * 1000.0)
-    fits = np.isfinite(depth_mm) & (depth_mm > 0) & (depth_mm <= DEPTH_MAX)
-    return encode_image(np.where(fits, depth_mm, 0).astype(np.uint16), ".png")
 
 
 def levelling(world_up: Sequence[float], floor_m: float) -> np.ndarray | None:

@@ -23,7 +23,6 @@ Source: github.com/ut-amrl/coda-devkit, docs/DATA_REPORT.md, helpers/calibration
 """
 
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -33,32 +32,32 @@ import numpy as np
 
 from prior_sg.schemas.frames import Intrinsics
 from prior_sg.services.geometry import inverse, transform
+from prior_sg.services.ingest.core.options import ReadOptions
+from prior_sg.services.ingest.sources import base
 from prior_sg.services.ingest.sources.base import (
     MILLIMETRE,
-    UP,
     Entry,
+    Found,
     FrameError,
-    Rig,
-    Source,
+    Images,
     SourceError,
-    decode_image,
-    encode_image,
+    color_pixels,
     file_of,
-    levelling,
-    millimetre_png,
     numbered,
-    quaternion_pose,
-    sequence,
-    stamp_ns,
-    table,
+    truth_beside,
 )
 from prior_sg.services.ingest.sources.lidar import depth_image
+from prior_sg.services.ingest.sources.pixels import encoded
+from prior_sg.services.ingest.sources.poses import quaternion_of
+from prior_sg.services.ingest.sources.tables import stamps_ns, table, text_of
 
+NAME = "coda"
 RAW, RECTIFIED, SCANS = "2d_raw", "2d_rect", "3d_comp/os1"
 LOOKS = f"{RECTIFIED}/cam0/SEQUENCE or {RAW}/cam0/SEQUENCE beside {SCANS} (CODa)"
 POSES = ("poses/dense_global", "poses/dense")
 SCAN_ROWS, SCAN_COLUMNS = 128, 1024
 WITHIN_NS = 50_000_000
+FEW, NEARLY_NONE = 4, 0.1  # frames that tell whether stamps fit, and the share that does when they do not
 NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 
 
@@ -77,7 +76,7 @@ class Files:
 
     colors: dict[int, Path]
     scans: dict[int, Path]
-    stamps_ns: list[int]
+    stamps_ns: list[int | None]
     pose_stamps_ns: np.ndarray
     poses: list[list[str]]
 
@@ -87,40 +86,64 @@ def fits(path: Path) -> bool:
     return bool(_image_folders(path))
 
 
-def load(path: Path, world_up: Sequence[float] = (), floor_m: float = 0.0) -> Source:
-    """A CODa sequence as a source. Raises SourceError."""
+def load(path: Path, options: ReadOptions) -> Found:
+    """A CODa sequence. Raises SourceError."""
     folders = _image_folders(path)
     if len({folder.name for folder in folders}) > 1:
         raise SourceError(f"{path} holds several sequences: name the images of one, such as {folders[0]}")
+    if options.poses or options.camera_axes:
+        raise SourceError("CODa has poses of its lidar: leave out --poses and --axes")
     folder = folders[0].resolve()
     root, kind, name, number = folder.parents[2], folder.parents[1].name, folder.parent.name, folder.name
     camera = _camera(root / "calibrations" / number, name, rectified=kind == RECTIFIED)
-    files = _files(root, kind, name, number)
+    files, notes = _files(root, kind, name, number, options)
+    order = options.quaternion or "wxyz"
     entries = [
         Entry(
             frame,
-            files.stamps_ns[frame] if frame < len(files.stamps_ns) else 0,
-            partial(_read, files, camera, frame),
+            stamp if (stamp := _stamp(files, frame)) is not None else 0,
+            partial(_pose, files, camera, frame, order),
+            partial(_images, files, camera, frame),
         )
         for frame in sorted(files.colors.keys() | files.scans.keys())
     ]
-    rig = Rig(camera.intrinsics, MILLIMETRE, len(entries), levelling(world_up or UP, floor_m))
-    return sequence("coda", folder, rig, entries)
+    return Found(
+        NAME,
+        folder,
+        base.Camera(camera.intrinsics),
+        MILLIMETRE,
+        entries,
+        ground_truth=truth_beside(folder),
+        why=(f"it lies in {kind}/{name} beside {SCANS}",),
+        notes=notes,
+    )
 
 
-def _files(root: Path, kind: str, name: str, number: str) -> Files:
+def _files(root: Path, kind: str, name: str, number: str, options: ReadOptions) -> tuple[Files, tuple[str, ...]]:
     stamps = root / "timestamps" / f"{number}.txt"
     poses = next((root / p / f"{number}.txt" for p in POSES if (root / p / f"{number}.txt").is_file()), None)
     if poses is None:
         raise SourceError(f"{root} has no poses of sequence {number}: looked for {number}.txt in {' and '.join(POSES)}")
     rows = table(poses, 8)
-    return Files(
+    frame_stamps, said = stamps_ns([row[0] for row in table(stamps, 1)], stamps, "s", options.stamp_unit)
+    pose_stamps, also_said = stamps_ns([row[0] for row in rows], poses, "s", options.stamp_unit)
+    shift_ns = round((options.stamp_offset_s or 0.0) * 1e9)
+    posed = [(stamp + shift_ns, row[1:]) for stamp, row in zip(pose_stamps, rows, strict=True) if stamp is not None]
+    files = Files(
         numbered(root / kind / name / number, rf"{kind}_{name}_{number}_(\d+)\.(?:png|jpg)"),
         numbered(root / SCANS / number, rf"3d_comp_os1_{number}_(\d+)\.bin"),
-        [stamp_ns(row[0], stamps) for row in table(stamps, 1)],
-        np.array([stamp_ns(row[0], poses) for row in rows], np.int64),
-        [row[1:] for row in rows],
+        frame_stamps,
+        np.array([stamp for stamp, _ in posed], np.int64),
+        [words for _, words in posed],
     )
+    numbers = [n for n in files.colors if _stamp(files, n) is not None]
+    if len(numbers) >= FEW and sum(_nearest(files, n) is not None for n in numbers) < NEARLY_NONE * len(numbers):
+        raise SourceError(f"no pose of {poses} lies within 50 ms of nearly any frame: give --stamp-offset SECONDS")
+    return files, tuple(filter(None, (said, also_said)))
+
+
+def _stamp(files: Files, frame: int) -> int | None:
+    return files.stamps_ns[frame] if frame < len(files.stamps_ns) else None
 
 
 def _image_folders(path: Path) -> list[Path]:
@@ -136,25 +159,31 @@ def _image_folders(path: Path) -> list[Path]:
     return []
 
 
-def _read(files: Files, camera: Camera, frame: int) -> tuple[np.ndarray, bytes, bytes]:
-    if frame >= len(files.stamps_ns):
+def _pose(files: Files, camera: Camera, frame: int, order: str) -> np.ndarray:
+    if _stamp(files, frame) is None:
         raise FrameError("the list of timestamps has no line for it")
-    world_from_lidar = quaternion_pose(_nearest(files, files.stamps_ns[frame]), scalar_first=True)
+    words = _nearest(files, frame)
+    if words is None:
+        raise FrameError("no pose lies within 50 ms of it")
+    return quaternion_of(words, order) @ inverse(camera.camera_from_lidar)
+
+
+def _nearest(files: Files, frame: int) -> list[str] | None:
+    differences_ns = np.abs(files.pose_stamps_ns - files.stamps_ns[frame])
+    if not len(differences_ns) or differences_ns.min() > WITHIN_NS:
+        return None
+    return files.poses[int(differences_ns.argmin())]
+
+
+def _images(files: Files, camera: Camera, frame: int) -> Images:
     color = file_of(files.colors, frame, "colour")
     points_lidar = _points(file_of(files.scans, frame, "lidar"))
     points_camera = transform(camera.camera_from_lidar, points_lidar.reshape(-1, 3)).reshape(points_lidar.shape)
     empty = ~points_lidar.any(axis=-1, keepdims=True)  # the lidar writes 0 0 0 where nothing came back
     depth_m = depth_image(np.where(empty, np.nan, points_camera), camera.intrinsics)
     if camera.distorted is not None:
-        color = encode_image(cv2.undistort(decode_image(color, "colour"), *camera.distorted), ".jpg")
-    return world_from_lidar @ inverse(camera.camera_from_lidar), color, millimetre_png(depth_m)
-
-
-def _nearest(files: Files, stamp: int) -> list[str]:
-    differences_ns = np.abs(files.pose_stamps_ns - stamp)
-    if not len(differences_ns) or differences_ns.min() > WITHIN_NS:
-        raise FrameError("no pose lies within 50 ms of it")
-    return files.poses[int(differences_ns.argmin())]
+        color = encoded(cv2.undistort(color_pixels(color), *camera.distorted), ".jpg")
+    return Images(color, depth_m)
 
 
 def _points(scan: bytes) -> np.ndarray:
@@ -195,7 +224,7 @@ def _rigid(matrix: np.ndarray) -> np.ndarray:
 
 def _matrix(path: Path, key: str, count: int) -> np.ndarray:
     """The numbers of `key: … data: […]`, in brackets or as a list with dashes. Raises SourceError."""
-    match = re.search(rf"^{key}:.*?^\s+data:((?:[\s,\[\]-]|{NUMBER})+)", _text(path), re.DOTALL | re.MULTILINE)
+    match = re.search(rf"^{key}:.*?^\s+data:((?:[\s,\[\]-]|{NUMBER})+)", text_of(path), re.DOTALL | re.MULTILINE)
     numbers = [float(number) for number in re.findall(NUMBER, match[1])] if match else []
     if len(numbers) != count:
         raise SourceError(f"{path} has no {key} with {count} numbers")
@@ -203,14 +232,7 @@ def _matrix(path: Path, key: str, count: int) -> np.ndarray:
 
 
 def _first_number(path: Path, key: str) -> int:
-    match = re.search(rf"^{key}:\s*(\d+)", _text(path), re.MULTILINE)
+    match = re.search(rf"^{key}:\s*(\d+)", text_of(path), re.MULTILINE)
     if match is None:
         raise SourceError(f"{path} has no {key}")
     return int(match[1])
-
-
-def _text(path: Path) -> str:
-    try:
-        return path.read_text()
-    except (OSError, UnicodeDecodeError) as error:
-        raise SourceError(f"{path} cannot be read: {error}") from error

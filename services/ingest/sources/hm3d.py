@@ -13,58 +13,69 @@ Source: github.com/hovsg/HOV-SG, hovsg/data/hm3dsem/habitat_utils.py (save_obs, 
 hovsg/data/hm3dsem/gen_hm3dsem_walks_from_poses.py and hovsg/dataloader/hm3dsem.py (_load_pose).
 """
 
-from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
-import numpy as np
-
 from prior_sg.schemas.frames import Intrinsics
+from prior_sg.services.ingest.core.options import ReadOptions
 from prior_sg.services.ingest.sources.base import (
     MILLIMETRE,
+    Camera,
     Entry,
-    Rig,
-    Source,
+    Found,
     file_of,
     first_size,
-    levelling,
-    matrix_pose,
+    images_of,
     numbered,
-    sequence,
+    truth_beside,
 )
+from prior_sg.services.ingest.sources.poses import Convention
 
+NAME = "hm3d"
 COLORS, DEPTHS, POSES = "rgb", "depth", "pose"
-LOOKS = f"{COLORS}/*_NNNNNN.png, {DEPTHS}/ and {POSES}/*_NNNNNN.txt (HM3D walk)"
-NAME = r"(?:.*[_-])?(\d+)\."
+LOOKS = f"{COLORS}/SCENE_NNNNNN.png, {DEPTHS}/ and {POSES}/SCENE_NNNNNN.txt without a camera file (HM3D walk)"
+FILE = r".+_(\d{6})\."  # plain numbers are anybody's
+CAMERA_FILES = ("*intrinsic*", "*camera*", "*calib*")
 UP = (0.0, 1.0, 0.0)
-FRAME_NS = 1e9 / 5
-HABITAT_FROM_CAMERA = np.diag((1.0, -1.0, -1.0, 1.0))
+RATE_HZ = 5.0
 
 
 def fits(path: Path) -> bool:
-    """Whether a folder has this layout."""
-    return (path / DEPTHS).is_dir() and bool(
-        numbered(path / COLORS, NAME + "png") and numbered(path / POSES, NAME + "txt")
+    """Whether a folder has this layout: HOV-SG names files by scene, and writes no camera."""
+    return (
+        (path / DEPTHS).is_dir()
+        and bool(numbered(path / COLORS, FILE + "png") and numbered(path / POSES, FILE + "txt"))
+        and not any(file for pattern in CAMERA_FILES for file in path.glob(pattern))
     )
 
 
-def load(path: Path, world_up: Sequence[float] = (), floor_m: float = 0.0) -> Source:
-    """An HM3D walk as a source. Raises SourceError."""
-    colors, depths = numbered(path / COLORS, NAME + "png"), numbered(path / DEPTHS, NAME + "png")
-    poses = numbered(path / POSES, NAME + "txt")
+def load(path: Path, options: ReadOptions) -> Found:
+    """An HM3D walk. Raises SourceError."""
+    name = FILE if numbered(path / COLORS, FILE + "png") else r"(?:.*[_-])?(\d+)\."
+    colors, depths = numbered(path / COLORS, name + "png"), numbered(path / DEPTHS, name + "png")
+    poses = numbered(path / POSES, name + "txt")
     width_px, height_px = first_size(list(colors.values()))
     focal_px = width_px / 2
     intrinsics = Intrinsics(width_px, height_px, focal_px, focal_px, (width_px - 1) / 2, (height_px - 1) / 2)
-    entries = [
-        Entry(number, round(number * FRAME_NS), partial(_read, colors, depths, poses, number))
-        for number in sorted(colors.keys() | depths.keys() | poses.keys())
-    ]
-    rig = Rig(intrinsics, MILLIMETRE, len(entries), levelling(world_up or UP, floor_m))
-    return sequence("hm3d", path, rig, entries)
+    convention = Convention(axes="opengl").changed(options)
 
+    def entry(number: int) -> Entry:
+        return Entry(
+            number,
+            round(number * options.frame_ns(RATE_HZ)),
+            lambda: convention.of_text(file_of(poses, number, "pose")),
+            partial(images_of, colors, depths, number),
+        )
 
-def _read(
-    colors: dict[int, Path], depths: dict[int, Path], poses: dict[int, Path], number: int
-) -> tuple[np.ndarray, bytes, bytes]:
-    pose = matrix_pose(file_of(poses, number, "pose")) @ HABITAT_FROM_CAMERA
-    return pose, file_of(colors, number, "colour"), file_of(depths, number, "depth")
+    return Found(
+        NAME,
+        path,
+        Camera(intrinsics),
+        MILLIMETRE,
+        [entry(number) for number in sorted(colors.keys() | depths.keys() | poses.keys())],
+        up=UP,
+        ground_truth=truth_beside(path),
+        convention=convention,
+        why=(f"{COLORS}/, {DEPTHS}/ and {POSES}/ hold files named SCENE_NNNNNN, and no camera lies beside them",),
+        assumed_hz=0.0 if options.rate_hz else RATE_HZ,
+    )

@@ -13,32 +13,32 @@ Frames have no stamps: 30 Hz, as published. A trajectory may lack its first fram
 poses only. Source: A. Handa et al., ICRA 2014, and www.doc.ic.ac.uk/~ahanda/VaFRIC/iclnuim.html.
 """
 
-from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from prior_sg.schemas.frames import Intrinsics
+from prior_sg.services.ingest.core.options import ReadOptions
 from prior_sg.services.ingest.sources.base import (
-    UP,
+    Camera,
     Entry,
+    Found,
     FrameError,
-    Rig,
-    Source,
+    Images,
     SourceError,
-    levelling,
-    quaternion_pose,
     read_bytes,
-    sequence,
-    table,
+    truth_beside,
 )
+from prior_sg.services.ingest.sources.poses import quaternion_of
+from prior_sg.services.ingest.sources.tables import table
 
+NAME = "icl-nuim"
 PAIRS, POSES = "associations.txt", "*.gt.freiburg"
 LOOKS = f"{PAIRS} and {POSES} (ICL-NUIM folder)"
 CAMERA = Intrinsics(640, 480, 481.2, 480.0, 319.5, 239.5)
 DEPTH_SCALE_M = 1 / 5000
-FRAME_NS = 1e9 / 30
+RATE_HZ = 30.0
 MIRRORED_Y = np.diag((1.0, -1.0, 1.0, 1.0))
 EXCHANGED_YZ = np.eye(4)[[0, 2, 1, 3]]
 
@@ -48,26 +48,47 @@ def fits(path: Path) -> bool:
     return path.is_dir() and (path / PAIRS).is_file() and any(path.glob(POSES))
 
 
-def load(path: Path, world_up: Sequence[float] = (), floor_m: float = 0.0) -> Source:
-    """An ICL-NUIM folder as a source. Raises SourceError."""
+def load(path: Path, options: ReadOptions) -> Found:
+    """An ICL-NUIM folder. Raises SourceError."""
     trajectories = sorted(path.glob(POSES))
     if len(trajectories) > 1:
         raise SourceError(f"{path} holds several trajectories: keep one of {', '.join(t.name for t in trajectories)}")
+    if options.poses or options.camera_axes:
+        raise SourceError("an ICL-NUIM folder has left-handed poses of its own: leave out --poses and --axes")
+    order = options.quaternion or "xyzw"
     poses = {_number(row[0], trajectories[0]): row[1:] for row in table(trajectories[0], 8)}
     entries = []
-    for row in table(path / PAIRS, 4):
+    for row in sorted(table(path / PAIRS, 4), key=lambda row: _number(row[0], path / PAIRS)):
         number = _number(row[0], path / PAIRS)
-        depth, color = sorted((row[1], row[3]), key=lambda name: "depth" not in name)
-        read = partial(_read, path / color, path / depth, poses.get(number))
-        entries.append(Entry(number, round(number * FRAME_NS), read))
-    rig = Rig(CAMERA, DEPTH_SCALE_M, len(entries), levelling(world_up or UP, floor_m))
-    return sequence("icl-nuim", path, rig, entries)
+        depth, color = sorted((row[1], row[-1]), key=lambda name: "depth" not in name)
+        entries.append(
+            Entry(
+                number,
+                round(number * options.frame_ns(RATE_HZ)),
+                partial(_pose, poses.get(number), order),
+                partial(_images, path / color, path / depth),
+            )
+        )
+    return Found(
+        NAME,
+        path,
+        Camera(CAMERA, published=True),
+        DEPTH_SCALE_M,
+        entries,
+        ground_truth=truth_beside(path),
+        why=(f"{PAIRS} and {trajectories[0].name} lie in it",),
+        assumed_hz=0.0 if options.rate_hz else RATE_HZ,
+    )
 
 
-def _read(color: Path, depth: Path, pose: list[str] | None) -> tuple[np.ndarray, bytes, bytes]:
+def _pose(pose: list[str] | None, order: str) -> np.ndarray:
     if pose is None:
         raise FrameError("the trajectory has no pose for it")
-    return EXCHANGED_YZ @ quaternion_pose(pose) @ MIRRORED_Y, read_bytes(color), read_bytes(depth)
+    return EXCHANGED_YZ @ quaternion_of(pose, order) @ MIRRORED_Y
+
+
+def _images(color: Path, depth: Path) -> Images:
+    return Images(read_bytes(color), read_bytes(depth))
 
 
 def _number(word: str, path: Path) -> int:

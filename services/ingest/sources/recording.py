@@ -2,24 +2,82 @@
 
 import json
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from prior_sg.schemas.codec import DecodeError, decode
-from prior_sg.schemas.frames import Keyframe, PoseUpdate
+from prior_sg.schemas.frames import Intrinsics, Keyframe, PoseUpdate
 from prior_sg.schemas.topics import KEYFRAME, POSE_UPDATE
+from prior_sg.services.ingest.core.options import ReadOptions
 from prior_sg.services.ingest.core.selection import BadFrame, Correction, RawFrame
-from prior_sg.services.ingest.sources.base import UP, FrameError, Rig, Source, SourceError, levelling
+from prior_sg.services.ingest.sources.base import Camera, Found, Images, Source, SourceError, Wanted
+from prior_sg.services.ingest.sources.normalise import LOOKED_AT, UNUSABLE, Normaliser, prepare, shifted_truth
+from prior_sg.services.ingest.sources.poses import Convention
 from prior_sg.services.runtime.record import Content, LogError, attachments, contents, read_log
 
+NAME = "log"
 REGIONS = "regions.json"
 log = logging.getLogger(__name__)
+Rig = tuple[Intrinsics, float]
 
 
-def load(path: Path, world_up: Sequence[float] = (), floor_m: float = 0.0, robot: str = "") -> Source:
+@dataclass(frozen=True)
+class Log:
+    """One robot's stream in a log."""
+
+    path: Path
+    key: str
+    total: int
+    first: Keyframe
+    truth: dict[str, Any] | None
+
+
+def load(path: Path, options: ReadOptions) -> Source:
     """A log as a source. Raises SourceError."""
+    recorded, corrected = _opened(path, options.source_robot)
+    samples = _samples(recorded)
+    found = Found(NAME, path, Camera(recorded.first.intrinsics), recorded.first.depth_scale_m, ())
+    moved, notes = prepare(found, options, samples)
+    normaliser = replace(moved, origin_m=_sum(recorded.first.origin_m, moved.origin_m))
+    if options.rate_hz:
+        notes = (*notes, f"{options.rate_hz:g} frames a second, as told, in place of the stamps")
+
+    @cache
+    def normaliser_of(rig: Rig) -> Normaliser:
+        """A robot may change its camera, or its settings, on the way."""
+        if rig == (recorded.first.intrinsics, recorded.first.depth_scale_m):
+            return normaliser
+        other = prepare(replace(found, camera=Camera(rig[0]), depth_scale_m=rig[1]), options, ())[0]
+        return replace(other, world_from_source=normaliser.world_from_source, origin_m=normaliser.origin_m)
+
+    return Source(
+        layout=NAME,
+        path=path,
+        intrinsics=normaliser.intrinsics,
+        total=recorded.total,
+        frames=lambda: _frames(recorded, normaliser_of, options),
+        ground_truth=shifted_truth(recorded.truth, moved.origin_m),
+        corrections=lambda: _corrections(recorded, normaliser) if corrected else iter(()),
+        why=("it is an MCAP log of ours",),
+        notes=notes,
+        origin_m=normaliser.origin_m,
+        convention=Convention().changed(options),
+        world_from_source=normaliser.world_from_source,
+        thinned=lambda wanted: _frames(recorded, normaliser_of, options, wanted),
+    )
+
+
+def _sum(a: tuple[float, float, float], b: tuple[float, float, float]) -> tuple[float, float, float]:
+    return a[0] + b[0], a[1] + b[1], a[2] + b[2]
+
+
+def _opened(path: Path, robot: str) -> tuple[Log, bool]:
+    """The stream that was asked for, and whether its poses were corrected. Raises SourceError."""
     try:
         found = contents(path)
         streams = [content for content in found if content.topic == KEYFRAME.name]
@@ -27,42 +85,55 @@ def load(path: Path, world_up: Sequence[float] = (), floor_m: float = 0.0, robot
         total = sum(content.messages for content in streams if content.key == key)
         if total == 0:
             raise SourceError(f"{path} holds no keyframes{f' of {robot}' if robot else ''}{_robots(streams)}")
-        first = _first(path, key)
         files = attachments(path)
-        ground_truth = json.loads(files[REGIONS]) if REGIONS in files else None
+        truth = json.loads(files[REGIONS]) if REGIONS in files else None
     except (LogError, ValueError) as error:
         raise SourceError(str(error)) from error
-    world_from_source = levelling(world_up or UP, floor_m)
-    corrected = any(content.topic == POSE_UPDATE.name for content in found)
-    return Source(
-        "log",
-        path,
-        first.intrinsics,
-        total,
-        lambda: _frames(path, key, total, world_from_source),
-        ground_truth,
-        lambda: _corrections(path, first.robot, world_from_source) if corrected else iter(()),
-    )
+    recorded = Log(path, key, total, _first(path, key), truth)
+    return recorded, any(content.topic == POSE_UPDATE.name for content in found)
 
 
-def _frames(path: Path, key: str, total: int, world_from_source: np.ndarray | None) -> Iterator[RawFrame | BadFrame]:
-    for index, payload in enumerate(_payloads(path, key)):
+def _samples(recorded: Log) -> list[tuple[np.ndarray, Images]]:
+    """Poses and images of the first frames that have the first one's camera."""
+    samples: list[tuple[np.ndarray, Images]] = []
+    for payload in _payloads(recorded.path, recorded.key):
+        try:
+            keyframe = decode(Keyframe, payload)
+        except DecodeError:
+            continue
+        if keyframe.intrinsics == recorded.first.intrinsics and keyframe.depth_scale_m == recorded.first.depth_scale_m:
+            samples.append((np.array(keyframe.world_from_camera), _images(keyframe)))
+        if len(samples) == LOOKED_AT:
+            break
+    return samples
+
+
+def _images(keyframe: Keyframe) -> Images:
+    return Images(keyframe.color, keyframe.depth, keyframe.mask)
+
+
+def _frames(
+    recorded: Log, normaliser_of: Callable[[Rig], Normaliser], options: ReadOptions, wanted: Wanted | None = None
+) -> Iterator[RawFrame | BadFrame]:
+    total, convention = recorded.total, Convention().changed(options)
+    for index, payload in enumerate(_payloads(recorded.path, recorded.key)):
         frame_id = -1
         try:
             keyframe = decode(Keyframe, payload)
             frame_id = keyframe.frame_id
-            rig = Rig(keyframe.intrinsics, keyframe.depth_scale_m, total, world_from_source)
-            pose = np.array(keyframe.world_from_camera)
-            images = {"color": keyframe.color, "depth": keyframe.depth, "mask": keyframe.mask}
-            yield rig.frame(index, frame_id, keyframe.stamp_ns, pose, **images)
-        except (DecodeError, FrameError) as error:
+            stamp_ns = round(index * options.frame_ns(1)) if options.rate_hz else keyframe.stamp_ns
+            pose = convention.of_matrix(np.array(keyframe.world_from_camera))
+            normaliser = normaliser_of((keyframe.intrinsics, keyframe.depth_scale_m))
+            make = normaliser.frame if wanted is None or wanted(index, normaliser.pose(pose)) else normaliser.bare
+            yield make(index, total, frame_id, stamp_ns, pose, _images(keyframe))
+        except (DecodeError, SourceError, *UNUSABLE) as error:
             yield BadFrame(frame_id=frame_id, reason=str(error), index=index, total=total)
 
 
-def _corrections(path: Path, robot: str, world_from_source: np.ndarray | None) -> Iterator[Correction]:
+def _corrections(recorded: Log, normaliser: Normaliser) -> Iterator[Correction]:
     """Pose updates, each stamped as the newest keyframe before it: who wrote it may have had another clock."""
-    stamp_ns = 0
-    for logged in read_log(path, (KEYFRAME, POSE_UPDATE)):
+    stamp_ns, robot = 0, recorded.first.robot
+    for logged in read_log(recorded.path, (KEYFRAME, POSE_UPDATE)):
         if logged.key not in (KEYFRAME.pattern(robot), POSE_UPDATE.pattern(robot)):
             continue
         try:
@@ -73,11 +144,10 @@ def _corrections(path: Path, robot: str, world_from_source: np.ndarray | None) -
         if isinstance(message, Keyframe):
             stamp_ns = message.stamp_ns
         elif isinstance(message, PoseUpdate):
-            poses = np.array(message.world_from_camera)
             yield Correction(
                 stamp_ns=stamp_ns,
                 frame_ids=np.array(message.frame_ids),
-                world_from_camera=poses if world_from_source is None else world_from_source @ poses,
+                world_from_camera=normaliser.pose(np.array(message.world_from_camera)),
             )
 
 
@@ -94,6 +164,6 @@ def _first(path: Path, key: str) -> Keyframe:
     raise SourceError(f"no keyframe in {path} can be read: they come from another version")
 
 
-def _robots(streams: list[Content]) -> str:
+def _robots(streams: Sequence[Content]) -> str:
     names = sorted({content.key.split("/")[1] for content in streams})
     return f"; it holds those of {', '.join(names)}" if names else ""

@@ -10,32 +10,29 @@ assumed. Ground truth: poses only; regions.json is read where one lies beside tr
 Source: github.com/cvg/nice-slam, src/utils/datasets.py, configs/Replica/replica.yaml, scripts/download_replica.sh.
 """
 
-from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
+from prior_sg.services.ingest.core.options import ReadOptions
 from prior_sg.services.ingest.sources.base import (
-    UP,
     Entry,
+    Found,
     FrameError,
-    Rig,
-    Source,
     SourceError,
     camera_of,
-    file_of,
-    levelling,
-    matrix_pose,
+    images_of,
     numbered,
-    read_json,
-    sequence,
-    table,
+    truth_beside,
 )
+from prior_sg.services.ingest.sources.poses import Convention
+from prior_sg.services.ingest.sources.tables import read_json, table
 
+NAME = "replica"
 POSES, IMAGES, CAMERA = "traj.txt", "results", "cam_params.json"
 LOOKS = f"{POSES} and {IMAGES}/frame*.jpg (Replica folder)"
-FRAME_NS = 1e9 / 30
+RATE_HZ = 30.0
 
 
 def fits(path: Path) -> bool:
@@ -43,8 +40,8 @@ def fits(path: Path) -> bool:
     return (path / POSES).is_file() and (path / IMAGES).is_dir()
 
 
-def load(path: Path, world_up: Sequence[float] = (), floor_m: float = 0.0) -> Source:
-    """A Replica folder as a source. Raises SourceError."""
+def load(path: Path, options: ReadOptions) -> Found:
+    """A Replica folder. Raises SourceError."""
     file = path / CAMERA if (path / CAMERA).is_file() else path.resolve().parent / CAMERA
     camera = read_json(file)
     try:
@@ -54,21 +51,31 @@ def load(path: Path, world_up: Sequence[float] = (), floor_m: float = 0.0) -> So
         raise SourceError(f"{file} is not a camera: {error!r}") from error
     if not scale > 0:
         raise SourceError(f"{file} is not a camera: scale must be positive")
-    intrinsics = camera_of(file, camera | {"width": camera.get("w"), "height": camera.get("h")})
-    colors, depths = numbered(path / IMAGES, r"frame(\d+)\.jpg"), numbered(path / IMAGES, r"depth(\d+)\.png")
-    poses = table(path / POSES, 1)
-    numbers = sorted(colors.keys() | depths.keys())
-    entries = [
-        Entry(number, round(number * FRAME_NS), partial(_read, colors, depths, poses, number)) for number in numbers
-    ]
-    rig = Rig(intrinsics, 1 / scale, len(entries), levelling(world_up or UP, floor_m))
-    return sequence("replica", path, rig, entries)
+    described = camera_of(file, camera | {"width": camera.get("w"), "height": camera.get("h")})
+    colors, depths = numbered(path / IMAGES, r"frame(\d+)\.(?:jpg|png)"), numbered(path / IMAGES, r"depth(\d+)\.png")
+    convention, poses = Convention().changed(options), table(path / POSES, 1)
+    return Found(
+        NAME,
+        path,
+        described,
+        1 / scale,
+        [
+            Entry(
+                number,
+                round(number * options.frame_ns(RATE_HZ)),
+                partial(_pose, poses, number, convention),
+                partial(images_of, colors, depths, number),
+            )
+            for number in sorted(colors.keys() | depths.keys())
+        ],
+        ground_truth=truth_beside(path),
+        convention=convention,
+        why=(f"{POSES} and {IMAGES}/ lie in it",),
+        assumed_hz=0.0 if options.rate_hz else RATE_HZ,
+    )
 
 
-def _read(
-    colors: dict[int, Path], depths: dict[int, Path], poses: list[list[str]], number: int
-) -> tuple[np.ndarray, bytes, bytes]:
+def _pose(poses: list[list[str]], number: int, convention: Convention) -> np.ndarray:
     if number >= len(poses):
         raise FrameError(f"{POSES} has no line for it")
-    pose = matrix_pose(" ".join(poses[number]))
-    return pose, file_of(colors, number, "colour"), file_of(depths, number, "depth")
+    return convention.of_text(" ".join(poses[number]))

@@ -12,7 +12,6 @@ export; 30 Hz are assumed. Ground truth: poses only; regions.json is read where 
 Source: github.com/ScanNet/ScanNet, README.md ("Data Organization", ".sens") and SensReader/python/SensorData.py.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -21,27 +20,29 @@ import cv2
 import numpy as np
 
 from prior_sg.schemas.frames import Intrinsics
+from prior_sg.services.ingest.core.options import ReadOptions
 from prior_sg.services.ingest.sources.base import (
     MILLIMETRE,
-    UP,
+    Camera,
     Entry,
+    Found,
     FrameError,
-    Rig,
-    Source,
+    Images,
     SourceError,
-    decode_image,
-    encode_image,
+    color_pixels,
     file_of,
     first_size,
-    levelling,
-    matrix_pose,
     numbered,
-    sequence,
+    truth_beside,
 )
+from prior_sg.services.ingest.sources.pixels import encoded
+from prior_sg.services.ingest.sources.poses import Convention
+from prior_sg.services.ingest.sources.tables import text_of
 
+NAME = "scannet"
 COLOR_CAMERA, DEPTH_CAMERA = "intrinsic/intrinsic_color.txt", "intrinsic/intrinsic_depth.txt"
 LOOKS = f"{COLOR_CAMERA} and {DEPTH_CAMERA} (ScanNet export)"
-FRAME_NS = 1e9 / 30
+RATE_HZ = 30.0
 
 
 def fits(path: Path) -> bool:
@@ -51,18 +52,17 @@ def fits(path: Path) -> bool:
 
 @dataclass(frozen=True)
 class Files:
-    """Where the frames of a scan lie, and how colour gets onto the pixels of depth."""
+    """Where the images of a scan lie, and how colour gets onto the pixels of depth."""
 
     colors: dict[int, Path]
     depths: dict[int, Path]
-    poses: dict[int, Path]
     color_size: tuple[int, int]  # width, height, pixels
     color_from_depth: np.ndarray  # 3 x 3, pixels of the same ray
     camera: Intrinsics  # of depth
 
 
-def load(path: Path, world_up: Sequence[float] = (), floor_m: float = 0.0) -> Source:
-    """A ScanNet export as a source. Raises SourceError."""
+def load(path: Path, options: ReadOptions) -> Found:
+    """A ScanNet export. Raises SourceError."""
     colors, depths = numbered(path / "color", r"(\d+)\.(?:jpg|png)"), numbered(path / "depth", r"(\d+)\.png")
     poses = numbered(path / "pose", r"(\d+)\.txt")
     depth_matrix, color_matrix = _matrix(path / DEPTH_CAMERA), _matrix(path / COLOR_CAMERA)
@@ -72,26 +72,40 @@ def load(path: Path, world_up: Sequence[float] = (), floor_m: float = 0.0) -> So
     except ValueError as error:
         raise SourceError(f"{path / DEPTH_CAMERA} is not a camera: {error}") from error
     color_from_depth = color_matrix @ np.linalg.inv(depth_matrix)
-    files = Files(colors, depths, poses, first_size(list(colors.values())), color_from_depth, camera)
-    entries = [
-        Entry(number, round(number * FRAME_NS), partial(_read, files, number))
-        for number in sorted(colors.keys() | depths.keys() | poses.keys())
-    ]
-    rig = Rig(camera, MILLIMETRE, len(entries), levelling(world_up or UP, floor_m))
-    return sequence("scannet", path, rig, entries)
+    files = Files(colors, depths, first_size(list(colors.values())), color_from_depth, camera)
+    convention = Convention().changed(options)
+
+    def entry(number: int) -> Entry:
+        return Entry(
+            number,
+            round(number * options.frame_ns(RATE_HZ)),
+            lambda: convention.of_text(file_of(poses, number, "pose")),
+            partial(_images, files, number),
+        )
+
+    return Found(
+        NAME,
+        path,
+        Camera(camera),
+        MILLIMETRE,
+        [entry(number) for number in sorted(colors.keys() | depths.keys() | poses.keys())],
+        ground_truth=truth_beside(path),
+        convention=convention,
+        why=(f"{COLOR_CAMERA} and {DEPTH_CAMERA} lie in it",),
+        assumed_hz=0.0 if options.rate_hz else RATE_HZ,
+    )
 
 
-def _read(files: Files, number: int) -> tuple[np.ndarray, bytes, bytes]:
-    pose = matrix_pose(file_of(files.poses, number, "pose"))
+def _images(files: Files, number: int) -> Images:
     depth = file_of(files.depths, number, "depth")
-    color = decode_image(file_of(files.colors, number, "colour"), "colour")
+    color = color_pixels(file_of(files.colors, number, "colour"))
     height_px, width_px = color.shape[:2]
     if (width_px, height_px) != files.color_size:
         raise FrameError(
             f"the colour image has {width_px} x {height_px} pixels, the first one "
             f"{files.color_size[0]} x {files.color_size[1]}"
         )
-    return pose, encode_image(resampled(color, files.color_from_depth, files.camera), ".jpg"), depth
+    return Images(encoded(resampled(color, files.color_from_depth, files.camera), ".jpg"), depth)
 
 
 def resampled(color: np.ndarray, color_from_depth: np.ndarray, camera: Intrinsics) -> np.ndarray:
@@ -118,8 +132,9 @@ def resampled(color: np.ndarray, color_from_depth: np.ndarray, camera: Intrinsic
 def _matrix(path: Path) -> np.ndarray:
     """The 3 x 3 camera matrix of a file with a 4 x 4 or 3 x 3 matrix."""
     try:
-        matrix = np.loadtxt(path)
-    except (OSError, ValueError) as error:
+        rows = [line.replace(",", " ").split() for line in text_of(path).splitlines() if line.strip()]
+        matrix = np.array(rows, float)
+    except ValueError as error:
         raise SourceError(f"{path} cannot be read: {error}") from error
     if matrix.shape not in ((4, 4), (3, 3)) or not (np.diag(matrix)[:2] > 0).all():
         raise SourceError(f"{path} is not a camera matrix of 4 x 4 numbers")

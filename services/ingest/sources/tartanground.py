@@ -14,35 +14,34 @@ are not read, regions.json is where one lies beside the poses.
 Source: github.com/castacks/tartanairpy, docs/modalities.rst, docs/tartanground.rst, examples/accumulate_pointcloud.py.
 """
 
-from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from prior_sg.schemas.frames import Intrinsics
+from prior_sg.services.ingest.core.options import ReadOptions
 from prior_sg.services.ingest.sources.base import (
     MILLIMETRE,
+    Camera,
     Entry,
+    Found,
     FrameError,
-    Rig,
-    Source,
-    decode_image,
+    Images,
+    depth_pixels,
     first_size,
-    levelling,
-    millimetre_png,
-    quaternion_pose,
     read_bytes,
-    sequence,
-    table,
+    truth_beside,
 )
+from prior_sg.services.ingest.sources.poses import Convention
+from prior_sg.services.ingest.sources.tables import table
 
+NAME = "tartanground"
 CAMERA = "lcam_front"
 POSES, COLORS, DEPTHS = f"pose_{CAMERA}.txt", f"image_{CAMERA}", f"depth_{CAMERA}"
 LOOKS = f"{POSES}, {COLORS}/ and {DEPTHS}/ (TartanGround trajectory)"
 UP = (0.0, 0.0, -1.0)
-FRAME_NS = 1e9 / 10
-NED_FROM_CAMERA = np.array(((0.0, 0, 1, 0), (1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 0, 1)))
+RATE_HZ = 10.0
 
 
 def fits(path: Path) -> bool:
@@ -50,29 +49,43 @@ def fits(path: Path) -> bool:
     return (path / POSES).is_file() and (path / COLORS).is_dir() and (path / DEPTHS).is_dir()
 
 
-def load(path: Path, world_up: Sequence[float] = (), floor_m: float = 0.0) -> Source:
-    """A TartanGround trajectory as a source. Raises SourceError."""
+def load(path: Path, options: ReadOptions) -> Found:
+    """A TartanGround trajectory. Raises SourceError."""
     width_px, height_px = first_size(sorted((path / COLORS).glob(f"*_{CAMERA}.png")))
     focal_px = width_px / 2
     intrinsics = Intrinsics(width_px, height_px, focal_px, focal_px, (width_px - 1) / 2, (height_px - 1) / 2)
+    convention = Convention(axes="ned").changed(options)
     entries = [
-        Entry(number, round(number * FRAME_NS), partial(_read, path, number, words))
+        Entry(
+            number,
+            round(number * options.frame_ns(RATE_HZ)),
+            partial(convention.of_words, words),
+            partial(_images, path, number),
+        )
         for number, words in enumerate(table(path / POSES, 7))
     ]
-    rig = Rig(intrinsics, MILLIMETRE, len(entries), levelling(world_up or UP, floor_m))
-    return sequence("tartanground", path, rig, entries)
+    return Found(
+        NAME,
+        path,
+        Camera(intrinsics),
+        MILLIMETRE,
+        entries,
+        up=UP,
+        ground_truth=truth_beside(path),
+        convention=convention,
+        why=(f"{POSES}, {COLORS}/ and {DEPTHS}/ lie in it",),
+        assumed_hz=0.0 if options.rate_hz else RATE_HZ,
+    )
 
 
-def _read(path: Path, number: int, words: list[str]) -> tuple[np.ndarray, bytes, bytes]:
-    pose = quaternion_pose(words) @ NED_FROM_CAMERA
+def _images(path: Path, number: int) -> Images:
     color = read_bytes(path / COLORS / f"{number:06d}_{CAMERA}.png")
-    depth_m = unpacked(read_bytes(path / DEPTHS / f"{number:06d}_{CAMERA}_depth.png"))
-    return pose, color, millimetre_png(depth_m)
+    return Images(color, unpacked(read_bytes(path / DEPTHS / f"{number:06d}_{CAMERA}_depth.png")))
 
 
 def unpacked(png: bytes) -> np.ndarray:
     """Depth in metres (h, w) of a packed depth image. Raises FrameError."""
-    packed = decode_image(png, "depth")
+    packed = depth_pixels(png)
     if packed.dtype != np.uint8 or packed.ndim != 3 or packed.shape[2] != 4:
         raise FrameError("the depth image does not have four channels of 8 bits")
     return np.ascontiguousarray(packed).view("<f4")[..., 0].astype(np.float64)

@@ -15,34 +15,35 @@ Source: "File Formats" and "Intrinsic Camera Calibration" on cvg.cit.tum.de/data
 
 import re
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from prior_sg.schemas.frames import Intrinsics
+from prior_sg.services.ingest.core.options import ReadOptions
 from prior_sg.services.ingest.sources.base import (
     CAMERA,
-    UP,
+    Camera,
     Entry,
+    Found,
     FrameError,
-    Rig,
-    Source,
+    Images,
     SourceError,
     camera_of,
-    levelling,
-    quaternion_pose,
     read_bytes,
-    read_json,
-    sequence,
-    stamp_ns,
-    table,
+    truth_beside,
 )
+from prior_sg.services.ingest.sources.poses import Convention
+from prior_sg.services.ingest.sources.tables import FEW, lines_of, named, read_json, stamps_ns, table
 
+NAME = "tum"
 COLORS, DEPTHS, POSES = "rgb.txt", "depth.txt", "groundtruth.txt"
 LOOKS = f"{COLORS}, {DEPTHS} and {POSES} (TUM RGB-D folder)"
 WITHIN_NS = 20_000_000  # associate.py's largest difference
 DEPTH_SCALE_M = 1 / 5000
+NEARLY_NONE, MOST, NEARLY_ALL = 0.1, 0.5, 0.9  # shares of the colour images that find a partner
 PUBLISHED = {
     "freiburg1": Intrinsics(640, 480, 517.3, 516.5, 318.6, 255.3),
     "freiburg2": Intrinsics(640, 480, 520.9, 521.0, 325.1, 249.7),
@@ -55,29 +56,41 @@ def fits(path: Path) -> bool:
     return all((path / name).is_file() for name in (COLORS, DEPTHS, POSES))
 
 
-def load(path: Path, world_up: Sequence[float] = (), floor_m: float = 0.0) -> Source:
-    """A TUM RGB-D folder as a source. Raises SourceError."""
-    intrinsics, depth_scale_m = _camera(path)
-    colors, depths, poses = (_stamped(path / n, columns) for n, columns in ((COLORS, 2), (DEPTHS, 2), (POSES, 8)))
-    stamps_ns = [stamp for stamp, _ in colors]
-    depth_of = associate(stamps_ns, [stamp for stamp, _ in depths], WITHIN_NS)
-    pose_of = associate(stamps_ns, [stamp for stamp, _ in poses], WITHIN_NS)
-    entries = [
-        Entry(
-            index,
-            stamp,
-            partial(
-                _read,
-                path,
-                words[0],
-                depths[depth_of[index]][1][0] if index in depth_of else None,
-                poses[pose_of[index]][1] if index in pose_of else None,
-            ),
+@dataclass(frozen=True)
+class Stamped:
+    """The lines of one list, by stamp."""
+
+    path: Path
+    stamps_ns: list[int]
+    lines: list[list[str]]  # the words behind the stamp
+
+
+def load(path: Path, options: ReadOptions) -> Found:
+    """A TUM RGB-D folder. Raises SourceError."""
+    camera, depth_scale_m = _camera(path, options)
+    (colors, said), (depths, _) = (_stamped(path / name, 2, options) for name in (COLORS, DEPTHS))
+    poses, poses_said = _stamped(path / POSES, 8, options)
+    depth_of, depth_shift = _partners(colors, depths, None)
+    pose_of, pose_shift = _partners(colors, poses, options.stamp_offset_s)
+    convention = Convention().changed(options)
+    entries = []
+    for index, (stamp, words) in enumerate(zip(colors.stamps_ns, colors.lines, strict=True)):
+        depth = depths.lines[depth_of[index]][0] if index in depth_of else None
+        pose = poses.lines[pose_of[index]] if index in pose_of else None
+        stamp_ns = round(index * options.frame_ns(1)) if options.rate_hz else stamp
+        entries.append(
+            Entry(index, stamp_ns, partial(_pose, depth, pose, convention), partial(_images, path, words[0], depth))
         )
-        for index, (stamp, words) in enumerate(colors)
-    ]
-    return sequence(
-        "tum", path, Rig(intrinsics, depth_scale_m, len(entries), levelling(world_up or UP, floor_m)), entries
+    return Found(
+        NAME,
+        path,
+        camera,
+        depth_scale_m,
+        entries,
+        ground_truth=truth_beside(path),
+        convention=convention,
+        why=(f"{COLORS}, {DEPTHS} and {POSES} lie in it",),
+        notes=tuple(filter(None, (said, poses_said, depth_shift, pose_shift))),
     )
 
 
@@ -101,29 +114,95 @@ def associate(first_ns: Sequence[int], second_ns: Sequence[int], within_ns: int)
     return partner
 
 
-def _read(path: Path, color: str, depth: str | None, pose: list[str] | None) -> tuple[np.ndarray, bytes, bytes]:
+def _partners(colors: Stamped, others: Stamped, offset_s: float | None) -> tuple[dict[int, int], str]:
+    """Index in `others` of each colour image that finds one, and what was shifted to find it. Raises SourceError."""
+    shift_ns = round((offset_s or 0.0) * 1e9)
+    found = associate(colors.stamps_ns, [stamp + shift_ns for stamp in others.stamps_ns], WITHIN_NS)
+    count = len(colors.stamps_ns)
+    note = f"{offset_s:g} s are added to the stamps of {others.path.name}, as told" if offset_s else ""
+    if count < FEW or len(found) >= MOST * count:
+        return found, note
+    if offset_s is None and (best := _constant_shift(colors.stamps_ns, others.stamps_ns)) is not None:
+        shifted = associate(colors.stamps_ns, [stamp + best for stamp in others.stamps_ns], WITHIN_NS)
+        return shifted, (
+            f"the clock of {others.path.name} is another: {best / 1e9:+.3f} s are added to its stamps, with which "
+            f"{len(shifted)} of {count} colour images find a line (say otherwise with --stamp-offset)"
+        )
+    if len(found) < NEARLY_NONE * count:
+        begin_s = (others.stamps_ns[0] - colors.stamps_ns[0]) / 1e9 if others.stamps_ns else 0.0
+        raise SourceError(
+            f"{len(found)} of {count} colour images find a line within 20 ms in {others.path}, which begins "
+            f"{begin_s:+.3f} s after {COLORS}: give the difference of the clocks with --stamp-offset SECONDS"
+        )
+    return found, note
+
+
+def _constant_shift(first_ns: Sequence[int], second_ns: Sequence[int]) -> int | None:
+    """The one constant that, added to `second_ns`, gives nearly all of `first_ns` a partner; None when several do.
+
+    Candidates are the differences between the first stamps of one list and those of the other; those that
+    associate as many lie within a few times the tolerance of each other, or the constant cannot be told.
+    """
+    first, second = np.asarray(first_ns, np.int64), np.asarray(second_ns, np.int64)
+    if not len(second):
+        return None
+    anchors = first[np.unique(np.linspace(0, len(first) - 1, 8).astype(int))]
+    candidates = np.unique((anchors[:, None] - second[None, :]).ravel())
+    ends = np.concatenate((first[:1] - second[:1], first[-1:] - second[-1:]))
+    candidates = np.unique(np.concatenate((candidates[:: max(1, len(candidates) // 20_000)], ends)))
+    counts = np.array([_met(first, second + shift) for shift in candidates])
+    if counts.max() < NEARLY_ALL * len(first):
+        return None
+    best = candidates[counts == counts.max()]
+    if best[-1] - best[0] > 2 * WITHIN_NS:
+        return None
+    return int(np.median(best))
+
+
+def _met(first: np.ndarray, second: np.ndarray) -> int:
+    """How many of `first` have one of `second` (both rising) within the tolerance."""
+    begins = np.searchsorted(second, first - WITHIN_NS, side="right")
+    ends = np.searchsorted(second, first + WITHIN_NS, side="left")
+    return int((ends > begins).sum())
+
+
+def _pose(depth: str | None, pose: list[str] | None, convention: Convention) -> np.ndarray:
     if depth is None or pose is None:
         raise FrameError(f"no {'depth image' if depth is None else 'pose'} lies within 20 ms of it")
-    return quaternion_pose(pose), read_bytes(path / color), read_bytes(path / depth)
+    return convention.of_words(pose)
 
 
-def _stamped(path: Path, columns: int) -> list[tuple[int, list[str]]]:
-    """Stamp (nanoseconds) and the other words of each line, by stamp."""
-    return sorted((stamp_ns(row[0], path), row[1:]) for row in table(path, columns))
+def _images(path: Path, color: str, depth: str | None) -> Images:
+    return Images(read_bytes(path / color), read_bytes(path / (depth or "")))
 
 
-def _camera(path: Path) -> tuple[Intrinsics, float]:
+def _stamped(path: Path, columns: int, options: ReadOptions) -> tuple[Stamped, str]:
+    """The lines of a list by stamp, and a note on its unit; lines without a stamp are left out. Raises SourceError."""
+    if columns == 2:  # a file's name may have blanks
+        rows: list[list[str]] = [list(named(line)) for line in lines_of(path)]
+    else:
+        rows = table(path, columns)
+    if rows and re.match(r"[A-Za-z]", rows[0][0]) and rows[0][0].lower() not in ("nan", "inf"):
+        rows = rows[1:]  # names of columns without the sign of a comment
+    stamps, note = stamps_ns([row[0] for row in rows], path, "s", options.stamp_unit)
+    lines = sorted((stamp, row[1:]) for stamp, row in zip(stamps, rows, strict=True) if stamp is not None)
+    return Stamped(path, [stamp for stamp, _ in lines], [words for _, words in lines]), note
+
+
+def _camera(path: Path, options: ReadOptions) -> tuple[Camera, float]:
     if (path / CAMERA).is_file():
         camera = read_json(path / CAMERA)
-        intrinsics = camera_of(path / CAMERA, camera)
+        described = camera_of(path / CAMERA, camera)
         try:
-            return intrinsics, float(camera.get("depth_scale_m", DEPTH_SCALE_M))
+            return described, float(camera.get("depth_scale_m", DEPTH_SCALE_M))
         except (TypeError, ValueError) as error:
             raise SourceError(f"{path / CAMERA} is not a camera: {error!r}") from error
     match = re.search(r"freiburg[123]", path.resolve().name)
-    if match is None:
-        raise SourceError(
-            f"the camera of {path} is unknown: put freiburg1, freiburg2 or freiburg3 into the folder's name, "
-            f"or a {CAMERA} with width, height, fx, fy, cx, cy beside {COLORS}"
-        )
-    return PUBLISHED[match[0]], DEPTH_SCALE_M
+    if match is not None:
+        return Camera(PUBLISHED[match[0]], published=True), DEPTH_SCALE_M
+    if options.intrinsics:
+        return Camera(PUBLISHED["freiburg3"], published=True), DEPTH_SCALE_M
+    raise SourceError(
+        f"the camera of {path} is unknown: put freiburg1, freiburg2 or freiburg3 into the folder's name, give "
+        f"--intrinsics FX,FY,CX,CY, or a {CAMERA} with width, height, fx, fy, cx, cy beside {COLORS}"
+    )

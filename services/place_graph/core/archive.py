@@ -23,7 +23,7 @@ class Kept:
 
 
 @dataclass
-class Archive:
+class DepthArchive:
     """The newest keyframes by frame id, in order of arrival, at most `limit_bytes` of them."""
 
     limit_bytes: float

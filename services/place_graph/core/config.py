@@ -1,9 +1,14 @@
-"""Settings of the place graph, under Hydra's names where Hydra has them (pure)."""
+"""Settings of the place graph, under Hydra's names where Hydra has them, and the rules they make in voxels (pure)."""
 
 from typing import Any, ClassVar, Literal
 
 import msgspec
 
+from prior_sg.services.images import MAX_PRINCIPAL_OFFSET
+from prior_sg.services.place_graph.core.ground import GroundRules
+from prior_sg.services.place_graph.core.skeleton.distance import FieldRules
+from prior_sg.services.place_graph.core.skeleton.graph import GraphRules
+from prior_sg.services.place_graph.core.skeleton.places import ExtractionRules
 from prior_sg.services.place_graph.core.trajectory import Bounds
 from prior_sg.services.place_graph.core.volume import tsdf
 
@@ -136,7 +141,7 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
     relocalised_after: int = 5  # keyframes that go on from a jump before it is believed ...
     max_contradiction: float = 0.4  # ... unless more of their depth contradicts the map: 0.1 to 0.33 with true poses of
     # the development sequences, above 0.58 half a metre beside them
-    max_principal_offset: float = 0.2  # share of the image by which the principal point may be off its middle
+    max_principal_offset: float = MAX_PRINCIPAL_OFFSET  # share by which the principal point may be off the middle
 
     def __post_init__(self) -> None:
         if not 0 < self.voxel_m <= min(self.truncation_m, self.compression_distance_m):
@@ -163,6 +168,55 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
             max_range_m=self.max_range_m,
             max_weight=self.max_weight,
             constant_weight=self.use_constant_weight,
+        )
+
+    @property
+    def field_rules(self) -> FieldRules:
+        """How far distances reach and what is on the diagram."""
+        return FieldRules(
+            max_distance=self.voxels(self.max_distance_m),
+            voronoi_min_distance=self.voxels(max(self.voronoi_min_distance_m, self.min_distance_m)),
+            parent_l1=self.parent_l1_separation,
+            parent_cos=self.parent_cos_angle_separation,
+        )
+
+    @property
+    def extraction_rules(self) -> ExtractionRules:
+        """What becomes a place."""
+        return ExtractionRules(
+            cell=self.cell_voxels,
+            min_radius=self.voxels(self.min_node_distance_m),
+            merge=self.voxels(self.node_merge_distance_m),
+            widest=self.merge_policy == "distance",
+        )
+
+    @property
+    def graph_rules(self) -> GraphRules:
+        """What makes places one and what joins them."""
+        return GraphRules(
+            cell=self.cell_voxels,
+            merge=self.voxels(self.node_merge_distance_m),
+            edge=self.voxels(self.min_edge_distance_m),
+            reach=self.voxels(self.freespace_max_length_m) if self.add_freespace_edges else 0.0,
+            free=self.voxels(self.freespace_min_clearance_m),
+            check=self.freespace_num_nodes_to_check,
+            find=self.freespace_num_neighbors_to_find,
+            overlap=self.voxels(self.overlap_min_clearance_m),
+            overlap_check=self.overlap_num_neighbors_to_check if self.add_overlap_edges else 0,
+        )
+
+    @property
+    def ground_rules(self) -> GroundRules:
+        """What is ground and how it is divided."""
+        return GroundRules(
+            clearance=round(self.voxels(self.surface_min_clearance_m)),
+            step=max(1, round(self.voxels(self.surface_max_step_m))),
+            slope=self.surface_max_slope,
+            piece=self.voxels(self.pure_final_place_size_m),
+            points=self.min_final_place_points,
+            cluster=round(self.min_cluster_area_m2 / self.voxel_m**2),
+            overlap=self.voxels(self.place_overlap_threshold_m),
+            rise=self.voxels(self.place_max_neighbor_z_diff_m),
         )
 
     @property

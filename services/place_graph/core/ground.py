@@ -10,13 +10,14 @@ line between them, and whose ellipses overlap are joined.
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 from numba import njit
 
-from prior_sg.services.place_graph.core.skeleton.graph import Changes, Place, PlaceGraph, Rules, Voxel
+from prior_sg.services.place_graph.core.columns import GroundColumns
+from prior_sg.services.place_graph.core.skeleton.graph import Changes, GraphRules, Place, PlaceGraph, Voxel
 from prior_sg.services.place_graph.core.volume.grid import FREE, OCCUPIED, Box, VoxelGrid
 
 TILE_PIECES = 4  # side of a tile in pieces of the final size
@@ -56,7 +57,7 @@ class GroundGraph(PlaceGraph):
     """Places on the ground with lasting ids, and the edges between them."""
 
     def __init__(self, rules: GroundRules) -> None:
-        super().__init__(Rules(cell=max(1, round(rules.piece)), merge=rules.piece, edge=0, reach=0, free=0))
+        super().__init__(GraphRules(cell=max(1, round(rules.piece)), merge=rules.piece, edge=0, reach=0, free=0))
         self.ground = rules
         self.pieces: dict[int, Piece] = {}
 
@@ -72,17 +73,17 @@ class GroundGraph(PlaceGraph):
         self._relink(Box(np.array((*low * tile, z_low)), np.array((*high * tile, z_high))), changes)
         return changes
 
-    def tell(self, ids: Iterable[int], voxel_m: float) -> dict[str, Any]:
-        """Array fields of the PlaceDelta that tells ellipse and hull of places."""
+    def shapes(self, ids: Iterable[int], voxel_m: float) -> GroundColumns:
+        """Ellipse and hull of places, ids ascending."""
         pieces = {i: self.pieces[i] for i in sorted(ids) if i in self.pieces}
-        shapes = [(*(piece.half_axes * voxel_m), piece.angle_rad) for piece in pieces.values()]
+        ellipses = [(*(piece.half_axes * voxel_m), piece.angle_rad) for piece in pieces.values()]
         hulls = [np.empty((0, 2)), *((piece.hull + 0.5) * voxel_m for piece in pieces.values())]
-        return {
-            "surface_ids": np.array(list(pieces), np.int64),
-            "ellipses": np.array(shapes, np.float32).reshape(-1, 3),
-            "hull_counts": np.array([len(piece.hull) for piece in pieces.values()], np.int64),
-            "hulls_m": np.concatenate(hulls).astype(np.float32),
-        }
+        return GroundColumns(
+            surface_ids=np.array(list(pieces), np.int64),
+            ellipses=np.array(ellipses, np.float32).reshape(-1, 3),
+            hull_counts=np.array([len(piece.hull) for piece in pieces.values()], np.int64),
+            hulls_m=np.concatenate(hulls).astype(np.float32),
+        )
 
     def _renew_tile(self, grid: VoxelGrid, tile: tuple[int, int], changes: Changes) -> None:
         side = self.ground.tile

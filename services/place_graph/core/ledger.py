@@ -1,15 +1,14 @@
 """What readers of the place graph know, and the delta that brings them up to date (pure)."""
 
-from typing import Any
-
 import numpy as np
 
+from prior_sg.services.place_graph.core.columns import EdgeColumns, GoneColumns, GraphColumns, PlaceColumns
 from prior_sg.services.place_graph.core.skeleton.graph import Changes, Place, PlaceGraph
 
 Pair = tuple[int, int]
 
 
-class Published:
+class PlaceLedger:
     """The graph as published: without components that are too small, and without changes that are too small."""
 
     def __init__(self) -> None:
@@ -18,8 +17,8 @@ class Published:
 
     def update(
         self, graph: PlaceGraph, changes: Changes, voxel_m: float, min_component_size: int, min_change_m: float
-    ) -> dict[str, Any]:
-        """Array fields of the PlaceDelta that follows from `changes`; what it says is remembered as published."""
+    ) -> GraphColumns:
+        """What readers must hear of `changes`; it is remembered as told."""
         affected = _within_hops(graph, changes.touched, min_component_size)
         shown = {i for i in affected if i in graph.places and _component_reaches(graph, i, min_component_size)}
         gone = [i for i in affected if i in self.places and i not in shown]
@@ -36,22 +35,20 @@ class Published:
             self.edges.setdefault(a, {})[b] = self.edges.setdefault(b, {})[a] = clearance
         implied = set(removed)
         explicit = [pair for pair in lost_edges if not implied.intersection(pair)]
-        return _place_fields([(i, self.places[i]) for i in upserts], voxel_m) | {
-            "removed_ids": np.array(removed, np.int64),
-            "merged_ids": np.array(merged, np.int64).reshape(-1, 2),
-            "removed_edges": np.array(explicit, np.int64).reshape(-1, 2),
-            **_edge_fields(changed_edges, voxel_m),
-        }
+        return GraphColumns(
+            _place_columns([(i, self.places[i]) for i in upserts], voxel_m),
+            _edge_columns(changed_edges, voxel_m),
+            _gone_columns(removed, merged, explicit),
+        )
 
-    def snapshot(self, voxel_m: float) -> dict[str, Any]:
-        """Array fields of the PlaceDelta that tells everything."""
+    def snapshot(self, voxel_m: float) -> GraphColumns:
+        """All that readers have been told, ids ascending."""
         edges = sorted(((a, b), c) for a, links in self.edges.items() for b, c in links.items() if a < b)
-        return _place_fields(sorted(self.places.items()), voxel_m) | {
-            "removed_ids": np.empty(0, np.int64),
-            "merged_ids": np.empty((0, 2), np.int64),
-            "removed_edges": np.empty((0, 2), np.int64),
-            **_edge_fields(edges, voxel_m),
-        }
+        return GraphColumns(
+            _place_columns(sorted(self.places.items()), voxel_m),
+            _edge_columns(edges, voxel_m),
+            _gone_columns([], [], []),
+        )
 
     def _edge_changes(
         self, graph: PlaceGraph, affected: list[int], shown: set[int], voxel_m: float, min_change_m: float
@@ -103,18 +100,26 @@ def _differs(known: Place | None, place: Place, voxel_m: float, min_change_m: fl
     return moved > min_change_m or abs(known.d2**0.5 - place.d2**0.5) * voxel_m > min_change_m
 
 
-def _place_fields(places: list[tuple[int, Place]], voxel_m: float) -> dict[str, Any]:
+def _place_columns(places: list[tuple[int, Place]], voxel_m: float) -> PlaceColumns:
     voxels = np.array([p.voxel for _, p in places], np.float64).reshape(-1, 3)
-    return {
-        "place_ids": np.array([i for i, _ in places], np.int64),
-        "positions_m": ((voxels + 0.5) * voxel_m).astype(np.float32),
-        "radii_m": (np.sqrt([float(p.d2) for _, p in places]) * voxel_m).astype(np.float32),
-        "basis_points": np.array([p.basis for _, p in places], np.int16),
-    }
+    return PlaceColumns(
+        place_ids=np.array([i for i, _ in places], np.int64),
+        positions_m=((voxels + 0.5) * voxel_m).astype(np.float32),
+        radii_m=(np.sqrt([float(p.d2) for _, p in places]) * voxel_m).astype(np.float32),
+        basis_points=np.array([p.basis for _, p in places], np.int16),
+    )
 
 
-def _edge_fields(edges: list[tuple[Pair, int]], voxel_m: float) -> dict[str, Any]:
-    return {
-        "edges": np.array([pair for pair, _ in edges], np.int64).reshape(-1, 2),
-        "clearances_m": (np.sqrt([float(c) for _, c in edges]) * voxel_m).astype(np.float32),
-    }
+def _edge_columns(edges: list[tuple[Pair, int]], voxel_m: float) -> EdgeColumns:
+    return EdgeColumns(
+        edges=np.array([pair for pair, _ in edges], np.int64).reshape(-1, 2),
+        clearances_m=(np.sqrt([float(c) for _, c in edges]) * voxel_m).astype(np.float32),
+    )
+
+
+def _gone_columns(removed: list[int], merged: list[Pair], edges: list[Pair]) -> GoneColumns:
+    return GoneColumns(
+        removed_ids=np.array(removed, np.int64),
+        merged_ids=np.array(merged, np.int64).reshape(-1, 2),
+        removed_edges=np.array(edges, np.int64).reshape(-1, 2),
+    )

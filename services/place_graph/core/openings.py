@@ -7,11 +7,11 @@ surfaces, whose normals cancel, and a doorway not yet passed adds up to its widt
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from numba import njit
 
+from prior_sg.services.place_graph.core.columns import OpeningColumns
 from prior_sg.services.place_graph.core.skeleton.graph import PlaceGraph
 from prior_sg.services.place_graph.core.volume.grid import FREE, UNOBSERVED, Box, VoxelGrid
 
@@ -41,8 +41,8 @@ class Openings:
             self.normals |= {i: normal for i, normal in zip(rivals, found, strict=True) if i in wanted}
         return set(near)
 
-    def tell(self, ids: Iterable[int], shown: Iterable[int], voxel_m: float, min_area_m2: float) -> dict[str, Any]:
-        """Array fields of the PlaceDelta that says what is new of the places `ids`; only those `shown` are told."""
+    def update(self, ids: Iterable[int], shown: Iterable[int], voxel_m: float, min_area_m2: float) -> OpeningColumns:
+        """What readers must hear of the places `ids`, of those that are `shown`; it is remembered as told."""
         news: dict[int, np.ndarray] = {}
         for place_id in sorted(ids):
             normal = self.normals.get(place_id, np.zeros(3, np.int64)) if place_id in shown else np.zeros(3, np.int64)
@@ -54,7 +54,7 @@ class Openings:
             self.told[place_id] = normal
             if not normal.any():
                 del self.told[place_id]
-        return _fields({i: normal for i, normal in news.items() if i in shown}, voxel_m)
+        return _columns({i: normal for i, normal in news.items() if i in shown}, voxel_m)
 
     def forget(self, ids: Iterable[int]) -> None:
         """Places that are no more."""
@@ -62,9 +62,9 @@ class Openings:
             self.normals.pop(place_id, None)
             self.told.pop(place_id, None)
 
-    def all(self, voxel_m: float) -> dict[str, Any]:
-        """Array fields of a snapshot."""
-        return _fields(dict(sorted(self.told.items())), voxel_m)
+    def snapshot(self, voxel_m: float) -> OpeningColumns:
+        """All that readers have been told, ids ascending."""
+        return _columns(dict(sorted(self.told.items())), voxel_m)
 
 
 @njit(cache=True, nogil=True)
@@ -102,12 +102,12 @@ def _differs(told: np.ndarray, now: np.ndarray) -> bool:
     return abs(after - before) > TOLD_AREA * before or float(told @ now) < TOLD_COSINE * before * after
 
 
-def _fields(openings: dict[int, np.ndarray], voxel_m: float) -> dict[str, Any]:
+def _columns(openings: dict[int, np.ndarray], voxel_m: float) -> OpeningColumns:
     normals = np.array(list(openings.values()), np.float64).reshape(-1, 3)
     lengths = np.linalg.norm(normals, axis=1)
     directions = np.divide(normals, lengths[:, None], out=np.zeros_like(normals), where=lengths[:, None] > 0)
-    return {
-        "frontier_ids": np.array(list(openings), np.int64),
-        "frontier_directions": directions.astype(np.float32),
-        "frontier_areas_m2": (lengths * voxel_m**2).astype(np.float32),
-    }
+    return OpeningColumns(
+        frontier_ids=np.array(list(openings), np.int64),
+        frontier_directions=directions.astype(np.float32),
+        frontier_areas_m2=(lengths * voxel_m**2).astype(np.float32),
+    )

@@ -35,7 +35,7 @@ class Bounds:
 
 
 @dataclass
-class Track:
+class Trajectory:
     """Stamps and camera centres believed so far, and those of a jump that goes on."""
 
     believed: list[Point] = field(default_factory=list)  # by stamp

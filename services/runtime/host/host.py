@@ -52,10 +52,6 @@ class Work:
     message: Message | None  # None = malformed
 
 
-class UndeclaredError(Exception):
-    """A service wrote or asked what its declaration does not name: a fault in the service."""
-
-
 class Host:
     """One running service. `await run()` ends when `stop` is called or the service fails (then it raises)."""
 
@@ -128,9 +124,7 @@ class Host:
         self._outbox.journal("START", inline=encode(started))
         log.info("started", extra={"robot": robot, "config": msgspec.to_builtins(self.cfg)})
         for query in service.answers:
-            fields = {name: robot if name == "robot" else "*" for name in query.request.__struct_fields__}
-            key = query.key.format(**(fields | service.key_fields(self.cfg)))
-            self.bus.serve(key, partial(self._queue_question, query))
+            self.bus.serve(service.answer_key(query, robot, self.cfg), partial(self._queue_question, query))
         self.bus.serve(status_key(service.name, self.identity.instance), self._answer_status)
         for topic in service.writes:
             if topic.delivery == "job":
@@ -293,8 +287,7 @@ class Host:
         self._timing.stepped(started_s)
 
     def _publish(self, topic: Topic, message: Message) -> None:
-        if topic not in self.service.writes:
-            raise UndeclaredError(f"{self.service.name} wrote {topic.name}, which it does not declare")
+        self.service.check_write(topic)
         self.inbox.of(topic.name).published += 1
         if topic.delivery == "job":
             job_id = (message.robot, message.frame_id)  # type: ignore[attr-defined]
@@ -304,8 +297,7 @@ class Host:
             self._outbox.put(topic, message)
 
     def _ask(self, ask: Ask) -> None:
-        if ask.query not in (*self.service.asks, *self.service.errands):
-            raise UndeclaredError(f"{self.service.name} asked {ask.query.name}, which it does not declare")
+        self.service.check_ask(ask)
         self._asks.ask(ask)
 
     def _job_ended(self, topic: Topic) -> Callable[[Ended], None]:

@@ -89,6 +89,7 @@ class Graph:
     objects: dict[int, SceneObject] = field(default_factory=dict)
     alignment: Alignment = field(default_factory=Alignment)
     task: Task | None = None
+    origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of the world, as the place graph says
     place_cursor: Cursor = field(default_factory=Cursor)
     region_cursor: Cursor = field(default_factory=Cursor)
     object_cursor: Cursor = field(default_factory=Cursor)
@@ -133,6 +134,7 @@ def apply_places(graph: Graph, delta: PlaceDelta) -> Changes:
     for (a, b), clearance_m in zip(delta.edges.tolist(), delta.clearances_m.tolist(), strict=True):
         _put_edge(graph, a, b, clearance_m, changes)
     _put_details(graph, delta, changes)
+    graph.origin_m = delta.origin_m
     graph.place_cursor = Cursor(delta.epoch, delta.revision, delta.stamp_ns)
     graph.revision += 1
     return changes
@@ -267,6 +269,7 @@ def scene(graph: Graph) -> Scene:
             [place for place, belief in zip(ids, beliefs, strict=True) if belief.predicted], np.int64
         ),
         objects=[graph.objects[number] for number in sorted(graph.objects)],
+        origin_m=graph.origin_m,
         **_details(graph),
     )
 

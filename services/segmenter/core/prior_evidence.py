@@ -9,17 +9,18 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from prior_sg.schemas.priors import PriorEvidence
+from prior_sg.services.segmenter.core.config import Config
 from prior_sg.services.segmenter.core.experts.context import ObjectView
 from prior_sg.services.segmenter.core.map.table import UNLABELLED
 from prior_sg.services.segmenter.core.regions.components import OBJECT_REACH_M
-from prior_sg.services.segmenter.core.state import Config, State
+from prior_sg.services.segmenter.core.state import State
 
 
 def evidence(state: State, cfg: Config) -> PriorEvidence | None:
     """Totals of the map as it is; None without a prior in force, or without regions large enough to count."""
-    if state.alignment is None:
+    if state.aim.in_force is None:
         return None
-    places, prior, count = state.places, state.alignment.prior, len(state.alignment.labels)
+    places, prior, count = state.map.places, state.aim.in_force.prior, len(state.aim.in_force.labels)
     rows = np.flatnonzero(places.labels != UNLABELLED)
     ids, first, sizes = np.unique(places.regions[rows], return_index=True, return_counts=True)
     large = sizes >= cfg.evidence_places
@@ -29,23 +30,23 @@ def evidence(state: State, cfg: Config) -> PriorEvidence | None:
     instances = np.bincount(labels, minlength=count).astype(np.float32)
     pairs = np.outer(instances, instances)
     np.fill_diagonal(pairs, instances * (instances - 1) / 2)
-    looked = bool((state.objects.answers > 0).any())
-    held = _held(state.objects, state.graph.positions_m, places.regions, ids)
+    looked = bool((state.objects.view.answers > 0).any())
+    held = _held(state.objects.view, state.map.graph.positions_m, places.regions, ids)
     return PriorEvidence(
         robot=state.robot,
-        epoch=state.graph_epoch,
+        epoch=state.map.epoch,
         stamp_ns=state.stamp_ns,
-        prior_digest=state.alignment.digest,
+        prior_digest=state.aim.in_force.digest,
         environment=prior.environment,
         task=prior.task,
         vocabulary=prior.vocabulary,
-        regions=state.alignment.labels,
+        regions=state.aim.in_force.labels,
         places=places.posteriors[rows].sum(axis=0).astype(np.float32),
         instances=instances,
         objects=[item.name for item in prior.objects] if looked else [],
         holding=_by_label(held, labels, count) if looked else np.zeros((count, 0), np.float32),
         pairs=pairs.astype(np.float32),
-        touching=_touching(places.regions[state.graph.edges], ids, labels, count),
+        touching=_touching(places.regions[state.map.graph.edges], ids, labels, count),
     )
 
 

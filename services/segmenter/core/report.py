@@ -14,80 +14,81 @@ from prior_sg.schemas.regions import (
     RegionDelta,
     RegionEvent,
 )
-from prior_sg.services.segmenter.core.energy import posteriors, swap
+from prior_sg.services.segmenter.core.config import Config
+from prior_sg.services.segmenter.core.energy import posteriors
+from prior_sg.services.segmenter.core.energy.mrf import energy
 from prior_sg.services.segmenter.core.inference import field_of, votes
 from prior_sg.services.segmenter.core.map.table import UNLABELLED
 from prior_sg.services.segmenter.core.regions import components, ledger
-from prior_sg.services.segmenter.core.state import Config, State
+from prior_sg.services.segmenter.core.state import State
 
 
 def publish(state: State, events: list[RegionEvent], everything: bool, cfg: Config) -> RegionDelta | None:
     """What followers do not know yet; with `everything`, all."""
-    assert state.alignment is not None
-    places, prior = state.places, state.alignment.prior
-    state.regions = _described(state, everything, cfg)
+    places, regions = state.map.places, state.regions
+    regions.describe(_described(state, everything, cfg))
     fresh = np.arange(len(places.labels)) if everything else np.flatnonzero(places.unbelieved)
     places.unbelieved[:] = False
-    state.disturbed.clear()
-    state.reformed.clear()
-    source = ledger.Source(
-        robot=state.robot,
-        epoch=state.epoch,
-        stamp_ns=state.stamp_ns,
-        prior_digest=state.alignment.digest,
-        environment=prior.environment,
-        task=prior.task,
-        space=state.spaces.force if len(state.archive) else "",
-        labels=tuple(state.alignment.labels),
-        energy=swap.energy(field_of(state), places.labels),
-    )
-    return state.ledger.tell(
-        source,
+    return regions.ledger.tell(
+        _head(state),
         places.slots[fresh],
         _beliefs(state, fresh, cfg),
-        state.regions,
+        regions.known,
         events,
         everything=everything,
         tolerance=cfg.posterior_change,
     )
 
 
+def _head(state: State) -> RegionDelta:
+    """From what the map is made: a delta that tells nothing else."""
+    aligned = state.aim.aligned
+    return msgspec.structs.replace(
+        ledger.nothing(state.robot, state.epoch, aligned.labels),
+        stamp_ns=state.stamp_ns,
+        prior_digest=aligned.digest,
+        environment=aligned.prior.environment,
+        task=aligned.prior.task,
+        space=state.seen.spaces.force if len(state.seen.archive) else "",
+        energy=energy(field_of(state), state.map.places.labels),
+    )
+
+
 def _beliefs(state: State, rows: np.ndarray, cfg: Config) -> ledger.Beliefs:
     """What is believed of some places, as it travels."""
-    places = state.places
+    places = state.map.places
     return ledger.Beliefs(
-        place_ids=state.graph.ids[rows],
+        place_ids=state.map.graph.ids[rows],
         regions=places.regions[rows],
         posteriors=places.posteriors[rows].astype(np.float16),
         unknown=(1.0 - known_mass(state, rows, cfg)).astype(np.float16),
-        predicted=state.evidence.trust[places.slots[rows]] < cfg.predicted_trust,
+        predicted=state.seen.evidence.trust[places.slots[rows]] < cfg.predicted_trust,
     )
 
 
 def known_mass(state: State, rows: np.ndarray, cfg: Config) -> np.ndarray:
     """Share (row,) of a place's belief that rests on something seen and known: c_vis T / (T + T_half)."""
-    trust = state.evidence.trust[state.places.slots[rows]]
-    return state.places.sight[rows] * trust / (trust + cfg.trust_half)
+    trust = state.seen.evidence.trust[state.map.places.slots[rows]]
+    return state.map.places.sight[rows] * trust / (trust + cfg.trust_half)
 
 
 def _described(state: State, everything: bool, cfg: Config) -> dict[int, Region]:
     """All regions; figures of those that were disturbed are computed again, and rounded, so that a region is sent again
     only when they visibly change.
     """
-    graph, places = state.graph, state.places
-    wanted = np.zeros(state.next_region_id + 1, dtype=bool)  # the last is NO_REGION's
-    wanted[list(state.disturbed)] = True
-    wanted |= everything
+    graph, places = state.map.graph, state.map.places
+    wanted = state.regions.wanted(everything)
     rows = np.flatnonzero(wanted[places.regions])
     order = rows[np.argsort(places.regions[rows], kind="stable")]
     ids, starts = np.unique(places.regions[order], return_index=True)
     border = components.border(graph, places.regions, set(ids.tolist()), cfg.door_clearance_m)
-    objects = components.members(state.objects, graph.positions_m, places.regions, rows)
-    found = {} if everything else {number: region for number, region in state.regions.items() if not wanted[number]}
+    objects = components.members(state.objects.view, graph.positions_m, places.regions, rows)
+    known, reformed = state.regions.known, state.regions.reformed
+    found = {} if everything else {number: region for number, region in known.items() if not wanted[number]}
     for number, members in zip(ids.tolist(), np.split(order, starts[1:]), strict=False):
-        formed = everything or number in state.reformed or number not in state.regions
+        formed = everything or number in reformed or number not in known
         found[number] = msgspec.structs.replace(
-            _formed(state, members, cfg) if formed else state.regions[number],
+            _formed(state, members, cfg) if formed else known[number],
             **_believed(state, members, cfg),
             neighbour_ids=border.neighbours.get(number, []),
             transitions=border.transitions.get(number, []),
@@ -98,10 +99,10 @@ def _described(state: State, everything: bool, cfg: Config) -> dict[int, Region]
 
 def _formed(state: State, rows: np.ndarray, cfg: Config) -> Region:
     """What the places `rows` of one region say of its shape."""
-    positions_m, radii_m = state.graph.positions_m[rows], state.graph.radii_m[rows]
+    positions_m, radii_m = state.map.graph.positions_m[rows], state.map.graph.radii_m[rows]
     x, y, z = positions_m.mean(axis=0).tolist()
     return Region(
-        id=int(state.places.regions[rows[0]]),
+        id=int(state.map.places.regions[rows[0]]),
         label="",
         place_count=len(rows),
         probability=0.0,
@@ -113,12 +114,11 @@ def _formed(state: State, rows: np.ndarray, cfg: Config) -> Region:
 
 def _believed(state: State, rows: np.ndarray, cfg: Config) -> dict[str, Any]:
     """What the places `rows` of one region say of its label, by the fields of Region."""
-    assert state.alignment is not None
-    places, label = state.places, int(state.places.labels[rows[0]])
-    predicted = state.evidence.trust[places.slots[rows]] < cfg.predicted_trust
+    places, label = state.map.places, int(state.map.places.labels[rows[0]])
+    predicted = state.seen.evidence.trust[places.slots[rows]] < cfg.predicted_trust
     return {
-        "label": state.alignment.labels[label],
-        "parent": state.alignment.prior.regions[label].parent,
+        "label": state.aim.aligned.labels[label],
+        "parent": state.aim.aligned.prior.regions[label].parent,
         "probability": round(float(places.posteriors[rows, label].mean()), 2),
         "unknown": round(1.0 - float(known_mass(state, rows, cfg).mean()), 2),
         "predicted": bool(predicted.mean() > 0.5),
@@ -127,15 +127,15 @@ def _believed(state: State, rows: np.ndarray, cfg: Config) -> dict[str, Any]:
 
 def snapshot(state: State) -> RegionDelta:
     """Everything published so far, as one delta."""
-    return state.ledger.snapshot(state.robot, state.epoch)
+    return state.regions.ledger.snapshot(state.robot, state.epoch)
 
 
 def explain(state: State, request: PosteriorRequest, cfg: Config) -> PosteriorReply:
     """Each expert's vote on one place, its neighbours' pull, and what follows, as of the last update."""
-    row = int(state.graph.rows(np.array([request.place_id]))[0])
-    if row < 0 or state.alignment is None or state.places.labels[row] == UNLABELLED:
+    row = int(state.map.graph.rows(np.array([request.place_id]))[0])
+    if row < 0 or state.aim.in_force is None or state.map.places.labels[row] == UNLABELLED:
         return PosteriorReply(robot=state.robot, place_id=request.place_id, found=False)
-    places, names, near = state.places, state.alignment.labels, state.graph.adjacency
+    places, names, near = state.map.places, state.aim.in_force.labels, state.map.graph.arcs
     rows, slot = np.array([row]), int(places.slots[row])
     answers = votes(state, rows, cfg)
     unary = sum(-cfg.experts[name] * sure[0] * log[0] for name, (log, sure) in answers.items())
@@ -158,21 +158,21 @@ def explain(state: State, request: PosteriorRequest, cfg: Config) -> PosteriorRe
             )
             for name, (log, sure) in answers.items()
         ],
-        frames=int(state.evidence.frames[slot]),
-        trust=float(state.evidence.trust[slot]),
-        position_m=tuple(state.graph.positions_m[row].tolist()),
+        frames=int(state.seen.evidence.frames[slot]),
+        trust=float(state.seen.evidence.trust[slot]),
+        position_m=tuple(state.map.graph.positions_m[row].tolist()),
         region=int(places.regions[row]),
         pull=(costs[0] - places.unary[row]).tolist(),
         neighbours=[
             NeighbourPull(
-                place_id=int(state.graph.ids[near.neighbours[at]]),
+                place_id=int(state.map.graph.ids[near.neighbours[at]]),
                 label=names[places.labels[near.neighbours[at]]],
-                weight=float(state.weights[near.edges[at]]),
+                weight=float(state.map.weights[near.edges[at]]),
             )
             for at in arcs
         ],
         unknown=1.0 - float(known_mass(state, rows, cfg)[0]),
-        predicted=bool(state.evidence.trust[slot] < cfg.predicted_trust),
+        predicted=bool(state.seen.evidence.trust[slot] < cfg.predicted_trust),
         temperature=cfg.temperature,
         inclination_rad=float(places.inclination_rad[row]),
     )

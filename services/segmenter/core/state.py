@@ -1,153 +1,56 @@
-"""Settings of the segmenter, and everything it remembers (pure)."""
+"""Everything the segmenter remembers, in parts with one owner each (pure)."""
 
 from dataclasses import dataclass, field
 
-import msgspec
-import numpy as np
-
-from prior_sg.schemas.features import DEFAULT_SPACE, TextEmbeddings, TextRequest
-from prior_sg.schemas.places import PlaceDelta
-from prior_sg.schemas.priors import Prior, PriorEvidence, Task
-from prior_sg.schemas.regions import Region
-from prior_sg.services.deltas import Follower
-from prior_sg.services.segmenter.core.appearance.adaptation import Adaptation, AdaptationConfig
-from prior_sg.services.segmenter.core.appearance.label_bias import BalanceConfig
-from prior_sg.services.segmenter.core.appearance.smoothing import SharingConfig
-from prior_sg.services.segmenter.core.energy.solver import Settings, Solver
-from prior_sg.services.segmenter.core.evidence import kernel as descriptors
-from prior_sg.services.segmenter.core.evidence.handover import Spaces, SpacesConfig
-from prior_sg.services.segmenter.core.experts import REGISTRY
-from prior_sg.services.segmenter.core.experts.context import ObjectSettings, ObjectView
-from prior_sg.services.segmenter.core.map.inclination import GeometryConfig
-from prior_sg.services.segmenter.core.map.received import PlaceGraph
-from prior_sg.services.segmenter.core.map.table import Places
-from prior_sg.services.segmenter.core.objects import names
-from prior_sg.services.segmenter.core.objects.sizes import SizeConfig
-from prior_sg.services.segmenter.core.objects.tracks import TrackingConfig, Tracks
-from prior_sg.services.segmenter.core.regions import ledger as publication
-
-
-class Config(msgspec.Struct, frozen=True, kw_only=True):
-    """Settings of the segmenter. Those marked (paper) are published values; the others were chosen here."""
-
-    space: str = DEFAULT_SPACE  # embedding space at the start; another may take over
-    spaces: SpacesConfig = msgspec.field(default_factory=SpacesConfig)
-    kernel: descriptors.KernelConfig = msgspec.field(default_factory=descriptors.KernelConfig)
-    default_query_radius_m: float = 0.75  # r_Q until a prior is in force (paper)
-    experts: dict[str, float] = msgspec.field(  # names, with their reliabilities lambda (paper)
-        default_factory=lambda: {"visual": 4.0, "geometric": 1.0, "object": 1.0, "environment": 0.1}
-    )
-    geometry: GeometryConfig = msgspec.field(default_factory=GeometryConfig)
-    objects: ObjectSettings = msgspec.field(default_factory=ObjectSettings)
-    tracking: TrackingConfig = msgspec.field(default_factory=TrackingConfig)
-    sizes: SizeConfig = msgspec.field(default_factory=SizeConfig)
-    beta: float = 2.0  # weight of the pairwise term (paper)
-    edge_decay_m: float = 2.0  # w_dist = exp(-length / edge_decay_m)
-    edge_sum: float = 3.0  # sum of w_dist at a place, whatever the graph's density and scale; 0 = w_dist as it is
-    solver: Settings = msgspec.field(default_factory=Settings)
-    budget_ms: float = 40.0  # of solving per keyframe; the rest is done when idle. 0 = as long as it takes
-    look_ms: float = 2.0  # of solving between two looks at the budget, see Budget
-    edge_clearance_m: float = (
-        0.8  # w_dist times min(clearance / edge_clearance_m, 1): half of it in a usual door; 0 = off
-    )
-    probability_floor: float = 1e-6  # least probability in a logarithm, so that every cost is finite
-    object_phrases: int = 2  # objects whose phrases join a region's concept, the most discriminative first
-    sharing: SharingConfig = msgspec.field(default_factory=SharingConfig)  # beyond the paper
-    balance: BalanceConfig = msgspec.field(default_factory=BalanceConfig)  # beyond the paper
-    adaptation: AdaptationConfig = msgspec.field(default_factory=AdaptationConfig)  # beyond the paper
-    temperature: float = (
-        6.0  # of the posteriors, see prior_sg.services.segmenter.core.energy.posteriors; least calibration error on dev
-    )
-    trust_half: float = 0.5  # sum of trust at which half of the unknown mass is left
-    predicted_trust: float = 1.0  # sum of trust below which a place counts as predicted; one close look gives about 2
-    door_clearance_m: float = 0.7  # a way between regions with at most this clearance is a door
-    posterior_change: float = 0.01  # smaller changes of a belief are not sent
-    footprint_cell_m: float = 0.1  # grid of the regions' areas
-    evidence_ticks: int = 40  # ticks between two reports of what the map shows of its prior; 0 = none
-    evidence_places: int = 5  # a region of fewer places is not counted there: most are mistakes
-    prior_wait_ticks: int = 4  # ticks to wait for a task's prior before asking for it
-    remembered_priors: int = 4  # priors kept that no task has asked for yet
-
-    def __post_init__(self) -> None:
-        unknown = sorted(set(self.experts) - set(REGISTRY))
-        if unknown:
-            raise ValueError(f"no such expert: {', '.join(unknown)}; there are {', '.join(sorted(REGISTRY))}")
-        if not (self.beta >= 0 and self.edge_decay_m > 0 and self.edge_sum >= 0):
-            raise ValueError("beta, edge_decay_m or edge_sum is out of range")
-        if not (0 < self.probability_floor < 1 and self.trust_half > 0 and self.temperature > 0):
-            raise ValueError("probability_floor, trust_half or temperature is out of range")
-
-
-@dataclass(frozen=True)
-class Alignment:
-    """The prior in force, and its concepts in the embedding space."""
-
-    prior: Prior
-    digest: str
-    text: TextEmbeddings
-    pairwise: np.ndarray  # (label, label): -beta log P(ri <-> rj), zero diagonal
-
-    @property
-    def labels(self) -> list[str]:
-        """Names of the prior's regions."""
-        return [region.name for region in self.prior.regions]
+from prior_sg.schemas.priors import Task
+from prior_sg.services.deltas import PoseCorrections
+from prior_sg.services.intent import Intent
+from prior_sg.services.segmenter.core.aim import Aim
+from prior_sg.services.segmenter.core.config import Config
+from prior_sg.services.segmenter.core.energy.solver import Solver
+from prior_sg.services.segmenter.core.evidence.handover import Spaces
+from prior_sg.services.segmenter.core.evidence.seen import Seen
+from prior_sg.services.segmenter.core.labelling import Labelling
+from prior_sg.services.segmenter.core.map.place_map import PlaceMap
+from prior_sg.services.segmenter.core.objects.object_map import ObjectMap
+from prior_sg.services.segmenter.core.objects.tracks import Tracks
+from prior_sg.services.segmenter.core.prior_report import PriorReport
+from prior_sg.services.segmenter.core.regions.region_map import RegionMap
 
 
 @dataclass
 class State:
-    """Everything the segmenter remembers."""
+    """Everything the segmenter remembers. Each part is written by its own methods and by whom its masks address."""
 
     robot: str
     epoch: int
-    stamp_ns: int = 0  # of the newest place delta or pyramid
-    follower: Follower[PlaceDelta] = field(default_factory=Follower)
-    graph_epoch: int = -1
-    graph: PlaceGraph = field(default_factory=PlaceGraph)
-    weights: np.ndarray = field(default_factory=lambda: np.zeros(0))  # (edge,) w_dist
-    archive: descriptors.Archive = field(default_factory=descriptors.Archive)
-    evidence: descriptors.Evidence = field(default_factory=descriptors.Evidence)
-    spaces: Spaces = field(default_factory=Spaces)
-    query_radius_m: float = 0.0
-    poses: dict[int, np.ndarray] = field(default_factory=dict)  # corrected world_from_camera by frame id
-    pose_revisions: dict[int, int] = field(default_factory=dict)  # of the newest correction by the epoch of its writer
-    places: Places = field(default_factory=Places.none)
-    objects: ObjectView = field(default_factory=ObjectView)
-    tracks: Tracks = field(default_factory=Tracks)
-    object_ledger: names.ObjectLedger = field(default_factory=names.ObjectLedger)
-    task: Task | None = None
-    priors: dict[str, Prior] = field(default_factory=dict)  # by digest, latest arrival last
-    texts: dict[tuple[str, ...], TextEmbeddings] = field(default_factory=dict)  # by space and concepts
-    alignment: Alignment | None = None
-    solver: Solver = field(default_factory=Solver)
-    adaptation: Adaptation = field(default_factory=Adaptation)
-    unadapted: int = (
-        0  # places whose evidence changed, or that left, since that was looked at; at least one if any edge did
-    )
-    bias: np.ndarray = field(default_factory=lambda: np.zeros(0))  # (label,) of the visual scores in this map
-    compared: int = 0  # places whose similarity was computed, or that left, since the bias was
-    next_region_id: int = 0
-    regions: dict[int, Region] = field(default_factory=dict)
-    disturbed: set[int] = field(default_factory=set)  # regions whose beliefs, ways or objects may have changed
-    reformed: set[int] = field(default_factory=set)  # regions whose places came, went or moved
-    ledger: publication.Ledger = field(default_factory=publication.Ledger)
-    dirty: bool = False  # something changed since the last solution
-    asked_snapshot: bool = False
-    asked_text: dict[str, TextRequest] = field(default_factory=dict)  # by space
-    asked_prior: bool = False
-    asked_task: bool = False
-    waited_ticks: int = 0
-    evidence_waits: int = 0  # ticks since the last report of what the map shows of its prior
-    observed: PriorEvidence | None = None  # that report
-    ignored_pyramids: int = 0  # repeated, or not of this space
+    aim: Aim
+    seen: Seen
+    objects: ObjectMap
+    labelling: Labelling
+    map: PlaceMap = field(default_factory=PlaceMap)
+    regions: RegionMap = field(default_factory=RegionMap)
+    corrections: PoseCorrections = field(default_factory=PoseCorrections)
+    report: PriorReport = field(default_factory=PriorReport)
+    stamp_ns: int = 0  # of the newest place delta, pyramid or detections
+
+    @property
+    def task(self) -> Task | None:
+        """The task in force."""
+        return self.aim.task
+
+    def heard(self, stamp_ns: int) -> None:
+        """Something that was taken in at this time."""
+        self.stamp_ns = max(self.stamp_ns, stamp_ns)
 
 
 def empty(cfg: Config, robot: str, epoch: int) -> State:
     """The state before the first message."""
     return State(
-        robot=robot,
-        epoch=epoch,
-        query_radius_m=cfg.default_query_radius_m,
-        spaces=Spaces(cfg.space),
-        solver=Solver(cfg.solver),
-        tracks=Tracks(cfg.space),
+        robot,
+        epoch,
+        aim=Aim(robot, Intent(cfg.remembered_priors)),
+        seen=Seen(Spaces(cfg.space), cfg.default_query_radius_m),
+        objects=ObjectMap(Tracks(cfg.space)),
+        labelling=Labelling(Solver(cfg.solver)),
     )

@@ -24,8 +24,9 @@ from prior_sg.deploy.truth import GroundTruth, TrueObject, read_objects
 from prior_sg.schemas.codec import encode
 from prior_sg.schemas.places import VoxelMap
 from prior_sg.schemas.priors import ObjectPrior
+from prior_sg.schemas.topics import PLACE_DELTA
+from prior_sg.services.segmenter.core.config import Config
 from prior_sg.services.segmenter.core.experts import REGISTRY
-from prior_sg.services.segmenter.core.state import Config
 from tests.help.paths import SAMPLE
 from tests.help.world import DIM, ROBOT, ROOM_M, SPACE, place_delta, place_grid, prior, text, walk
 from tests.services.segmenter.test_objects import BED, OVEN, sight
@@ -332,7 +333,9 @@ def test_tables_name_every_method(results):
 
 
 def test_true_scene_is_perfect(case):
-    scene = methods.Segmenter(Config(), lambda concepts: None).read([case.perception.places])
+    pipeline = methods.labelling(Config(), ROBOT, lambda concepts: None)
+    pipeline.publish(PLACE_DELTA, case.perception.places)
+    scene = methods.scene_of(pipeline, ROBOT)
     labelled = methods.Method("truth", lambda _: true_scene(scene, case.truth))
     assert score(labelled, case)["f1_s"] == 1.0
 

@@ -9,13 +9,12 @@ import pytest
 import spark_dsg
 from scipy.spatial.transform import Rotation
 
+from prior_sg.deploy.showing.dsg import save_spark_dsg, spark_dsg_graph
 from prior_sg.deploy.showing.export import (
     map_png,
     places_png,
     save_json,
-    save_spark_dsg,
     scene_json,
-    spark_dsg_graph,
     zones,
 )
 from prior_sg.deploy.showing.map import FREE, PALETTE, UNLABELLED, WALL, label_colors
@@ -86,6 +85,13 @@ def flat_map(voxel_m=0.25):
     return VoxelMap(
         robot="spot", voxel_m=voxel_m, free=index[~rim].astype(np.int16), occupied=index[rim].astype(np.int16)
     )
+
+
+def test_the_offset_of_the_world_is_exported_and_positions_stay_local():
+    scene = changed(flat(), origin_m=(512_345.0, 5_403_210.0, 312.0))
+    assert scene_json(scene) == scene_json(flat()) | {"origin_m": [512_345.0, 5_403_210.0, 312.0]}
+    metadata = spark_dsg_graph(scene).metadata.get()
+    assert metadata["origin_m"] == [512_345.0, 5_403_210.0, 312.0]
 
 
 def node(graph, prefix, index):

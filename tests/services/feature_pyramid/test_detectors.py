@@ -22,7 +22,7 @@ from prior_sg.services.feature_pyramid.detectors.masks import load_masks
 from prior_sg.services.feature_pyramid.detectors.prompted import as_sentences, batches, best_sentence
 from prior_sg.services.feature_pyramid.encoders import torchvision_parts
 from prior_sg.services.feature_pyramid.encoders.base import EncoderUnavailable
-from prior_sg.services.runtime.service import Ask
+from prior_sg.services.runtime.runner import Runner
 from tests.help.world import prior, task
 
 CAMERA = Intrinsics(640, 480, 500.0, 500.0, 320.0, 240.0)
@@ -87,7 +87,7 @@ class Colours:
 def worked(frame, cfg):
     state = service.Worker("worker-7", Colours(), load_detector(cfg))
     try:
-        (_, pyramid), (_, detections) = service.step(state, frame, cfg)
+        (_, pyramid), (_, detections) = Runner(service.SERVICE, cfg, state=state).feed(frame)
     finally:
         state.reader.shutdown()
     return pyramid, detections
@@ -381,14 +381,9 @@ def ready():
 
 def ran(state, cfg, *messages):
     """What steps on messages yield: questions, and outputs by topic."""
-    asked, outputs = [], []
-    for message in messages:
-        for output in service.step(state, message, cfg):
-            if isinstance(output, Ask):
-                asked.append(output.request)
-            else:
-                outputs.append((output[0].name, output[1]))
-    return asked, outputs
+    runner = Runner(service.SERVICE, cfg, state=state)
+    outputs = [(topic.name, message) for topic, message in runner.feed(*messages)]
+    return [ask.request for ask in runner.asks], outputs
 
 
 def test_a_prompted_detector_looks_for_the_objects_of_the_robots_prior():
@@ -431,7 +426,7 @@ def test_a_keyframe_made_ready_before_the_prior_changed_is_looked_at_again():
 
 
 def test_the_newest_task_and_the_newest_prior_for_it_count():
-    known = intent.Vocabulary()
+    known = intent.Intent()
     home = prior(["kitchen"])
     first, second = (
         task(robot="ada", stamp_ns=stamp, environment="e", task=name) for stamp, name in ((5, "a"), (7, "b"))
@@ -451,7 +446,7 @@ def test_the_newest_task_and_the_newest_prior_for_it_count():
 
 
 def test_priors_that_answer_a_task_are_remembered_longest_and_asked_for_again():
-    known, home = intent.Vocabulary(), prior(["kitchen"])
+    known, home = intent.Intent(), prior(["kitchen"])
     intent.hear(known, task(robot="ada", environment=home.environment, task=home.task))
     assert len(list(intent.questions(known, "ada"))) == len(list(intent.questions(known, "ada"))) == 1
     intent.hear(known, home)

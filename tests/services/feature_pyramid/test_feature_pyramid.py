@@ -7,6 +7,7 @@ import subprocess
 import sys
 
 import cv2
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -407,6 +408,33 @@ def test_broken_images_give_an_empty_pyramid_and_are_counted(worker, color, dept
     assert pyramid.embeddings.shape == (0, worker.encoder.dim) and pyramid.crops_total == 28
     assert (pyramid.surface_m == 0.0).all()
     assert decode(Pyramid, encode(pyramid)) == pyramid
+
+
+def test_what_the_mask_covers_has_no_depth(worker):
+    mask = np.zeros((480, 640), np.uint8)
+    mask[:, :320] = 255
+    frame = keyframe(checkered(), np.full((480, 640), 4000, np.uint16))
+    masked = msgspec.structs.replace(frame, mask=cv2.imencode(".png", mask)[1].tobytes())
+    before, pyramid = worker.broken, only(service.step(worker, masked, CFG))
+    assert (pyramid.surface_m[:, :40] == 0.0).all() and (pyramid.surface_m[:, 40:] == 4.0).all()
+    whole = only(service.step(worker, frame, CFG))
+    assert 0 < len(pyramid.depths_m) < len(whole.depths_m) and worker.broken == before
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"mask": b"no"}, "the mask image cannot be decoded"),
+        ({"intrinsics": Intrinsics(640, 480, 500.0, 400.0, 160.0, 240.0)}, "intrinsics belong to another image size"),
+    ],
+)
+def test_a_keyframe_that_the_map_refuses_is_not_encoded_and_the_next_one_is(worker, caplog, changes, reason):
+    frame = keyframe(checkered(), np.full((480, 640), 4000, np.uint16))
+    before = worker.broken
+    pyramid = only(service.step(worker, msgspec.structs.replace(frame, **changes), CFG))
+    assert len(pyramid.depths_m) == 0 and worker.broken == before + 1
+    assert reason in caplog.records[-1].reason
+    assert len(only(service.step(worker, frame, CFG)).depths_m) > 0 and worker.broken == before + 1
 
 
 def test_a_wall_close_by_gives_an_empty_pyramid(worker):

@@ -17,12 +17,14 @@ from prior_sg.schemas.status import JobDone
 from prior_sg.schemas.topics import ARCHIVE, CAMERA_STATE, ENCODE, INGEST_STATE, KEYFRAME, POSE_UPDATE
 from prior_sg.services.geometry import back_project, inverse, pose_from_quaternion, project, transform
 from prior_sg.services.ingest.core import selection
-from prior_sg.services.ingest.core.selection import BadFrame, Config, Correction, EndOfSource, RawFrame
+from prior_sg.services.ingest.core.config import Config
+from prior_sg.services.ingest.core.selection import BadFrame, Correction, EndOfSource, RawFrame
 from prior_sg.services.ingest.service import SERVICE, drive, step
 from prior_sg.services.ingest.sources import SourceError, open_source
 from prior_sg.services.ingest.sources.base import levelling
 from prior_sg.services.ingest.sources.images import ImageError, image_size
 from prior_sg.services.runtime.record import LogWriter, attachments, metadata
+from prior_sg.services.runtime.runner import Runner
 from prior_sg.services.runtime.service import Identity
 from tests.help.paths import SAMPLE, SHARED_DATA
 
@@ -67,8 +69,8 @@ def empty_state():
 
 def feed(state, messages, cfg):
     """All outputs, each checked to be declared."""
-    outputs = [output for message in messages for output in step(state, message, cfg)]
-    assert all(topic in SERVICE.writes and isinstance(message, topic.type) for topic, message in outputs)
+    outputs = Runner(SERVICE, cfg, state=state).feed(*messages)
+    assert all(isinstance(message, topic.type) for topic, message in outputs)
     return outputs
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from prior_sg.services.place_graph import service
-from prior_sg.services.place_graph.core import ground, update
+from prior_sg.services.place_graph.core import ground, publishing
 from prior_sg.services.place_graph.core.config import Config
 from prior_sg.services.place_graph.core.volume.grid import BLOCK, FREE, OCCUPIED, UNOBSERVED, Block, Box, VoxelGrid
 from prior_sg.services.runtime.service import Identity
@@ -128,7 +128,7 @@ def two_rooms():
 
 def test_a_doorway_joins_the_ground_of_two_rooms_and_the_wall_does_not(two_rooms):
     state, deltas = two_rooms
-    told = update.snapshot(state, CFG)
+    told = publishing.snapshot(state, CFG)
     assert len(told.place_ids) >= 12 and (np.abs(told.positions_m[:, 2] + 0.05) < 0.11).all()
     assert told.surface_ids.tolist() == told.place_ids.tolist()
     index = np.searchsorted(told.place_ids, told.edges)
@@ -155,9 +155,9 @@ def test_any_order_of_the_same_keyframes_gives_the_same_pieces(two_rooms, seed):
 
 def test_pieces_keep_their_ids_when_the_map_grows():
     state, deltas = run(ROOM_WALK[:6])
-    before = update.snapshot(state, CFG)
+    before = publishing.snapshot(state, CFG)
     deltas += play(state, ROOM_WALK[6:], CFG)
-    after = update.snapshot(state, CFG)
+    after = publishing.snapshot(state, CFG)
     kept = set(before.place_ids.tolist()) & set(after.place_ids.tolist())
     assert len(before.place_ids) >= 4 and len(kept) >= 0.7 * len(before.place_ids)
     told = read(deltas)

@@ -17,12 +17,13 @@ from scipy.sparse.csgraph import connected_components
 from prior_sg.schemas.codec import encode
 from prior_sg.schemas.frames import ArchiveReply, Intrinsics, Keyframe, PoseUpdate
 from prior_sg.schemas.places import MapRequest, PlaceDelta, SnapshotRequest
-from prior_sg.schemas.topics import PLACE_DELTA, PLACE_SNAPSHOT, VOXEL_MAP
+from prior_sg.schemas.topics import ARCHIVE, PLACE_DELTA, PLACE_SNAPSHOT, VOXEL_MAP
 from prior_sg.services import images
 from prior_sg.services.geometry import inside_polygon, pose_from_quaternion
 from prior_sg.services.place_graph import service
+from prior_sg.services.place_graph.core import fusing, publishing, renewal
 from prior_sg.services.place_graph.core import openings as frontiers
-from prior_sg.services.place_graph.core import update as core
+from prior_sg.services.place_graph.core import state as core
 from prior_sg.services.place_graph.core.config import PRESETS, Config, preset
 from prior_sg.services.place_graph.core.skeleton import distance, links
 from prior_sg.services.place_graph.core.volume.grid import (
@@ -37,7 +38,8 @@ from prior_sg.services.place_graph.core.volume.grid import (
     VoxelGrid,
 )
 from prior_sg.services.runtime.config import resolve
-from prior_sg.services.runtime.service import Ask, Identity
+from prior_sg.services.runtime.runner import Runner
+from prior_sg.services.runtime.service import Identity
 from tests.help.paths import SHARED_DATA
 
 DATA = SHARED_DATA
@@ -127,12 +129,9 @@ def start(cfg: core.Config = CFG) -> core.State:
 
 
 def play(state: core.State, frames: list[Keyframe], cfg: core.Config = CFG) -> list[PlaceDelta]:
-    deltas = []
-    for frame in frames:
-        for topic, delta in (output for output in service.step(state, frame, cfg) if not isinstance(output, Ask)):
-            assert topic is PLACE_DELTA
-            deltas.append(delta)
-    return deltas
+    published = Runner(service.SERVICE, cfg, state=state).feed(*frames)
+    assert all(topic is PLACE_DELTA for topic, _ in published)
+    return [delta for _, delta in published]
 
 
 @pytest.fixture(scope="module")
@@ -305,7 +304,7 @@ def grid_of(label: np.ndarray) -> VoxelGrid:
     return grid
 
 
-FIELD = {"max_distance_voxels": 7.0, "voronoi_min_voxels": 1.0, "parent_l1_voxels": 20.0, "parent_cos": 0.2}
+FIELD = distance.FieldRules(max_distance=7.0, voronoi_min_distance=1.0, parent_l1=20.0, parent_cos=0.2)
 
 
 def fields_of(grid: VoxelGrid) -> dict[str, np.ndarray]:
@@ -321,7 +320,7 @@ def test_repairing_a_change_equals_the_definition_and_a_fresh_start(seed):
     rim[2:-2, 2:-2, 2:-2] = False
     label[rim] = UNOBSERVED
     local = grid_of(label)
-    distance.refresh(local, everywhere(local), **FIELD)
+    distance.refresh(local, everywhere(local), FIELD)
     for _ in range(4):
         low = rng.integers(3, (22, 22, 22))
         changed = Box(low, low + rng.integers(1, 7, 3))
@@ -329,12 +328,12 @@ def test_repairing_a_change_equals_the_definition_and_a_fresh_start(seed):
         before = label[part].copy()
         label[part] = rng.choice((UNOBSERVED, FREE, OCCUPIED), before.shape).astype(np.uint8)
         local.scatter("label", changed, label[part])
-        distance.refresh(local, np.argwhere(label[part] != before) + low, **FIELD)
+        distance.refresh(local, np.argwhere(label[part] != before) + low, FIELD)
     whole = grid_of(label)
-    distance.refresh(whole, everywhere(whole), **FIELD)
+    distance.refresh(whole, everywhere(whole), FIELD)
     for name, values in fields_of(whole).items():
         np.testing.assert_array_equal(fields_of(local)[name], values)
-    d2, offset = by_definition(label, FIELD["max_distance_voxels"])
+    d2, offset = by_definition(label, FIELD.max_distance)
     np.testing.assert_array_equal(fields_of(local)["d2"], d2)
     np.testing.assert_array_equal(fields_of(local)["offset"], offset)
 
@@ -344,7 +343,7 @@ def test_diagram_of_two_walls_is_the_plane_between_them():
     label[2] = label[12] = OCCUPIED
     label[:2] = label[13:] = UNOBSERVED
     grid = grid_of(np.concatenate((label, np.zeros_like(label))))
-    distance.refresh(grid, everywhere(grid), **FIELD)
+    distance.refresh(grid, everywhere(grid), FIELD)
     basis = grid.gather("basis", grid.bounds)[:, 8:24, 8:24]
     assert (basis[7] == 2).all()
     assert not basis[3:6].any() and not basis[9:12].any()
@@ -357,7 +356,7 @@ def test_one_ray_frees_voxels_before_the_surface_and_leaves_those_behind_unobser
     camera = Intrinsics(1, 1, 10.0, 10.0, 0.0, 0.0)
     pose = pose_from_quaternion(np.array((0.0, 0.05, 0.05)), np.array(FORWARD))
     state = start()
-    core.fuse(state, keyframe(0, pose, b"", camera), np.array([[2.05]], np.float32), CFG)
+    fusing.fuse(state, keyframe(0, pose, b"", camera), np.array([[2.05]], np.float32), CFG)
     line = Box(np.array((0, 0, 0)), np.array((32, 1, 1)))
     label = state.grid.gather("label", line).ravel()
     units = state.grid.gather("weight", line).ravel()
@@ -436,8 +435,8 @@ def test_graph_after_each_frame_equals_the_graph_of_the_finished_map(two_rooms):
     state, _ = two_rooms
     batch = start()
     for frame in TWO_ROOMS_WALK:
-        core.fuse(batch, frame, images.depth_of(frame, 0.5), CFG)
-    core.refresh(batch, observed(batch.grid), CFG)
+        fusing.fuse(batch, frame, images.depth_of(frame, 0.5), CFG)
+    renewal.renew(batch, observed(batch.grid), CFG)
     assert canonical(state) == canonical(batch)
 
 
@@ -554,7 +553,7 @@ def test_compressed_blocks_change_nothing(two_rooms):
     deltas = play(state, TWO_ROOMS_WALK, near)
     assert [encode(d) for d in deltas] == [encode(d) for d in two_rooms[1]]
     assert state.grid.packed_bytes > 0 and state.grid.size_bytes < 0.7 * two_rooms[0].grid.size_bytes
-    assert encode(core.voxel_map(state, CFG)) == encode(core.voxel_map(two_rooms[0], CFG))
+    assert encode(publishing.voxel_map(state, CFG)) == encode(publishing.voxel_map(two_rooms[0], CFG))
 
 
 def test_memory_is_bounded_and_places_of_dropped_space_stay_until_seen_again(room):
@@ -566,15 +565,15 @@ def test_memory_is_bounded_and_places_of_dropped_space_stay_until_seen_again(roo
     assert max(sizes) <= 3.0e6 and state.graph.frozen
     one, _ = room
     told = ask(state)
-    assert len(told.place_ids) > 4 * len(one.published.places) and parts(told) == 6
+    assert len(told.place_ids) > 4 * len(one.ledger.places) and parts(told) == 6
     frozen = set(state.graph.frozen)
-    assert {p for i, p in state.published.places.items() if i in frozen} <= set(state.published.places.values())
+    assert {p for i, p in state.ledger.places.items() if i in frozen} <= set(state.ledger.places.values())
     first = {i for i, x in zip(told.place_ids.tolist(), told.positions_m[:, 0].tolist(), strict=True) if x < 6}
     assert first & frozen
     play(state, shifted(ROOM_WALK, 0.0, 1000), small)  # back at the first room: the same places under the same ids
     again = ask(state)
     now = {i for i, x in zip(again.place_ids.tolist(), again.positions_m[:, 0].tolist(), strict=True) if x < 6}
-    assert len(first & now) >= 0.7 * len(now) and len(now) == len(one.published.places)
+    assert len(first & now) >= 0.7 * len(now) and len(now) == len(one.ledger.places)
     assert not {i for i in now if i in state.graph.frozen}
 
 
@@ -600,8 +599,8 @@ def test_hydras_limits_and_overlap_edges_change_edges_only(two_rooms):
         counts[name] = sum(map(len, state.graph.edges.values()))
         batch = start(cfg)
         for frame in TWO_ROOMS_WALK:
-            core.fuse(batch, frame, images.depth_of(frame, 0.5), cfg)
-        core.refresh(batch, observed(batch.grid), cfg)
+            fusing.fuse(batch, frame, images.depth_of(frame, 0.5), cfg)
+        renewal.renew(batch, observed(batch.grid), cfg)
         assert canonical(state) == canonical(batch)
     assert counts["bare"] < counts["few"]
 
@@ -635,7 +634,7 @@ def bad_frames() -> dict[str, tuple[Keyframe, str]]:
 def test_unusable_keyframes_leave_the_map_alone_and_the_delta_says_why(name):
     state = start()
     play(state, ROOM_WALK[:6])
-    before = canonical(state), encode(core.voxel_map(state, CFG))
+    before = canonical(state), encode(publishing.voxel_map(state, CFG))
     frame, reason = bad_frames()[name]
     (delta,) = play(state, [frame])
     assert (delta.frame_id, delta.revision, delta.camera_m) == (frame.frame_id, 6, None)
@@ -644,7 +643,7 @@ def test_unusable_keyframes_leave_the_map_alone_and_the_delta_says_why(name):
         len(a) for a in (delta.place_ids, delta.removed_ids, delta.merged_ids, delta.edges, delta.removed_edges)
     )
     assert state.rejected == 1
-    assert (canonical(state), encode(core.voxel_map(state, CFG))) == before
+    assert (canonical(state), encode(publishing.voxel_map(state, CFG))) == before
     assert not any(d.event for d in play(state, ROOM_WALK[6:]))
 
 
@@ -684,7 +683,7 @@ def test_what_the_mask_covers_stays_out_of_the_map():
     mask = cv2.imencode(".png", (bare != seen).astype(np.uint8) * 255)[1].tobytes()
     state = start()
     play(state, [msgspec.structs.replace(keyframe(0, pose, render(box, pose)), mask=mask)])
-    occupied = (core.voxel_map(state, CFG).occupied + 0.5) * CFG.voxel_m
+    occupied = (publishing.voxel_map(state, CFG).occupied + 0.5) * CFG.voxel_m
     assert (bare != seen).any() and len(occupied)
     assert not ((occupied > (2.1, 0.9, 0.2)) & (occupied < (2.7, 1.7, 1.6))).all(axis=1).any()
     assert "mask image" in play(state, [msgspec.structs.replace(ROOM_WALK[1], mask=b"no")])[0].event
@@ -726,7 +725,7 @@ def test_after_a_pose_update_the_map_is_what_the_corrected_poses_make(two_rooms)
     ids = set(ask(state).place_ids.tolist())
     (update,) = play(state, [truth(TWO_ROOMS_WALK, WRONG)])
     assert canonical(state) == canonical(clean)
-    assert encode(core.voxel_map(state, CFG)) == encode(core.voxel_map(clean, CFG))
+    assert encode(publishing.voxel_map(state, CFG)) == encode(publishing.voxel_map(clean, CFG))
     assert (update.revision, update.stamp_ns, update.event) == (len(TWO_ROOMS_WALK), 99, "")
     assert update.past_frame_ids.tolist() == WRONG
     np.testing.assert_allclose(ask(state).past_cameras_m, ask(clean).past_cameras_m)
@@ -844,20 +843,23 @@ def test_rooms_of_a_home_are_joined_by_their_doorways_only():
 
 def test_a_process_that_joins_in_mid_stream_fetches_the_missed_keyframes_page_by_page():
     frames = ROOM_WALK
-    state = service.init(CFG, Identity("r", "p", 2))
     archive, asked = {frame.frame_id: frame for frame in frames}, []
 
-    def feed(message):
-        for output in list(service.step(state, message, CFG)):
-            if isinstance(output, Ask):
-                request = output.request
-                asked.append((request.first_frame_id, request.end_frame_id))
-                wanted = range(request.first_frame_id, request.end_frame_id)
-                page = [archive[number] for number in sorted(archive) if number in wanted][:2]
-                feed(ArchiveReply(robot="r", oldest_frame_id=0, keyframes=page))
+    def page_of(request):
+        asked.append((request.first_frame_id, request.end_frame_id))
+        wanted = range(request.first_frame_id, request.end_frame_id)
+        page = [archive[number] for number in sorted(archive) if number in wanted][:2]
+        return ArchiveReply(robot="r", oldest_frame_id=0, keyframes=page)
 
-    for frame in frames[4:]:
-        feed(frame)
+    runner = Runner(service.SERVICE, CFG, Identity("r", "p", 2), {ARCHIVE: page_of})
+    runner.feed(*frames[4:])
     last = frames[4].frame_id
     assert asked[0] == (0, last) and [end for _, end in asked] == [last] * len(asked) and len(asked) == 3
-    assert sorted(state.seen) == sorted(archive)
+    assert sorted(runner.state.seen) == sorted(archive)
+
+
+def test_the_offset_of_the_world_travels_with_the_places():
+    origin_m = (512_345.0, 5_403_210.0, 312.0)
+    state = core.empty("r", 1, CFG)
+    deltas = play(state, [msgspec.structs.replace(frame, origin_m=origin_m) for frame in ROOM_WALK[:2]])
+    assert {delta.origin_m for delta in deltas} == {publishing.snapshot(state, CFG).origin_m} == {origin_m}

@@ -15,7 +15,7 @@ from prior_sg.deploy.running.recorder import Recorder
 from prior_sg.schemas.codec import decode
 from prior_sg.schemas.priors import Prior, PriorRequest, Task
 from prior_sg.schemas.topics import PRIOR, PRIORS, TASK
-from prior_sg.services.runtime.client import Client
+from prior_sg.services.runtime.client import BusClient
 from prior_sg.services.runtime.zenoh_bus import ZenohBus
 from tests.help.model import good, serving, slow, status
 from tests.help.paths import ROOT
@@ -56,7 +56,7 @@ class Fleet:
 
 @pytest.fixture
 def client(endpoint):
-    with Client(ZenohBus(endpoint)) as client:
+    with BusClient(ZenohBus(endpoint)) as client:
         yield client
 
 
@@ -72,13 +72,13 @@ def wait_for(condition, what: str, limit_s: float = DEADLINE_S) -> float:
     return time.monotonic() - started_s
 
 
-def priors_of(client: Client) -> list[Prior]:
+def priors_of(client: BusClient) -> list[Prior]:
     found: list[Prior] = []
     client.listen(PRIOR, "*", lambda sample: found.append(decode(Prior, sample.payload)))
     return found
 
 
-def alive(client: Client, *names: str) -> bool:
+def alive(client: BusClient, *names: str) -> bool:
     return set(names) <= set(client.alive(0.0))
 
 

@@ -17,9 +17,9 @@ from prior_sg.schemas.status import Consumed, JobDone, Tick
 from prior_sg.schemas.topics import ENCODE, JOURNAL, KEYFRAME, PLACE_SNAPSHOT, TASK, VOXEL_MAP
 from prior_sg.services.refusals import InputRefused
 from prior_sg.services.runtime.bus import Hub, LocalBus, pack_header
-from prior_sg.services.runtime.client import Client
-from prior_sg.services.runtime.host.host import Host, UndeclaredError
-from prior_sg.services.runtime.service import Ask, Identity, Service
+from prior_sg.services.runtime.client import BusClient
+from prior_sg.services.runtime.host.host import Host
+from prior_sg.services.runtime.service import Ask, Identity, Service, UndeclaredError
 from prior_sg.services.runtime.zenoh_bus import ZenohBus, client_config
 
 CAMERA = Intrinsics(4, 3, 5.0, 5.0, 2.0, 1.5)
@@ -299,7 +299,7 @@ def test_malformed_questions_are_refused(new_bus):
 def test_the_client_asks_and_sees_health(new_bus):
     async def main():
         async with running(new_bus, (ANSWERER, Config(), "b1")):
-            with await asyncio.to_thread(lambda: Client(new_bus())) as client:
+            with await asyncio.to_thread(lambda: BusClient(new_bus())) as client:
                 reply = await asyncio.to_thread(client.ask, VOXEL_MAP, MapRequest(robot="r"))
                 assert reply.voxel_m == 0.25
                 assert (await asyncio.to_thread(client.alive))["b1"] == "answerer"

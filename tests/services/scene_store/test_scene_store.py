@@ -19,6 +19,7 @@ from prior_sg.schemas.regions import Region, RegionDelta, Transition
 from prior_sg.schemas.scene import SceneRequest
 from prior_sg.schemas.status import Tick
 from prior_sg.schemas.topics import OBJECT_SNAPSHOT, PLACE_SNAPSHOT, REGION_SNAPSHOT, SCENE, SCENE_REVISION
+from prior_sg.services.runtime.runner import Runner
 from prior_sg.services.runtime.service import Ask, Identity
 from prior_sg.services.scene_store import service
 from prior_sg.services.scene_store.core import graph as core
@@ -89,19 +90,19 @@ class Store:
 
     def __init__(self, path=":memory:"):
         self.cfg = core.Config(path=str(path))
-        self.state = service.init(self.cfg, IDENTITY)
+        self.runner = Runner(service.SERVICE, self.cfg, IDENTITY, wire=True)
+        self.state = self.runner.state
 
     def feed(self, *messages):
-        outputs = []
-        for message in messages:
-            outputs += service.step(self.state, received(message), self.cfg)
-        return outputs
+        """What it publishes and what it asks."""
+        self.runner.asks.clear()
+        return [*self.runner.feed(*messages), *self.runner.asks]
 
     def scene(self, robot=ROBOT):
-        return service.SERVICE.answers[SCENE](self.state, SceneRequest(robot=robot), self.cfg)
+        return self.runner.answer(SCENE, SceneRequest(robot=robot))
 
     def reopened(self):
-        service.close(self.state)
+        self.runner.close()
         return Store(self.cfg.path)
 
 
@@ -383,7 +384,7 @@ def test_history_lists_what_each_delta_left(tmp_path):
 def test_nothing_received_is_kept_alive():
     store = Store()
     message = received(region_delta(0, [(1, 0, [1, 0, 0], 0)]))
-    list(service.step(store.state, message, store.cfg))
+    Runner(service.SERVICE, store.cfg, state=store.state).feed(message)
     posterior = store.state.robots[ROBOT].graph.beliefs[1].posterior
     assert not np.shares_memory(posterior, message.posteriors)
 
@@ -474,6 +475,21 @@ def test_a_file_of_the_former_layout_is_upgraded(tmp_path):
     assert encode(again.scene()) == encode(before)
     again.feed(region_delta(1, [(1, 4, [0, 1, 0], 0.5)], predicted_ids=np.array([1])))
     assert again.reopened().scene().predicted_ids.tolist() == [1]
+
+
+def test_the_offset_of_the_world_is_kept_and_a_file_without_it_is_upgraded(tmp_path):
+    path, origin_m = tmp_path / "scene.sqlite", (512_345.0, 5_403_210.0, 312.0)
+    store = Store(path)
+    store.feed(place_delta(0, [(1, 0, 0, 1, 0.5)], origin_m=origin_m))
+    assert store.scene().origin_m == store.reopened().scene().origin_m == origin_m
+    service.close(store.state)
+    with sqlite3.connect(path) as sql:
+        sql.execute("DROP TABLE origins")
+        sql.execute("PRAGMA user_version = 4")
+    again = Store(path)
+    assert again.scene().origin_m == (0.0, 0.0, 0.0)
+    again.feed(place_delta(1, origin_m=origin_m))
+    assert again.reopened().scene().origin_m == origin_m
 
 
 def write_text(path):

@@ -8,14 +8,14 @@ from scipy.spatial import ConvexHull
 
 from prior_sg.schemas.regions import NO_REGION
 from prior_sg.services.segmenter.core.experts.context import ObjectView
-from prior_sg.services.segmenter.core.map.received import PlaceGraph, apply
+from prior_sg.services.segmenter.core.map.received import ReceivedGraph, apply
 from prior_sg.services.segmenter.core.regions.components import (
     border,
-    components,
     events,
     footprint_m2,
     hull_m,
     members,
+    numbered,
     track,
 )
 from tests.help.world import place_delta
@@ -24,9 +24,9 @@ from tests.help.world import place_delta
 def test_components_by_hand():
     labels = np.array([0, 0, 1, 1, 0, 0])
     edges = np.array([(0, 1), (1, 2), (2, 3), (3, 4)])  # 5 has no edge
-    assert components(labels, edges).tolist() == [0, 0, 1, 1, 2, 3]
-    assert components(np.zeros(3, int), np.zeros((0, 2), int)).tolist() == [0, 1, 2]
-    assert len(components(np.zeros(0, int), np.zeros((0, 2), int))) == 0
+    assert numbered(labels, edges).tolist() == [0, 0, 1, 1, 2, 3]
+    assert numbered(np.zeros(3, int), np.zeros((0, 2), int)).tolist() == [0, 1, 2]
+    assert len(numbered(np.zeros(0, int), np.zeros((0, 2), int))) == 0
 
 
 N = NO_REGION
@@ -56,7 +56,7 @@ def test_tracked_ids_are_distinct_and_never_used_again():
     ids, next_id, dead = np.full(40, NO_REGION), 0, set()
     for _ in range(60):
         alive = set(ids.tolist()) - {NO_REGION}
-        component = components(rng.integers(0, 3, 40), np.stack((np.arange(39), np.arange(1, 40)), axis=1))
+        component = numbered(rng.integers(0, 3, 40), np.stack((np.arange(39), np.arange(1, 40)), axis=1))
         ids, next_id = track(component, ids, next_id)
         assert len(set(zip(component.tolist(), ids.tolist(), strict=True))) == len(set(ids.tolist()))
         assert len(set(component.tolist())) == len(set(ids.tolist()))
@@ -89,7 +89,7 @@ def test_components_equal_scipys(seed):
     same = edges[labels[edges[:, 0]] == labels[edges[:, 1]]]
     graph = sparse.coo_matrix((np.ones(len(same)), same.T), shape=(200, 200))
     expected = connected_components(graph, directed=False)[1]
-    found = components(labels, edges)
+    found = numbered(labels, edges)
     assert len(np.unique(np.stack((found, expected), axis=1), axis=0)) == len(np.unique(expected))
     assert len(np.unique(found)) == len(np.unique(expected))
     firsts = np.unique(found, return_index=True)[1]
@@ -129,7 +129,7 @@ def two_rooms():
     right = [(1.0, y, 1.0) for y in (0.0, 5.0, 6.0)]
     edges = np.array([(0, 3), (1, 4), (2, 5), (0, 1), (1, 2), (3, 4), (4, 5)])
     clearances = np.array([0.4, 0.9, 1.1, 1.0, 1.0, 1.0, 1.0], np.float32)
-    return apply(PlaceGraph(), place_delta(np.array(left + right), edges, clearances_m=clearances), False).graph
+    return apply(ReceivedGraph(), place_delta(np.array(left + right), edges, clearances_m=clearances), False).graph
 
 
 def test_border_by_hand():

@@ -6,7 +6,7 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
 from prior_sg.services.segmenter.core.map.inclination import GeometryConfig, disturbed, reach, shape_of
-from prior_sg.services.segmenter.core.map.received import PlaceGraph, apply
+from prior_sg.services.segmenter.core.map.received import ReceivedGraph, apply
 from tests.help.world import place_delta
 
 CFG = GeometryConfig(neighbourhood_m=2.5, saturation=10.0)
@@ -19,7 +19,7 @@ def grid(inclination_rad, rows=5, columns=5):
     positions = points[:, :1] * rise + points[:, 1:2] * (0.0, 1.0, 0.0)
     first, second = np.triu_indices(len(points), 1)
     near = np.linalg.norm(points[first] - points[second], axis=1) < 1.01
-    return apply(PlaceGraph(), place_delta(positions, np.stack((first, second), axis=1)[near]), False).graph
+    return apply(ReceivedGraph(), place_delta(positions, np.stack((first, second), axis=1)[near]), False).graph
 
 
 @pytest.mark.parametrize("degrees", [0, 20, 32, 60, 90])
@@ -43,7 +43,7 @@ def test_a_ball_of_places_says_little_and_a_single_place_nothing():
     """Six places at the ends of three equal axes and one in the middle: l1 = l3, anisotropy 0."""
     points = np.vstack((np.zeros((1, 3)), np.eye(3), -np.eye(3)))
     edges = np.array([(0, i) for i in range(1, 7)])
-    graph = apply(PlaceGraph(), place_delta(np.vstack((points, [(50.0, 0.0, 0.0)])), edges), False).graph
+    graph = apply(ReceivedGraph(), place_delta(np.vstack((points, [(50.0, 0.0, 0.0)])), edges), False).graph
     shape = shape_of(graph, np.array([0, 7]), CFG)
     np.testing.assert_allclose(shape.anisotropy, 0.0, atol=1e-9)
     assert shape.support.tolist() == pytest.approx([7 / 17, 1 / 11])
@@ -60,7 +60,7 @@ def random_graph(rng, count=80):
 @pytest.mark.parametrize("seed", range(3))
 def test_neighbourhoods_equal_scipys_shortest_paths(seed):
     rng = np.random.default_rng(seed)
-    graph = apply(PlaceGraph(), place_delta(*random_graph(rng)), False).graph
+    graph = apply(ReceivedGraph(), place_delta(*random_graph(rng)), False).graph
     count = len(graph.ids)
     weights = csr_matrix((graph.lengths_m, graph.edges.T), shape=(count, count))
     inside = dijkstra(weights, directed=False) <= CFG.neighbourhood_m
@@ -77,7 +77,7 @@ def test_neighbourhoods_equal_scipys_shortest_paths(seed):
 def test_whatever_a_change_does_not_disturb_keeps_its_shape(seed):
     rng = np.random.default_rng(seed)
     positions, edges = random_graph(rng)
-    before = apply(PlaceGraph(), place_delta(positions, edges), False).graph
+    before = apply(ReceivedGraph(), place_delta(positions, edges), False).graph
     some = rng.choice(len(positions), 6, replace=False)
     change = place_delta(
         positions[some[:2]] + 0.3,

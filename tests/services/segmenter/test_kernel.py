@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from prior_sg.services.segmenter.core.evidence import kernel
-from prior_sg.services.segmenter.core.evidence.kernel import Archive, Evidence, KernelConfig, Targets
+from prior_sg.services.segmenter.core.evidence.archive import FrameArchive, integrate_all
+from prior_sg.services.segmenter.core.evidence.kernel import Evidence, KernelConfig, Targets
 from tests.help.world import CAMERA, DIM, look, place_grid, pyramid, walk
 
 CFG = KernelConfig()
@@ -28,13 +29,13 @@ def literal_kernel(message, position_world, radius_m, gamma):
 
 def gather(frames, positions, order=None):
     """Evidence of places from frames."""
-    evidence, archive = Evidence(), Archive()
+    evidence, archive = Evidence(), FrameArchive()
     for index in range(len(frames)) if order is None else order:
         archive.add(frames[index].frame_id, kernel.compact(frames[index]))
     ids = list(range(len(positions)))
     evidence.add(ids)
     targets = Targets(evidence.of(ids), positions.astype(float))
-    kernel.integrate_all(evidence, archive, targets, RADIUS_M, CFG)
+    integrate_all(evidence, archive, targets, RADIUS_M, CFG)
     return evidence, targets
 
 
@@ -134,7 +135,7 @@ def test_a_wall_hides_the_room_behind_it():
 def test_frustum_candidates_miss_no_frame_that_sees_a_place():
     frames = walk(3)
     positions, _ = place_grid(3)
-    archive = Archive()
+    archive = FrameArchive()
     for message in frames:
         archive.add(message.frame_id, kernel.compact(message))
     for row in range(0, len(positions), 5):

@@ -7,19 +7,19 @@ import numpy as np
 import pytest
 
 from prior_sg.schemas.codec import decode, encode
-from prior_sg.schemas.features import TextRequest
 from prior_sg.schemas.frames import PoseUpdate
 from prior_sg.schemas.objects import Detections, ObjectDelta
 from prior_sg.schemas.places import SnapshotRequest
 from prior_sg.schemas.priors import ObjectPrior, RegionPrior
 from prior_sg.schemas.status import Tick
-from prior_sg.schemas.topics import OBJECT_SNAPSHOT
+from prior_sg.schemas.topics import OBJECT_SNAPSHOT, TEXT
 from prior_sg.services.geometry import inverse, transform
-from prior_sg.services.runtime.service import Ask, Identity
+from prior_sg.services.runtime.runner import Runner
+from prior_sg.services.runtime.service import Identity
+from prior_sg.services.segmenter.core.config import Config
 from prior_sg.services.segmenter.core.experts.context import ObjectView
 from prior_sg.services.segmenter.core.objects import names as naming
 from prior_sg.services.segmenter.core.objects import tracks as objects
-from prior_sg.services.segmenter.core.state import Config
 from prior_sg.services.segmenter.service import SERVICE
 from tests.help.world import CAMERA, DIM, ROBOT, SPACE, look, place_delta, place_grid, prior, task, text
 
@@ -375,16 +375,17 @@ class Run:
 
     def __init__(self, cfg=None):
         self.cfg = cfg or Config()
-        self.state = SERVICE.init(self.cfg, Identity(ROBOT, "i", 1))
+        self.runner = Runner(SERVICE, self.cfg, Identity(ROBOT, "i", 1), {TEXT: self.answer}, wire=True)
+        self.state = self.runner.state
         self.deltas, self.objects = [], {}
 
+    def answer(self, request):
+        return text(EYE[: len(request.concepts)], space=request.space)
+
     def feed(self, *messages):
-        for message in messages:
-            for output in list(SERVICE.step(self.state, message, self.cfg)):
-                if isinstance(output, Ask) and isinstance(output.request, TextRequest):
-                    self.feed(text(EYE[: len(output.request.concepts)], space=output.request.space))
-                elif not isinstance(output, Ask) and isinstance(output[1], ObjectDelta):
-                    self.take(decode(ObjectDelta, encode(output[1])))
+        for _, message in self.runner.feed(*messages):
+            if isinstance(message, ObjectDelta):
+                self.take(message)
         return self
 
     def take(self, delta):
@@ -409,7 +410,7 @@ def test_objects_are_told_once_and_named_when_a_prior_comes():
     assert len(run.deltas) == 1
     run.feed(task(), prior(["kitchen", "bedroom"]), TICK, TICK)
     assert sorted(item.label for item in run.objects.values()) == ["bed", "oven"] and len(run.deltas) == 2
-    assert run.deltas[1].prior_digest == run.state.alignment.digest
+    assert run.deltas[1].prior_digest == run.state.aim.in_force.digest
     snapshot = SERVICE.answers[OBJECT_SNAPSHOT](run.state, SnapshotRequest(robot=ROBOT), run.cfg)
     assert snapshot.snapshot and snapshot.revision == 1
     assert {item.id: item for item in snapshot.objects} == run.objects
@@ -419,13 +420,13 @@ def test_objects_are_told_once_and_named_when_a_prior_comes():
 def test_only_objects_that_were_sought_by_the_priors_names_answer_what_it_holds(sought, word):
     names = np.arange(len(sought), dtype=np.int16)
     fields = {"prompted": bool(sought), "sought": sought, "names": names}
-    view = started(**fields).feed(task(), prior(["kitchen", "bedroom"]), TICK).state.objects
+    view = started(**fields).feed(task(), prior(["kitchen", "bedroom"]), TICK).state.objects.view
     assert isinstance(view, ObjectView) and len(view.ids) == 2
     assert np.allclose(view.concepts.sum(axis=1), 1.0)
     assert (view.words > 0.9).all()
     assert view.answers == pytest.approx([word, word], abs=0.1) and (view.answers > 0).all() == (word > 0)
     silent = Config(tracking=objects.TrackingConfig(unprompted_weight=0.0))
-    view = started(silent, **fields).feed(task(), prior(["kitchen", "bedroom"]), TICK).state.objects
+    view = started(silent, **fields).feed(task(), prior(["kitchen", "bedroom"]), TICK).state.objects.view
     assert view.words == pytest.approx([word, word], abs=0.1)
 
 
@@ -445,7 +446,7 @@ def test_where_nothing_is_likely_enough_no_object_has_a_label_and_nothing_a_word
     run = Run(cfg).feed(place_delta(positions, edges), *frames, TICK, task(), prior(["kitchen", "bedroom"]), TICK, TICK)
     assert [item.label for item in run.objects.values()] == ["", ""]
     assert all(item.probability > 0.5 and 0 < item.known < 1 for item in run.objects.values())
-    assert len(run.state.objects.ids) == 0
+    assert len(run.state.objects.view.ids) == 0
 
 
 def test_a_pose_update_moves_what_was_told():
@@ -468,8 +469,8 @@ def test_detections_of_another_space_wait_until_it_is_in_force():
     there = dict(run.objects)
     run.feed(*[sight(i, pose, [OVEN], space="other/space") for i, pose in enumerate(walk())], TICK)
     assert run.objects == there
-    objects.renew(run.state.tracks, "other/space", 99, run.cfg.tracking)
-    assert [track.frames for track in run.state.tracks.items.values()] == [8]
+    objects.renew(run.state.objects.tracks, "other/space", 99, run.cfg.tracking)
+    assert [track.frames for track in run.state.objects.tracks.items.values()] == [8]
 
 
 def test_settings_out_of_range_are_refused():

@@ -5,7 +5,7 @@ import pytest
 
 from prior_sg.services.segmenter.core.energy.mrf import Field, energy
 from prior_sg.services.segmenter.core.energy.posteriors import conditional_costs, posteriors
-from prior_sg.services.segmenter.core.map.received import PlaceGraph, apply
+from prior_sg.services.segmenter.core.map.received import ReceivedGraph, apply
 from tests.help.world import place_delta
 
 
@@ -16,13 +16,13 @@ def test_conditional_costs_are_differences_of_the_energy(seed):
     count, labels = 20, 4
     edges = np.unique(np.sort(rng.integers(0, count, (40, 2)), axis=1), axis=0)
     edges = edges[edges[:, 0] != edges[:, 1]]
-    graph = apply(PlaceGraph(), place_delta(rng.uniform(0, 9, (count, 3)), edges), False).graph
+    graph = apply(ReceivedGraph(), place_delta(rng.uniform(0, 9, (count, 3)), edges), False).graph
     pairwise = np.triu(rng.uniform(0, 3, (labels, labels)), 1)
     field = Field(
         rng.normal(size=(count, labels)), graph.edges, rng.uniform(0, 2, len(graph.edges)), pairwise + pairwise.T
     )
     taken, rows = rng.integers(0, labels, count), rng.choice(count, 6, replace=False)
-    costs = conditional_costs(field, graph.adjacency, taken, rows)
+    costs = conditional_costs(field, graph.arcs, taken, rows)
     for index, row in enumerate(rows.tolist()):
         for label in range(labels):
             changed = taken.copy()

@@ -7,10 +7,11 @@ from prior_sg.schemas.priors import PriorEvidence
 from prior_sg.schemas.status import Tick
 from prior_sg.schemas.topics import PRIOR_EVIDENCE, TEXT
 from prior_sg.services.prior_gateway.core import learning
-from prior_sg.services.runtime.service import Ask, Identity
+from prior_sg.services.runtime.runner import Runner
+from prior_sg.services.runtime.service import Identity
 from prior_sg.services.segmenter.core import prior_evidence
+from prior_sg.services.segmenter.core.config import Config
 from prior_sg.services.segmenter.core.experts.context import ObjectView
-from prior_sg.services.segmenter.core.state import Config
 from prior_sg.services.segmenter.service import SERVICE
 from tests.help.world import ROBOT, place_delta, place_grid, prior, task, text, walk
 
@@ -18,18 +19,20 @@ ROOMS = ["kitchen", "hall", "bedroom"]
 TICK = Tick(stamp_ns=10**18)
 
 
+def segmenter(cfg: Config) -> Runner:
+    """A segmenter whose text requests are answered like rooms' basis vectors."""
+
+    def reply(request):
+        return text(np.eye(3)[: len(request.concepts)])
+
+    return Runner(SERVICE, cfg, Identity(ROBOT, "i", 1), {TEXT: reply}, wire=True)
+
+
 def told(cfg: Config, ticks: int, names=ROOMS) -> list[PriorEvidence]:
     """Everything told about the prior by the given tick."""
     positions, edges = place_grid(3)
-    state, found = SERVICE.init(cfg, Identity(ROBOT, "i", 1)), []
-    queue = [place_delta(positions, edges), task(), prior(names), *walk(3), *[TICK] * ticks]
-    while queue:
-        for output in list(SERVICE.step(state, queue.pop(0), cfg)):
-            if isinstance(output, Ask) and output.query is TEXT:
-                queue.insert(0, text(np.eye(3)[: len(output.request.concepts)]))
-            elif not isinstance(output, Ask) and output[0] is PRIOR_EVIDENCE:
-                found.append(decode(PriorEvidence, encode(output[1])))  # with the checks of the wire
-    return found
+    messages = (place_delta(positions, edges), task(), prior(names), *walk(3), *[TICK] * ticks)
+    return [message for topic, message in segmenter(cfg).feed(*messages) if topic is PRIOR_EVIDENCE]
 
 
 def test_rooms_in_a_row_are_counted_once_and_only_neighbours_touch():
@@ -86,13 +89,12 @@ def seen_with(weight: float) -> PriorEvidence:
     """The evidence of three labelled rooms with an oven in the kitchen."""
     positions, edges = place_grid(3)
     cfg = Config(evidence_ticks=0)
-    state = SERVICE.init(cfg, Identity(ROBOT, "i", 1))
-    queue = [place_delta(positions, edges), task(), prior(ROOMS), *walk(3), TICK]
-    while queue:
-        for output in list(SERVICE.step(state, queue.pop(0), cfg)):
-            if isinstance(output, Ask) and output.query is TEXT:
-                queue.insert(0, text(np.eye(3)[: len(output.request.concepts)]))
-    state.objects = ObjectView(np.array([1]), np.array([[2.0, 2.0, 0.5]]), np.array([[0.9, 0.1]]), np.array([weight]))
+    runner = segmenter(cfg)
+    runner.feed(place_delta(positions, edges), task(), prior(ROOMS), *walk(3), TICK)
+    state = runner.state
+    state.objects.view = ObjectView(
+        np.array([1]), np.array([[2.0, 2.0, 0.5]]), np.array([[0.9, 0.1]]), np.array([weight])
+    )
     return decode(PriorEvidence, encode(prior_evidence.evidence(state, cfg)))
 
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from prior_sg.services.segmenter.core.map.received import PlaceGraph, apply
+from prior_sg.services.segmenter.core.map.received import ReceivedGraph, apply
 from tests.help.world import place_delta
 
 
@@ -62,7 +62,7 @@ def random_delta(rng, literal, snapshot):
 
 def test_random_deltas_equal_the_literal_graph():
     rng = np.random.default_rng(2)
-    literal, graph = Literal(), PlaceGraph()
+    literal, graph = Literal(), ReceivedGraph()
     for turn in range(60):
         delta = random_delta(rng, literal, snapshot=turn in (0, 30))
         before = graph
@@ -83,7 +83,7 @@ def neighbours(graph, place):
     """Ids of the neighbours of a place by brute force, checked against the compressed table."""
     row = int(graph.rows(np.array([place]))[0])
     found = {*graph.edges[graph.edges[:, 0] == row, 1].tolist(), *graph.edges[graph.edges[:, 1] == row, 0].tolist()}
-    near = graph.adjacency
+    near = graph.arcs
     at = slice(near.starts[row], near.starts[row + 1])
     assert sorted(found) == sorted(near.neighbours[at].tolist())
     for other, edge in zip(near.neighbours[at].tolist(), near.edges[at].tolist(), strict=True):
@@ -93,7 +93,7 @@ def neighbours(graph, place):
 
 def test_only_real_changes_count_as_moved():
     positions = np.array([(0.0, 0.0, 1.0), (1.0, 0.0, 1.0), (2.0, 0.0, 1.0)])
-    first = apply(PlaceGraph(), place_delta(positions, np.array([(0, 1)])), replaces=False)
+    first = apply(ReceivedGraph(), place_delta(positions, np.array([(0, 1)])), replaces=False)
     assert first.moved.all() and (first.previous == -1).all()
     positions[1, 0] = 1.5
     second = apply(first.graph, place_delta(positions, np.zeros((0, 2))), replaces=False)

@@ -9,7 +9,7 @@ import pytest
 from prior_sg.schemas.priors import ObjectPrior, Task
 from prior_sg.services.prior_gateway.core.config import Config
 from prior_sg.services.prior_gateway.outside import library
-from prior_sg.services.segmenter.core.map.received import PlaceGraph, apply
+from prior_sg.services.segmenter.core.map.received import ReceivedGraph, apply
 from prior_sg.services.segmenter.core.objects import names, sizes
 from prior_sg.services.segmenter.core.objects.sizes import Boxes, SizeConfig
 from prior_sg.services.segmenter.core.objects.tracks import Track, TrackingConfig, packed
@@ -30,7 +30,7 @@ def graph_of(places, edges=(), **changes):
     positions_m = np.array([place[:3] for place in places], np.float32)
     radii_m = np.array([place[3] for place in places], np.float32)
     delta = place_delta(positions_m, np.array(edges, np.int64).reshape(-1, 2), radii_m=radii_m, **changes)
-    return apply(PlaceGraph(), delta, replaces=True).graph
+    return apply(ReceivedGraph(), delta, replaces=True).graph
 
 
 def boxes(*rows):
@@ -67,7 +67,7 @@ def test_the_floor_is_where_the_lowest_sphere_nearby_rests():
     points_m = np.array([(2, 0, 0.5), (0, 0, 0.2), (1, 0, 3.6)])
     assert sizes.floor_below(points_m, graph, 1) == pytest.approx([0.0, 0.0, 3.1])
     assert sizes.floor_below(points_m, graph, 0) == pytest.approx([0.9, 0.4, 3.6])
-    assert np.isnan(sizes.floor_below(points_m, PlaceGraph(), 3)).all()
+    assert np.isnan(sizes.floor_below(points_m, ReceivedGraph(), 3)).all()
 
 
 def test_places_on_the_ground_tell_the_floor_themselves():

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from prior_sg.services.segmenter.core.appearance.smoothing import SharingConfig, reached, shared
-from prior_sg.services.segmenter.core.map.received import PlaceGraph, apply
+from prior_sg.services.segmenter.core.map.received import ReceivedGraph, apply
 from tests.help.world import place_delta
 
 
@@ -13,7 +13,7 @@ def random_field(seed, count=60, columns=3):
     positions = rng.uniform(0, 6, (count, 3))
     first, second = np.triu_indices(count, 1)
     near = np.linalg.norm(positions[first] - positions[second], axis=1) < 1.8
-    graph = apply(PlaceGraph(), place_delta(positions, np.stack((first, second), axis=1)[near]), False).graph
+    graph = apply(ReceivedGraph(), place_delta(positions, np.stack((first, second), axis=1)[near]), False).graph
     trust = rng.uniform(0, 8, count) * (rng.random(count) < 0.7)
     return graph, rng.uniform(0.1, 2, len(graph.edges)), trust, rng.normal(size=(count, columns))
 
@@ -34,12 +34,10 @@ def test_sharing_equals_powers_of_the_walk(seed, steps):
     mass = np.minimum(trust, 5.0)
     sums, total = spread @ (mass[:, None] * own), (spread @ mass)[:, None]
     expected = 2.0 * np.divide(sums, total, out=np.zeros_like(own), where=total > 0) if steps else own
-    found = shared(own, trust, graph.adjacency, weights, rows=np.arange(count), cfg=cfg)
+    found = shared(own, trust, graph.arcs, weights, rows=np.arange(count), cfg=cfg)
     np.testing.assert_allclose(found, expected, atol=1e-12)
     some = np.random.default_rng(seed).choice(count, 5, replace=False)
-    np.testing.assert_allclose(
-        shared(own, trust, graph.adjacency, weights, rows=some, cfg=cfg), expected[some], atol=1e-12
-    )
+    np.testing.assert_allclose(shared(own, trust, graph.arcs, weights, rows=some, cfg=cfg), expected[some], atol=1e-12)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -47,11 +45,11 @@ def test_a_change_reaches_as_many_edges_as_there_are_steps(seed):
     graph, weights, trust, own = random_field(seed)
     cfg, mask = SharingConfig(steps=2), np.zeros(len(trust), dtype=bool)
     mask[[3, 9]] = True
-    rows = reached(graph.adjacency, mask, 2)
+    rows = reached(graph.arcs, mask, 2)
     changed = own + np.where(mask[:, None], 5.0, 0.0)
     everyone = np.arange(len(trust))
-    before = shared(own, trust, graph.adjacency, weights, rows=everyone, cfg=cfg)
-    after = shared(changed, np.where(mask, trust + 1, trust), graph.adjacency, weights, rows=everyone, cfg=cfg)
+    before = shared(own, trust, graph.arcs, weights, rows=everyone, cfg=cfg)
+    after = shared(changed, np.where(mask, trust + 1, trust), graph.arcs, weights, rows=everyone, cfg=cfg)
     rest = np.setdiff1d(everyone, rows)
     assert len(rest)
     np.testing.assert_array_equal(before[rest], after[rest])

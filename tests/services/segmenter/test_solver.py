@@ -5,10 +5,9 @@ import itertools
 import numpy as np
 import pytest
 
-from prior_sg.services.segmenter.core.energy import swap
 from prior_sg.services.segmenter.core.energy.bound import lower_bound
 from prior_sg.services.segmenter.core.energy.mrf import Field, energy
-from prior_sg.services.segmenter.core.energy.solver import Settings, Solver, changed_rows
+from prior_sg.services.segmenter.core.energy.solver import Settings, Solver, changed_rows, minimise
 from prior_sg.services.segmenter.core.map.arcs import arcs_of
 from tests.help.fields import all_energies, best_swap, random_field, random_tree
 
@@ -235,4 +234,4 @@ def test_on_trees_the_bound_and_the_labels_are_exact(seed):
     field = random_tree(seed, places=7, labels=3)
     energies = all_energies(field)[1]
     assert lower_bound(field) == pytest.approx(energies.min(), rel=1e-6)
-    assert energy(field, swap.minimise(field, field.unary.argmin(axis=1))) == pytest.approx(energies.min())
+    assert energy(field, minimise(field, field.unary.argmin(axis=1))) == pytest.approx(energies.min())

@@ -1,5 +1,7 @@
 """The whole segmenter on a small world: right regions, lasting ids, task switch, deltas, questions, replay."""
 
+from functools import partial
+
 import msgspec
 import numpy as np
 import pytest
@@ -21,14 +23,17 @@ from prior_sg.schemas.topics import (
     TASK_IN_FORCE,
     TEXT,
 )
+from prior_sg.services.runtime.runner import Runner
 from prior_sg.services.runtime.service import Ask, Identity
 from prior_sg.services.segmenter.core import inference, report
-from prior_sg.services.segmenter.core import update as core
+from prior_sg.services.segmenter.core.aim import region_concepts
 from prior_sg.services.segmenter.core.appearance.adaptation import Adaptation, AdaptationConfig
 from prior_sg.services.segmenter.core.appearance.label_bias import BalanceConfig
-from prior_sg.services.segmenter.core.energy import swap
+from prior_sg.services.segmenter.core.config import Config
+from prior_sg.services.segmenter.core.energy.mrf import energy
+from prior_sg.services.segmenter.core.energy.solver import minimise
 from prior_sg.services.segmenter.core.experts.context import ObjectView
-from prior_sg.services.segmenter.core.state import Config
+from prior_sg.services.segmenter.core.map.place_map import edge_weights
 from prior_sg.services.segmenter.service import SERVICE
 from tests.help.world import (
     FRAMES_PER_ROOM,
@@ -56,24 +61,27 @@ class Run:
     """One segmenter, its outputs, and a reader of its deltas. Text requests are answered like rooms' basis vectors."""
 
     def __init__(self, cfg=CFG, concepts=None):
-        self.cfg, self.state = cfg, SERVICE.init(cfg, Identity(ROBOT, "i", 1))
+        answers = {query: partial(self.answer, query) for query in SERVICE.asks}
+        self.runner = Runner(SERVICE, cfg, Identity(ROBOT, "i", 1), answers, wire=True)
+        self.cfg, self.state = cfg, self.runner.state
         self.concepts = np.eye(3) if concepts is None else concepts
         self.deltas, self.asked, self.reader = [], [], Reader()
-        self.asked_task = 0
+        self.asked_task, self.answer_text = 0, True
+
+    def answer(self, query, request):
+        if query is TASK_IN_FORCE:
+            self.asked_task += 1
+            return None
+        self.asked.append(Ask(query, request))
+        return text(self.concepts[: len(request.concepts)]) if query is TEXT and self.answer_text else None
 
     def feed(self, *messages, answer_text=True):
-        for message in messages:
-            for output in list(SERVICE.step(self.state, decode(type(message), encode(message)), self.cfg)):
-                if isinstance(output, Ask) and output.query is TASK_IN_FORCE:
-                    self.asked_task += 1
-                elif isinstance(output, Ask):
-                    self.asked.append(output)
-                    if output.query is TEXT and answer_text:
-                        self.feed(text(self.concepts[: len(output.request.concepts)]))
-                elif output[0] is not BACKFILL:  # which tests/test_segmenter_spaces.py is about
-                    assert output[0] is REGION_DELTA
-                    self.deltas.append(output[1])
-                    self.reader.apply(output[1])
+        self.answer_text = answer_text
+        for topic, message in self.runner.feed(*messages):
+            if topic is not BACKFILL:  # which test_handover.py is about
+                assert topic is REGION_DELTA
+                self.deltas.append(message)
+                self.reader.apply(message)
         return self
 
     def labels(self):
@@ -176,7 +184,7 @@ def test_a_prior_may_come_before_its_task_and_others_are_left_alone():
     assert run.deltas[-1].labels == ROOMS
     run.feed(*(prior(["x", "y"], f"foreign {n}") for n in range(9)), TICK)
     assert run.deltas[-1].labels == ROOMS
-    assert core.wanted_prior(run.state) is not None
+    assert run.state.aim.wanted is not None
 
 
 def test_switching_back_and_forth_ends_in_the_same_labels():
@@ -214,7 +222,7 @@ def test_an_older_task_changes_nothing():
     run, _ = finished()
     before = run.labels()
     run.feed(task("older", stamp_ns=1), TaskInForce(robot=ROBOT, task=task("oldest", stamp_ns=0)), TICK)
-    assert run.state.task == task() and run.labels() == before
+    assert run.state.aim.intent.tasks[ROBOT] == task() and run.labels() == before
 
 
 def test_a_missing_prior_is_asked_for_and_an_empty_answer_repeated():
@@ -257,9 +265,9 @@ def test_late_and_moved_places_get_the_evidence_of_all_frames():
     displaced[5] = (9.5, 3.5, 1.0)
     late = Run().feed(place_delta(displaced[:20], np.zeros((0, 2))), task(), prior(ROOMS), *frames, TICK)
     late.feed(place_delta(positions, edges, revision=1), TICK)
-    slots = [run.state.evidence.of(list(range(len(positions)))) for run in (early, late)]
+    slots = [run.state.seen.evidence.of(list(range(len(positions)))) for run in (early, late)]
     np.testing.assert_allclose(
-        early.state.evidence.descriptors(slots[0]), late.state.evidence.descriptors(slots[1]), atol=1e-5
+        early.state.seen.evidence.descriptors(slots[0]), late.state.seen.evidence.descriptors(slots[1]), atol=1e-5
     )
     assert early.labels() == late.labels()
 
@@ -269,21 +277,21 @@ def test_another_query_radius_integrates_everything_again():
     wide = [RegionPrior(name=name, phrases=[f"a {name}"], existence=1 / 3, query_radius_m=1.5) for name in ROOMS]
     before = Run().feed(task(), prior(ROOMS, regions=wide), place_delta(positions, edges), *frames, TICK)
     after = Run().feed(place_delta(positions, edges), *frames, task(), prior(ROOMS, regions=wide), TICK)
-    assert before.state.query_radius_m == after.state.query_radius_m == 1.5
-    slots = [run.state.evidence.of(list(range(len(positions)))) for run in (before, after)]
-    sums = [run.state.evidence.trust[slot] for run, slot in zip((before, after), slots, strict=True)]
+    assert before.state.seen.query_radius_m == after.state.seen.query_radius_m == 1.5
+    slots = [run.state.seen.evidence.of(list(range(len(positions)))) for run in (before, after)]
+    sums = [run.state.seen.evidence.trust[slot] for run, slot in zip((before, after), slots, strict=True)]
     np.testing.assert_allclose(*sums, rtol=1e-5)
     narrow, _ = finished()
-    assert not np.allclose(narrow.state.evidence.trust[: len(positions)], sums[0], rtol=0.05)
+    assert not np.allclose(narrow.state.seen.evidence.trust[: len(positions)], sums[0], rtol=0.05)
 
 
 def test_repeated_and_foreign_pyramids_change_nothing():
     run, _ = finished()
-    deltas, trust = len(run.deltas), run.state.evidence.trust.copy()
+    deltas, trust = len(run.deltas), run.state.seen.evidence.trust.copy()
     run.feed(walk(3)[2], pyramid(99, look(2, 2, 0), 3, space="other/space"), TICK, TICK)
     assert len(run.deltas) == deltas
-    np.testing.assert_array_equal(run.state.evidence.trust, trust)
-    assert run.state.ignored_pyramids == 1  # the other space is kept apart
+    np.testing.assert_array_equal(run.state.seen.evidence.trust, trust)
+    assert run.state.seen.ignored_pyramids == 1  # the other space is kept apart
 
 
 def test_deltas_hold_only_what_changed():
@@ -313,17 +321,17 @@ def test_a_spent_budget_leaves_a_valid_labelling_and_an_idle_tick_finishes():
     for frame in frames:
         run.feed(frame)
         state = run.state
-        assert ((state.places.labels >= 0) & (state.places.labels < len(ROOMS))).all()
-        assert state.dirty or not state.solver.pending
-        waited |= state.solver.pending > 0
+        assert ((state.map.places.labels >= 0) & (state.map.places.labels < len(ROOMS))).all()
+        assert state.labelling.dirty or not state.labelling.solver.pending
+        waited |= state.labelling.solver.pending > 0
     assert waited
-    hurried = swap.energy(inference.field_of(run.state), run.state.places.labels)
+    hurried = energy(inference.field_of(run.state), run.state.map.places.labels)
     run.feed(TICK, TICK)
-    assert not (run.state.dirty or run.state.solver.pending)
+    assert not (run.state.labelling.dirty or run.state.labelling.solver.pending)
     field = inference.field_of(run.state)
-    energy = swap.energy(field, run.state.places.labels)
-    assert energy <= hurried + 1e-9
-    assert swap.energy(field, swap.minimise(field, run.state.places.labels)) == pytest.approx(energy)
+    settled = energy(field, run.state.map.places.labels)
+    assert settled <= hurried + 1e-9
+    assert energy(field, minimise(field, run.state.map.places.labels)) == pytest.approx(settled)
     assert sorted(region.label for region in run.reader.regions.values()) == sorted(ROOMS)
 
 
@@ -334,8 +342,8 @@ def test_places_may_leave_at_either_end_of_the_list(end):
     run.feed(no_places(revision=1, removed_ids=np.array(gone)), TICK)
     assert set(run.reader.beliefs) == set(range(len(positions))) - set(gone)
     field = inference.field_of(run.state)
-    fresh = swap.minimise(field, run.state.places.labels)
-    assert swap.energy(field, fresh) == pytest.approx(swap.energy(field, run.state.places.labels))
+    fresh = minimise(field, run.state.map.places.labels)
+    assert energy(field, fresh) == pytest.approx(energy(field, run.state.map.places.labels))
 
 
 def test_a_merge_tells_the_new_region_of_every_place():
@@ -382,7 +390,7 @@ def test_what_is_kept_up_to_date_equals_what_is_found_afresh(seed):
     oven = ObjectView(ids=np.array([3]), positions_m=np.array([(2.0, 2.0, 1.0)]), concepts=np.array([(1.0, 0.0)]))
     none = np.zeros(0, dtype=np.int64)
     for revision, frame in enumerate(frames[::2], start=1):
-        alive = run.state.graph.ids
+        alive = run.state.map.graph.ids
         removed = rng.choice(alive, 2, replace=False) if revision % 3 == 0 else none
         merged = rng.choice(np.setdiff1d(alive, removed), (1, 2), replace=False) if revision % 4 == 0 else none
         back = np.arange(len(positions)) if revision % 7 == 0 else none
@@ -391,25 +399,25 @@ def test_what_is_kept_up_to_date_equals_what_is_found_afresh(seed):
         fields = {"removed_ids": removed, "merged_ids": merged.reshape(-1, 2), "place_ids": back, "revision": revision}
         run.feed(place_delta(positions[back], edges if len(back) else edges[:0], **fields), frame)
     run.feed(TICK, TICK, TICK)
-    state, places = run.state, run.state.places
-    assert not state.dirty and len(state.adaptation.directions)
+    state, places = run.state, run.state.map.places
+    assert not state.labelling.dirty and len(state.labelling.adaptation.directions)
     columns = ("labels", "regions", "unary", "posteriors", "inclination_rad", "support", "anisotropy")
     kept = {name: getattr(places, name).copy() for name in columns}
     before, beliefs = dict(run.reader.regions), dict(run.reader.beliefs)
     places.stale[:] = places.reshaped[:] = places.doubtful[:] = places.unbelieved[:] = True
-    state.adaptation = Adaptation()
-    state.weights = inference.edge_weights(state.graph, cfg)
+    state.labelling.adaptation = Adaptation()
+    state.map.weights = edge_weights(state.map.graph, cfg)
     inference.evaluate_experts(state, True, cfg)
     inference.believe(state, cfg)
     for name, column in kept.items():
-        np.testing.assert_allclose(getattr(state.places, name), column, atol=1e-5, err_msg=name)
+        np.testing.assert_allclose(getattr(state.map.places, name), column, atol=1e-5, err_msg=name)
     report.publish(state, [], True, cfg)
-    assert {number: (region.neighbour_ids, region.object_ids) for number, region in state.regions.items()} == {
+    assert {number: (region.neighbour_ids, region.object_ids) for number, region in state.regions.known.items()} == {
         number: (region.neighbour_ids, region.object_ids) for number, region in before.items()
     }
-    assert state.regions == before
+    assert state.regions.known == before
     told = {place: belief[0] for place, belief in beliefs.items()}
-    assert told == dict(zip(state.graph.ids.tolist(), places.regions.tolist(), strict=True))
+    assert told == dict(zip(state.map.graph.ids.tolist(), places.regions.tolist(), strict=True))
     fresh = Reader()
     fresh.apply(SERVICE.answers[REGION_SNAPSHOT](state, SnapshotRequest(robot=ROBOT), cfg))
     assert fresh.beliefs.keys() == beliefs.keys()
@@ -439,13 +447,15 @@ def test_corrected_poses_equal_poses_known_from_the_start():
     rest = [frame for frame in frames if frame.frame_id % 3]
     for order in ((*shifted, *rest, update), (update, *rest, *shifted), (*shifted[:5], update, *rest, *shifted[5:])):
         run = Run().feed(place_delta(positions, edges), task(), prior(ROOMS), *order, TICK)
-        slots = [one.state.evidence.of(list(range(len(positions)))) for one in (clean, run)]
+        slots = [one.state.seen.evidence.of(list(range(len(positions)))) for one in (clean, run)]
         for name in ("sums", "trust", "frames"):
-            found = [getattr(one.state.evidence, name)[slot] for one, slot in zip((clean, run), slots, strict=True)]
+            found = [
+                getattr(one.state.seen.evidence, name)[slot] for one, slot in zip((clean, run), slots, strict=True)
+            ]
             np.testing.assert_allclose(*found, atol=1e-3, err_msg=name)
         assert run.labels() == clean.labels()
     disturbed = Run().feed(place_delta(positions, edges), task(), prior(ROOMS), *shifted, *rest, TICK)
-    assert not np.allclose(disturbed.state.evidence.trust, clean.state.evidence.trust, atol=0.1)
+    assert not np.allclose(disturbed.state.seen.evidence.trust, clean.state.seen.evidence.trust, atol=0.1)
     deltas = len(run.deltas)
     run.feed(update, TICK)  # a repeat
     assert len(run.deltas) == deltas
@@ -485,7 +495,7 @@ def test_regions_know_their_doors_and_barely_seen_places_are_predicted():
     assert abs(kitchen.transitions[0].position_m[0] - 4.0) <= 0.5 and kitchen.transitions[0].clearance_m == 0.4
     assert run.deltas[-1].predicted_ids.tolist() or any(delta.predicted_ids.tolist() for delta in run.deltas)
     fresh = SERVICE.answers[REGION_SNAPSHOT](run.state, SnapshotRequest(robot=ROBOT), CFG)
-    trust = run.state.evidence.trust[run.state.evidence.of(fresh.place_ids.tolist())]
+    trust = run.state.seen.evidence.trust[run.state.seen.evidence.of(fresh.place_ids.tolist())]
     assert fresh.predicted_ids.tolist() == fresh.place_ids[trust < CFG.predicted_trust].tolist()
     assert len(positions) in fresh.predicted_ids.tolist() and len(fresh.predicted_ids) < len(positions) / 2
     assert not kitchen.predicted
@@ -515,7 +525,7 @@ def test_posterior_explains_the_label():
     likelihoods = np.exp(-(np.array(reply.unary) + reply.pull) / reply.temperature)
     np.testing.assert_allclose(reply.posterior, likelihoods / likelihoods.sum(), atol=1e-9)
     pull = [
-        sum(near.weight * run.state.alignment.pairwise[column, ROOMS.index(near.label)] for near in reply.neighbours)
+        sum(near.weight * run.state.aim.in_force.pairwise[column, ROOMS.index(near.label)] for near in reply.neighbours)
         for column in range(3)
     ]
     np.testing.assert_allclose(reply.pull, pull, atol=1e-9)
@@ -525,7 +535,7 @@ def test_posterior_explains_the_label():
 
 def test_beta_zero_labels_each_place_by_its_own_evidence():
     run, _ = finished(cfg=Config(beta=0.0))
-    np.testing.assert_array_equal(run.state.places.labels, run.state.places.unary.argmin(axis=1))
+    np.testing.assert_array_equal(run.state.map.places.labels, run.state.map.places.unary.argmin(axis=1))
 
 
 @pytest.mark.parametrize(("clearance_m", "factor"), [(0.0, 1.0), (0.8, 0.5), (0.2, 1.0)])
@@ -545,17 +555,17 @@ def test_edge_weights_by_hand(scale):
     positions = scale * np.array([(0.0, 0.0, 1.0), (1.0, 0.0, 1.0), (2.0, 0.0, 1.0), (1.0, 1.0, 1.0)])
     positions[:, 2] = 1.0
     run = Run().feed(place_delta(positions, np.array([(0, 1), (1, 2), (1, 3)])))
-    np.testing.assert_allclose(inference.edge_weights(run.state.graph, OPEN), np.sqrt(3.0), rtol=1e-6)
-    doors = run.state.graph.clearances_m  # 0.4 m from the posts on each side
+    np.testing.assert_allclose(edge_weights(run.state.map.graph, OPEN), np.sqrt(3.0), rtol=1e-6)
+    doors = run.state.map.graph.clearances_m  # 0.4 m from the posts on each side
     assert np.allclose(doors, 0.4)
-    np.testing.assert_allclose(inference.edge_weights(run.state.graph, CFG), np.sqrt(3.0) / 2, rtol=1e-6)
+    np.testing.assert_allclose(edge_weights(run.state.map.graph, CFG), np.sqrt(3.0) / 2, rtol=1e-6)
 
 
 def test_edge_weights_fall_with_length():
     """Path of 1 m and 3 m: w = 0.60653, 0.22313; 3 w / sqrt(d_u d_v) = 3 sqrt(w / 0.82966) = 2.5651, 1.5558."""
     positions = np.array([(0.0, 0.0, 1.0), (1.0, 0.0, 1.0), (4.0, 0.0, 1.0)])
     run = Run().feed(place_delta(positions, np.array([(0, 1), (1, 2)])))
-    np.testing.assert_allclose(inference.edge_weights(run.state.graph, OPEN), (2.5651, 1.5558), atol=1e-4)
+    np.testing.assert_allclose(edge_weights(run.state.map.graph, OPEN), (2.5651, 1.5558), atol=1e-4)
 
 
 def test_a_label_the_encoder_favours_everywhere_does_not_take_the_map():
@@ -568,13 +578,13 @@ def test_a_label_the_encoder_favours_everywhere_does_not_take_the_map():
         run = Run(cfg=cfg).feed(place_delta(positions, edges), task(), prior(ROOMS), answer_text=False)
         run.feed(shifted, *frames, TICK)
         inside = positions[:, 0] % 4.0 != 0
-        right[limit] = (run.state.places.labels == positions[:, 0] // 4.0)[inside].mean()
+        right[limit] = (run.state.map.places.labels == positions[:, 0] // 4.0)[inside].mean()
     assert right[0.0] < 0.75 and right[10.0] > 0.9
 
 
 def test_object_phrases_are_the_most_discriminative():
     containment = np.array([(0.9, 0.1), (0.1, 0.1)], dtype=np.float32)
-    found = core.region_concepts(prior(["kitchen", "hall"], containment=containment), object_phrases=1)
+    found = region_concepts(prior(["kitchen", "hall"], containment=containment), object_phrases=1)
     assert found == [["a kitchen", "an oven"], ["a hall"]]
 
 

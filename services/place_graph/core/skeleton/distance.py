@@ -24,22 +24,23 @@ STEPS = np.array(
 )
 
 
-def refresh(
-    grid: VoxelGrid,
-    changed: np.ndarray,
-    *,
-    max_distance_voxels: float,
-    voronoi_min_voxels: float,
-    parent_l1_voxels: float,
-    parent_cos: float,
-) -> Box | None:
+class FieldRules(NamedTuple):
+    """How far distances reach and what is on the GVD; lengths in voxels."""
+
+    max_distance: float  # distances end here
+    voronoi_min_distance: float  # the GVD ends this close to obstacles
+    parent_l1: float  # obstacles farther apart than this (L1) are distinct basis points ...
+    parent_cos: float  # ... and so are those seen under an angle with a smaller cosine
+
+
+def refresh(grid: VoxelGrid, changed: np.ndarray, rules: FieldRules) -> Box | None:
     """Bring distances and GVD up to date after the labels of the voxels (n, 3) changed.
 
     Returns the box of all voxels whose distance or membership of the GVD may have changed, None if there are none.
     """
     if not len(changed):
         return None
-    reach, max_d2 = int(np.ceil(max_distance_voxels)), int(np.floor(max_distance_voxels**2))
+    reach, max_d2 = int(np.ceil(rules.max_distance)), int(np.floor(rules.max_distance**2))
     core = Box(changed.min(axis=0), changed.max(axis=0) + 1).grown(reach).clipped(grid.bounds)
     while True:
         window = core.grown(RIM)
@@ -54,7 +55,7 @@ def refresh(
         return None
     box = Box(touched.min(axis=0) + window.low, touched.max(axis=0) + window.low + 1).grown(1)
     basis = grid.gather("basis", window)
-    limits = (voronoi_min_voxels**2, parent_l1_voxels, parent_cos)
+    limits = (rules.voronoi_min_distance**2, rules.parent_l1, rules.parent_cos)
     renew_voronoi(label, d2, offset, basis, touched, *limits)
     part = tuple(slice(*ends) for ends in zip(box.low - window.low, box.high - window.low, strict=True))
     for name, values in (("d2", d2), ("offset", offset), ("basis", basis)):

@@ -21,7 +21,7 @@ class Place(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Rules:
+class GraphRules:
     """What makes places one and what joins them, all lengths in voxels."""
 
     cell: int  # side of a compression cell
@@ -69,7 +69,7 @@ class _Sight:
 class PlaceGraph:
     """All places of the map, also those too isolated to be published."""
 
-    def __init__(self, rules: Rules) -> None:
+    def __init__(self, rules: GraphRules) -> None:
         self.rules = rules
         self.places: dict[int, Place] = {}
         self.edges: dict[int, dict[int, int]] = {}  # id -> neighbour -> squared clearance (voxels)
@@ -270,7 +270,7 @@ class PlaceGraph:
 
 
 def _match(
-    old_voxels: np.ndarray, new_voxels: np.ndarray, frozen: np.ndarray, rules: Rules, sight: _Sight
+    old_voxels: np.ndarray, new_voxels: np.ndarray, frozen: np.ndarray, rules: GraphRules, sight: _Sight
 ) -> dict[int, int]:
     """Index of the old place that each new one continues: nearest first, within a cell or its side, in clear sight.
 

@@ -1,6 +1,7 @@
 """From GVD voxels to places: compression cells, representatives, merging (Hydra, `graph_extractor`; pure)."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -37,22 +38,26 @@ def whole_cells(box: Box, cell_voxels: int, margin_cells: int = 0) -> Box:
     return Box(low * cell_voxels, high * cell_voxels)
 
 
-def extract(  # noqa: PLR0917
-    grid: VoxelGrid, box: Box, cell_voxels: int, min_d2: float, merge_d2: float, widest: bool = False
-) -> Extraction:
-    """Places of all cells inside `box`, which must consist of whole cells; the grid's GVD must be up to date.
+class ExtractionRules(NamedTuple):
+    """What becomes a place; lengths in voxels."""
 
-    Of places that merge the one with most basis points stays, or with `widest` the widest.
-    """
+    cell: int  # side of a compression cell
+    min_radius: float  # smallest radius of a place
+    merge: float  # touching places nearer than this are one ...
+    widest: bool = False  # ... the widest, instead of the one with most basis points
+
+
+def extract(grid: VoxelGrid, box: Box, rules: ExtractionRules) -> Extraction:
+    """Places of all cells inside `box`, which must consist of whole cells; the grid's GVD must be up to date."""
     basis = grid.gather("basis", box)
     d2 = grid.gather("d2", box)
-    members = _member_voxels(basis, d2, min_d2)
+    members = _member_voxels(basis, d2, rules.min_radius**2)
     labels = np.full(basis.shape, -1, np.int32)
-    groups = _grow_groups(members, labels, box.low, cell_voxels)
+    groups = _grow_groups(members, labels, box.low, rules.cell)
     local, group_d2, group_basis = _representatives(members, labels, d2, basis, groups)
     pairs = _unique_pairs(_touching(members, labels))
-    first, second = (group_d2, group_basis) if widest else (group_basis, group_d2)
-    root = _merge(local, first, second, pairs, merge_d2)
+    first, second = (group_d2, group_basis) if rules.widest else (group_basis, group_d2)
+    root = _merge(local, first, second, pairs, rules.merge**2)
     kept = np.flatnonzero(root == np.arange(groups))
     index = np.full(groups, -1, np.int64)
     index[kept] = np.arange(len(kept))

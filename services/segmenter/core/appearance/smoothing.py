@@ -13,8 +13,7 @@ import msgspec
 import numpy as np
 from numba import njit
 
-from prior_sg.services.segmenter.core.map.arcs import ball
-from prior_sg.services.segmenter.core.map.received import Adjacency
+from prior_sg.services.segmenter.core.map.arcs import Arcs, ball
 
 
 class SharingConfig(msgspec.Struct, frozen=True, kw_only=True):
@@ -31,7 +30,7 @@ class SharingConfig(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def shared(
-    own: np.ndarray, trust: np.ndarray, near: Adjacency, weights: np.ndarray, *, rows: np.ndarray, cfg: SharingConfig
+    own: np.ndarray, trust: np.ndarray, near: Arcs, weights: np.ndarray, *, rows: np.ndarray, cfg: SharingConfig
 ) -> np.ndarray:
     """Averages (row, column) of `own` (place, column) around the places `rows`, times the gain; `trust` (place,)
     weighs places, `weights` (edge,) weigh edges. Where nothing around has trust, zeros; without steps, `own`."""
@@ -42,7 +41,7 @@ def shared(
     return cfg.gain * averages
 
 
-def reached(near: Adjacency, mask: np.ndarray, steps: int) -> np.ndarray:
+def reached(near: Arcs, mask: np.ndarray, steps: int) -> np.ndarray:
     """Rows within `steps` edges of the places in `mask`, these included."""
     return ball(np.flatnonzero(mask), steps, near.starts, near.neighbours, np.zeros(len(mask), bool))
 

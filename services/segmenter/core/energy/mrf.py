@@ -9,7 +9,6 @@ A field is: `unary` (place, label) costs; `edges` (edge, 2) place rows with `wei
 from typing import NamedTuple
 
 import numpy as np
-from scipy import sparse
 
 RELATIVE_GAIN = 1e-12  # of the energy's magnitude; a smaller gain is rounding
 
@@ -28,15 +27,6 @@ def energy(field: Field, labels: np.ndarray) -> float:
     first, second = labels[field.edges[:, 0]], labels[field.edges[:, 1]]
     unary = field.unary[np.arange(len(labels)), labels].sum()
     return float(unary + (field.weights * field.pairwise[first, second]).sum())
-
-
-def conditional_costs(field: Field, labels: np.ndarray) -> np.ndarray:
-    """Cost (place, label) of each label at each place while all its neighbours keep theirs."""
-    n = len(labels)
-    rows = np.concatenate((field.edges[:, 0], field.edges[:, 1]))
-    columns = np.concatenate((field.edges[:, 1], field.edges[:, 0]))
-    weights = sparse.csr_matrix((np.tile(field.weights, 2), (rows, columns)), shape=(n, n))
-    return field.unary + weights @ field.pairwise[labels]
 
 
 def least_gain(unary: np.ndarray) -> float:

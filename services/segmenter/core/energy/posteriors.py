@@ -9,15 +9,16 @@ pictures, and the energy, which counts each of them, believes too firmly.
 import numpy as np
 from numba import njit
 
-from prior_sg.services.segmenter.core.energy.swap import Field
-from prior_sg.services.segmenter.core.map.received import Adjacency
+from prior_sg.services.segmenter.core.energy.mrf import Field
+from prior_sg.services.segmenter.core.energy.swap_moves import conditional
+from prior_sg.services.segmenter.core.map.arcs import Arcs
 
 
-def conditional_costs(field: Field, near: Adjacency, labels: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """Cost (row, label) of each label at the places `rows` while all others keep theirs."""
-    return _conditional_costs(
-        field.unary, near.starts, near.neighbours, near.edges, field.weights, field.pairwise, labels, rows
-    )
+def conditional_costs(field: Field, arcs: Arcs, labels: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Cost (row, label) of each label at the places `rows` while all others keep theirs; `arcs` of the field's edges,
+    whatever their weights."""
+    weights = field.weights[arcs.edges]
+    return _conditional_costs(field.unary, arcs.starts, arcs.neighbours, weights, field.pairwise, labels, rows)
 
 
 def posteriors(costs: np.ndarray, temperature: float) -> np.ndarray:
@@ -27,13 +28,8 @@ def posteriors(costs: np.ndarray, temperature: float) -> np.ndarray:
 
 
 @njit(cache=True, nogil=True)
-def _conditional_costs(unary, starts, neighbours, edges, weights, pairwise, labels, rows):  # noqa: ANN001, ANN202, PLR0917
+def _conditional_costs(unary, starts, neighbours, weights, pairwise, labels, rows):  # noqa: ANN001, ANN202, PLR0917
     costs = np.empty((len(rows), unary.shape[1]))
     for index in range(len(rows)):
-        row = rows[index]
-        costs[index] = unary[row]
-        for at in range(starts[row], starts[row + 1]):
-            label = labels[neighbours[at]]
-            for other in range(unary.shape[1]):
-                costs[index, other] += weights[edges[at]] * pairwise[other, label]
+        conditional(rows[index], starts, neighbours, weights, unary, pairwise, labels, costs[index])
     return costs

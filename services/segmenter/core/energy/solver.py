@@ -7,8 +7,9 @@
 The caller says which places changed (`dirty`: those with another unary cost, other edges, other weights or a
 neighbour that is gone; new places too), or leaves it to the solver, which then compares the field with the last one.
 Row numbers may change between updates: `previous` says which row each place had (-1: a new place), as
-`graph.Step.previous` does. A place without a label yet has label -1; labels may be others than the solver's last. The
-solver keeps references to the field's arrays, not copies: where they are changed in place, `dirty` must be given.
+`map.received.Step.previous` does. A place without a label yet has label -1; labels may be others than the solver's
+last. The solver keeps references to the field's arrays, not copies: where they are changed in place, `dirty` must be
+given.
 
 The change is solved as a local problem with fixed surroundings, which grows while labels at its border change:
 
@@ -22,14 +23,13 @@ Idle time also goes into longer message passing over the whole field, at the sta
 """
 
 from collections.abc import Callable
-from typing import Literal
 
 import msgspec
 import numpy as np
 from numba import njit
 
 from prior_sg.services.segmenter.core.energy import swap_moves
-from prior_sg.services.segmenter.core.energy.maxflow import CUTS
+from prior_sg.services.segmenter.core.energy.maxflow import CUTS, MinCut, min_cut_in_use
 from prior_sg.services.segmenter.core.energy.mrf import Field, least_gain
 from prior_sg.services.segmenter.core.energy.trws import empty_messages, lay_down, run_pass, take_up
 from prior_sg.services.segmenter.core.map.arcs import Arcs, arcs_of, ball
@@ -40,7 +40,7 @@ Expired = Callable[[], bool]
 class Settings(msgspec.Struct, frozen=True, kw_only=True):
     """How hard to try. Chosen on random fields like place graphs; see docs/performance.md."""
 
-    min_cut: Literal["pymaxflow", "scipy"] = "pymaxflow"  # library for large cuts; PyMaxflow is under the GPL
+    min_cut: MinCut = "auto"  # library for large cuts; auto is PyMaxflow (GPL) where it is installed, else SciPy
     compiled_up_to: int = 2_000  # free places in a cut that compiled code solves itself
     round_trips: int = 6  # of message passing
     idle_round_trips: int = 20  # of message passing over the whole field when all else is done
@@ -69,6 +69,7 @@ class Solver:
 
     def __init__(self, settings: Settings | None = None) -> None:
         self.settings = settings or Settings()
+        self._cut = CUTS[min_cut_in_use(self.settings.min_cut)]
         self.labels = np.zeros(0, np.int64)
         self._field: Field | None = None
         self._graph: Arcs = arcs_of(0, np.zeros((0, 2)), np.zeros(0))
@@ -118,7 +119,7 @@ class Solver:
         settings, arrays = self.settings, (self._graph, self._unary, self._pairwise, self.labels, self._work)
         limits = swap_moves.Limits(depth, settings.near, settings.compiled_up_to, settings.chunk, self._least_gain)
         while swap_moves.waiting(self._work, depth) and not expired():
-            swap_moves.run_swaps(*arrays, CUTS[settings.min_cut], limits)
+            swap_moves.run_swaps(*arrays, self._cut, limits)
 
     def take(
         self,
@@ -201,6 +202,17 @@ class Solver:
             )
             if self._propose(rows, self.settings.round_trips, expired):
                 self._unproposed = self._unproposed[:0]
+
+
+def minimise(field: Field, labels: np.ndarray, settings: Settings | None = None) -> np.ndarray:
+    """Labels (place,) from which no alpha-beta-swap lowers the energy; it is at most that of `labels`.
+
+    Message passing proposes a labelling for the whole field, which replaces `labels` wherever that lowers the energy;
+    then swaps run until none is left that gains. (An idle `Solver` goes on from there.)
+    """
+    solver = Solver(msgspec.structs.replace(settings or Settings(), worn_share=np.inf))
+    solver.take(field, labels)
+    return solver.drain()
 
 
 @njit(cache=True, nogil=True)

@@ -13,7 +13,8 @@ import msgspec
 import numpy as np
 
 from prior_sg.schemas.features import Backfill, Pyramid
-from prior_sg.services.segmenter.core.evidence import kernel
+from prior_sg.services.segmenter.core.evidence.archive import FrameArchive
+from prior_sg.services.segmenter.core.evidence.kernel import Evidence, compact
 
 
 class SpacesConfig(msgspec.Struct, frozen=True, kw_only=True):
@@ -34,7 +35,7 @@ class SpacesConfig(msgspec.Struct, frozen=True, kw_only=True):
 class Rival:
     """A space that is not in force."""
 
-    archive: kernel.Archive = field(default_factory=kernel.Archive)
+    archive: FrameArchive = field(default_factory=FrameArchive)
     waits: bool = False  # comes into force only when the present space is silent
     heard: int = 0  # pyramids since the last one of the space in force
     ticks: int = 0  # since it was first heard
@@ -53,7 +54,7 @@ class Spaces:
     still_ticks: int = 0  # since the space in force was last heard
 
 
-def hear(spaces: Spaces, pyramid: Pyramid, in_force: kernel.Archive, cfg: SpacesConfig) -> bool:
+def hear(spaces: Spaces, pyramid: Pyramid, in_force: FrameArchive, cfg: SpacesConfig) -> bool:
     """Keep a pyramid of a space that is not in force; False when it is not needed."""
     if not cfg.follow:
         return False
@@ -62,7 +63,7 @@ def hear(spaces: Spaces, pyramid: Pyramid, in_force: kernel.Archive, cfg: Spaces
         waits = pyramid.space in spaces.left or not len(in_force)
         rival = spaces.rivals[pyramid.space] = Rival(waits=waits)
     rival.heard += 1
-    if not _comes(rival, cfg) or not rival.archive.add(pyramid.frame_id, kernel.compact(pyramid)):
+    if not _comes(rival, cfg) or not rival.archive.add(pyramid.frame_id, compact(pyramid)):
         return False
     rival.still_ticks = 0
     return True
@@ -90,7 +91,7 @@ def move(spaces: Spaces, frame_id: int, world_from_camera: np.ndarray) -> None:
         rival.archive.move(frame_id, world_from_camera)
 
 
-def questions(spaces: Spaces, in_force: kernel.Archive, robot: str, cfg: SpacesConfig) -> Iterator[Backfill]:
+def questions(spaces: Spaces, in_force: FrameArchive, robot: str, cfg: SpacesConfig) -> Iterator[Backfill]:
     """Ask for keyframes: what this process has missed, after its start and whenever the stream rests; and for newcomers
     until they cover."""
     started, rests = spaces.ticks == cfg.backfill_ticks, spaces.still_ticks == cfg.backfill_ticks
@@ -102,7 +103,7 @@ def questions(spaces: Spaces, in_force: kernel.Archive, robot: str, cfg: SpacesC
             yield _backfill(name, rival.archive, robot, rival.still_ticks >= cfg.backfill_ticks)
 
 
-def successor(spaces: Spaces, in_force: kernel.Archive, cfg: SpacesConfig) -> str | None:
+def successor(spaces: Spaces, in_force: FrameArchive, cfg: SpacesConfig) -> str | None:
     """A space worth trying: it has every frame that the present one has, but the newest, or has stopped growing."""
     for name, rival in spaces.rivals.items():
         missing = in_force.frame_ids - rival.archive.frame_ids
@@ -114,7 +115,7 @@ def successor(spaces: Spaces, in_force: kernel.Archive, cfg: SpacesConfig) -> st
     return None
 
 
-def covers(new: kernel.Evidence, old: kernel.Evidence, slots: np.ndarray, cfg: SpacesConfig) -> bool:
+def covers(new: Evidence, old: Evidence, slots: np.ndarray, cfg: SpacesConfig) -> bool:
     """Whether nearly every place that the old evidence describes is described by the new; both have the same slots."""
     before, after = old.frames[slots] > 0, new.frames[slots] > 0
     return bool((before & after).sum() >= cfg.coverage * before.sum())
@@ -125,7 +126,7 @@ def refuse(spaces: Spaces, name: str) -> None:
     spaces.rivals[name].tried_frames = len(spaces.rivals[name].archive)
 
 
-def succeed(spaces: Spaces, name: str) -> kernel.Archive:
+def succeed(spaces: Spaces, name: str) -> FrameArchive:
     """Put a space in force; returns its frames."""
     spaces.left.add(spaces.force)
     spaces.left.discard(name)
@@ -137,6 +138,6 @@ def _comes(rival: Rival, cfg: SpacesConfig) -> bool:
     return not rival.waits or rival.heard >= cfg.silent_frames
 
 
-def _backfill(space: str, archive: kernel.Archive, robot: str, settled: bool) -> Backfill:
+def _backfill(space: str, archive: FrameArchive, robot: str, settled: bool) -> Backfill:
     frame_ids = np.array(sorted(archive.frame_ids), np.int64)
     return Backfill(robot=robot, space=space, frame_ids=frame_ids, settled=settled)

@@ -1,22 +1,17 @@
-"""Semantic integration kernel and temporal fusion: from pyramids to one descriptor per place (pure).
+"""Semantic integration kernel and temporal fusion: from pyramids to one descriptor per place (pure)."""
 
-All pyramids stay in an archive, without their images, so that new or moved places, a corrected pose or another query
-radius are integrated over every frame as if they had been there from the start.
-"""
-
-from collections.abc import Set
 from typing import NamedTuple
 
 import msgspec
 import numpy as np
+from numba import njit
 from scipy import ndimage
 
 from prior_sg.schemas.features import Pyramid
 from prior_sg.schemas.frames import Intrinsics
 from prior_sg.services.geometry import inverse
-from prior_sg.services.segmenter.core.loops import accumulate, weigh
 
-PAIRS_PER_BLOCK = 1 << 19  # frame-place pairs tested at once; bounds the memory of the visibility test
+ROWS_PER_BLOCK = 128  # places multiplied at once: their sums stay in the processor's cache
 
 
 class KernelConfig(msgspec.Struct, frozen=True, kw_only=True):
@@ -113,6 +108,34 @@ def kernel(frame: Frame, positions_m: np.ndarray, query_radius_m: float, gamma: 
     return weigh(query_states, crop_states, frame.layer_starts, float(gamma))
 
 
+@njit(cache=True, nogil=True, fastmath=True)
+def weigh(
+    query_states: np.ndarray, crop_states: np.ndarray, layer_starts: np.ndarray, gamma: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Weights (place, crop) and trust (place,), float32: eqs. spatial_affinity, scale_trust, observation_trust.
+
+    States are float32 (n, 3): pixel u, v and scale sigma in pixels.
+    """
+    places, crops, layers = len(query_states), len(crop_states), len(layer_starts)
+    weights, trust = np.empty((places, crops), np.float32), np.zeros(places, np.float32)
+    crop_logs, sharpness = np.log(crop_states[:, 2]), np.float32(1.0 / gamma)
+    for place in range(places):
+        u, v, sigma = query_states[place]
+        area, log = sigma**2, np.log(sigma)
+        for layer in range(layers):
+            end = layer_starts[layer + 1] if layer + 1 < layers else crops
+            best = np.float32(0.0)
+            for crop in range(layer_starts[layer], end):
+                du, dv = u - crop_states[crop, 0], v - crop_states[crop, 1]
+                spatial = (du * du + dv * dv) / (np.float32(2.0) * (area + crop_states[crop, 2] ** 2))
+                scale = (log - crop_logs[crop]) ** 2 * sharpness
+                weight = np.exp(-(spatial + scale))
+                weights[place, crop] = weight
+                best = max(best, weight)
+            trust[place] += best
+    return weights, trust
+
+
 class Evidence:
     """Running sums per place over all frames that observed it: sum of T e_p, sum of T, and count.
 
@@ -186,65 +209,24 @@ class Evidence:
         self.frames = np.concatenate((self.frames, np.zeros(size - have, dtype=np.int64)))
 
 
-class Archive:
-    """All frames, in the order of arrival, with a frustum test of many places against all of them at once."""
-
-    def __init__(self) -> None:
-        self.frames: list[Frame] = []
-        self._index: dict[int, int] = {}  # by frame id
-
-    def add(self, frame_id: int, frame: Frame) -> bool:
-        """Keep a frame; False when this id is already here."""
-        if frame_id in self._index:
-            return False
-        self._index[frame_id] = len(self.frames)
-        self.frames.append(frame)
-        return True
-
-    def move(self, frame_id: int, world_from_camera: np.ndarray) -> tuple[Frame, Frame] | None:
-        """Give a frame another pose; returns it before and after, None where it is unknown or stands there already."""
-        index = self._index.get(frame_id)
-        if index is None:
-            return None
-        before, camera_from_world = self.frames[index], inverse(world_from_camera)
-        if np.array_equal(before.camera_from_world, camera_from_world):
-            return None
-        self.frames[index] = before._replace(camera_from_world=camera_from_world)
-        return before, self.frames[index]
-
-    @property
-    def frame_ids(self) -> Set[int]:
-        """Numbers of the frames that are here."""
-        return self._index.keys()
-
-    def __len__(self) -> int:
-        return len(self.frames)
-
-    def candidates(self, positions_m: np.ndarray, cfg: KernelConfig) -> np.ndarray:
-        """Frames (indices, ascending) whose frustum may hold any of the positions; never leaves out one that does."""
-        if not self.frames or not len(positions_m):
-            return np.zeros(0, dtype=np.int64)
-        poses = np.stack([frame.camera_from_world for frame in self.frames])
-        limits = np.array([_frustum_tangents(frame.intrinsics) for frame in self.frames])
-        block = max(PAIRS_PER_BLOCK // len(positions_m), 1)
-        found = []
-        for start in range(0, len(poses), block):
-            pose, limit = poses[start : start + block], limits[start : start + block, :, None]
-            x, y, z = np.moveaxis(pose[:, :3, :3] @ positions_m.T + pose[:, :3, 3:], 1, 0)
-            inside = (z >= cfg.min_depth_m) & (z <= cfg.max_depth_m)
-            inside &= (x >= limit[:, 0] * z) & (x <= limit[:, 1] * z) & (y >= limit[:, 2] * z) & (y <= limit[:, 3] * z)
-            found.append(np.flatnonzero(inside.any(axis=1)) + start)
-        return np.concatenate(found)
-
-
-def _frustum_tangents(camera: Intrinsics) -> tuple[float, float, float, float]:
-    """Bounds of x / z and y / z inside the image, and one pixel more so that rounding leaves nothing out."""
-    return (
-        (-1.5 - camera.cx_px) / camera.fx_px,
-        (camera.width_px + 0.5 - camera.cx_px) / camera.fx_px,
-        (-1.5 - camera.cy_px) / camera.fy_px,
-        (camera.height_px + 0.5 - camera.cy_px) / camera.fy_px,
-    )
+@njit(cache=True, nogil=True)
+def accumulate(
+    sums: np.ndarray, slots: np.ndarray, weights: np.ndarray, trust: np.ndarray, embeddings: np.ndarray
+) -> None:
+    """sums[slots] += (trust * weights) @ embeddings, float32, in blocks of rows; no slot twice."""
+    dim = embeddings.shape[1]
+    scaled = np.empty((ROWS_PER_BLOCK, weights.shape[1]), np.float32)
+    products = np.empty((ROWS_PER_BLOCK, dim), np.float32)
+    for start in range(0, len(slots), ROWS_PER_BLOCK):
+        count = min(ROWS_PER_BLOCK, len(slots) - start)
+        for row in range(count):
+            for crop in range(weights.shape[1]):
+                scaled[row, crop] = weights[start + row, crop] * trust[start + row]
+        np.dot(scaled[:count], embeddings, products[:count])
+        for row in range(count):
+            target = sums[slots[start + row]]
+            for column in range(dim):
+                target[column] += products[row, column]
 
 
 class Targets(NamedTuple):
@@ -265,11 +247,3 @@ def integrate(
         weights, trust = kernel(frame, targets.positions_m[rows], query_radius_m, cfg.gamma)
         evidence.observe(targets.slots[rows], frame, weights, trust)
     return rows
-
-
-def integrate_all(
-    evidence: Evidence, archive: Archive, targets: Targets, query_radius_m: float, cfg: KernelConfig
-) -> None:
-    """Add every stored frame to targets that have none yet."""
-    for index in archive.candidates(targets.positions_m, cfg):
-        integrate(evidence, archive.frames[index], targets, query_radius_m, cfg)

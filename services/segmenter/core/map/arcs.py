@@ -1,4 +1,4 @@
-"""Which places touch which, as arcs with weights for the compiled solvers (pure)."""
+"""Which places touch which, as weighted arcs for compiled loops (pure)."""
 
 from typing import NamedTuple
 
@@ -11,8 +11,9 @@ class Arcs(NamedTuple):
 
     starts: np.ndarray  # (place + 1,) int64
     neighbours: np.ndarray  # (arc,) int32 row at the arc's far end
-    weights: np.ndarray  # (arc,) float64
+    weights: np.ndarray  # (arc,) float64, of its edge
     twins: np.ndarray  # (arc,) int32 number of the opposite arc
+    edges: np.ndarray  # (arc,) int32 number of its edge
 
 
 def arcs_of(places: int, edges: np.ndarray, weights: np.ndarray) -> Arcs:
@@ -33,7 +34,7 @@ def _build(places, edges, weights):  # noqa: ANN001, ANN202
         starts[place + 1] += starts[place]
     fill = starts[:-1].copy()
     arcs = starts[-1]
-    neighbours, twins = np.empty(arcs, np.int32), np.empty(arcs, np.int32)
+    neighbours, twins, numbers = np.empty(arcs, np.int32), np.empty(arcs, np.int32), np.empty(arcs, np.int32)
     arc_weights = np.empty(arcs)
     for edge in range(len(edges)):
         u, v = edges[edge, 0], edges[edge, 1]
@@ -46,7 +47,8 @@ def _build(places, edges, weights):  # noqa: ANN001, ANN202
         arc_weights[there] = weights[edge]
         arc_weights[back] = weights[edge]
         twins[there], twins[back] = back, there
-    return starts, neighbours, arc_weights, twins
+        numbers[there], numbers[back] = edge, edge
+    return starts, neighbours, arc_weights, twins, numbers
 
 
 @njit(cache=True, nogil=True)

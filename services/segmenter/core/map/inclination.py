@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 from numba import njit
 
-from prior_sg.services.segmenter.core.map.received import PlaceGraph, Step
+from prior_sg.services.segmenter.core.map.received import ReceivedGraph, Step
 
 
 class GeometryConfig(msgspec.Struct, frozen=True, kw_only=True):
@@ -37,12 +37,11 @@ class Shape(NamedTuple):
     anisotropy: np.ndarray  # (place,) 1 - l3 / l1; 0 where all places coincide
 
 
-def shape_of(graph: PlaceGraph, rows: np.ndarray, cfg: GeometryConfig) -> Shape:
+def shape_of(graph: ReceivedGraph, rows: np.ndarray, cfg: GeometryConfig) -> Shape:
     """Shape around the places in `rows`."""
-    near = graph.adjacency
-    lengths_m = graph.lengths_m[near.edges]
+    near = graph.arcs
     counts, covariances = _moments(
-        near.starts, near.neighbours, lengths_m, graph.positions_m, rows, cfg.neighbourhood_m
+        near.starts, near.neighbours, near.weights, graph.positions_m, rows, cfg.neighbourhood_m
     )
     values, vectors = np.linalg.eigh(covariances)  # ascending
     l1, l2, l3 = (np.maximum(values[:, axis], 0.0) for axis in (2, 1, 0))
@@ -56,15 +55,15 @@ def shape_of(graph: PlaceGraph, rows: np.ndarray, cfg: GeometryConfig) -> Shape:
     )
 
 
-def reach(graph: PlaceGraph, rows: np.ndarray, limit_m: float) -> np.ndarray:
+def reach(graph: ReceivedGraph, rows: np.ndarray, limit_m: float) -> np.ndarray:
     """Rows of the places within `limit_m` along edges of any of `rows`, these included."""
     if not len(rows):
         return np.zeros(0, dtype=np.int64)
-    near = graph.adjacency
-    return np.sort(_reach(near.starts, near.neighbours, graph.lengths_m[near.edges], rows, limit_m))
+    near = graph.arcs
+    return np.sort(_reach(near.starts, near.neighbours, near.weights, rows, limit_m))
 
 
-def disturbed(before: PlaceGraph, step: Step, limit_m: float) -> np.ndarray:
+def disturbed(before: ReceivedGraph, step: Step, limit_m: float) -> np.ndarray:
     """Mask (place,) of the places whose neighbourhood may differ from what it was before the step."""
     mask = np.zeros(len(step.graph.ids), dtype=bool)
     mask[reach(step.graph, np.flatnonzero(step.touched), limit_m)] = True

@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-from numba import njit
 
 from prior_sg.schemas.places import PlaceDelta
+from prior_sg.services.segmenter.core.map.arcs import Arcs, arcs_of
 
 
 def _empty(dtype: str, *shape: int) -> np.ndarray:
@@ -17,7 +17,7 @@ def _empty(dtype: str, *shape: int) -> np.ndarray:
 
 
 @dataclass(eq=False)
-class PlaceGraph:
+class ReceivedGraph:
     """Places sorted by id, and edges between their rows. Once built it does not change."""
 
     ids: np.ndarray = field(default_factory=lambda: _empty("int64"))  # (place,)
@@ -41,44 +41,16 @@ class PlaceGraph:
         return np.linalg.norm(self.positions_m[first] - self.positions_m[second], axis=1)
 
     @cached_property
-    def adjacency(self) -> "Adjacency":
-        """Neighbours of each place."""
-        return Adjacency(*_adjacency(len(self.ids), self.edges))
-
-
-@dataclass(frozen=True, eq=False)
-class Adjacency:
-    """Neighbours by row, compressed: those of row i stand at starts[i] to starts[i + 1]."""
-
-    starts: np.ndarray  # (place + 1,)
-    neighbours: np.ndarray  # (2 edge,) rows
-    edges: np.ndarray  # (2 edge,) the edge to each
-
-
-@njit(cache=True, nogil=True)
-def _adjacency(count, edges):  # noqa: ANN001, ANN202
-    starts = np.zeros(count + 1, np.int64)
-    for first, second in edges:
-        starts[first + 1] += 1
-        starts[second + 1] += 1
-    starts = np.cumsum(starts)
-    at = starts[:-1].copy()
-    neighbours = np.empty(2 * len(edges), np.int64)
-    numbers = np.empty(2 * len(edges), np.int64)
-    for number in range(len(edges)):
-        for one, other in ((0, 1), (1, 0)):
-            row = edges[number, one]
-            neighbours[at[row]] = edges[number, other]
-            numbers[at[row]] = number
-            at[row] += 1
-    return starts, neighbours, numbers
+    def arcs(self) -> Arcs:
+        """Neighbours of each place; an arc weighs its length in metres."""
+        return arcs_of(len(self.ids), self.edges, self.lengths_m)
 
 
 @dataclass(frozen=True)
 class Step:
     """How one graph follows from the one before."""
 
-    graph: PlaceGraph
+    graph: ReceivedGraph
     previous: np.ndarray  # (place,) row of each place in the former graph, -1 = new
     moved: np.ndarray  # (place,) bool: new, or the position differs
     touched: np.ndarray  # (place,) bool: new, moved, or an edge of it may have changed
@@ -86,7 +58,7 @@ class Step:
     removed: np.ndarray  # (removed,) rows of the former graph that are gone
 
 
-def apply(graph: PlaceGraph, delta: PlaceDelta, replaces: bool) -> Step:
+def apply(graph: ReceivedGraph, delta: PlaceDelta, replaces: bool) -> Step:
     """The graph after `delta`, in the order that the delta's schema states; with `replaces`, the delta is all of it.
 
     A place that was merged into another hands its edges over to it; edges to places that do not exist are dropped.
@@ -103,7 +75,7 @@ def apply(graph: PlaceGraph, delta: PlaceDelta, replaces: bool) -> Step:
     at = np.searchsorted(graph.ids[previous], new)
     previous = np.insert(previous, at, -1)
     old = previous >= 0
-    after = PlaceGraph(
+    after = ReceivedGraph(
         ids=np.insert(graph.ids[kept], at, new),
         positions_m=np.insert(graph.positions_m[kept], at, 0.0, axis=0),
         radii_m=np.insert(graph.radii_m[kept], at, 0.0),
@@ -119,8 +91,17 @@ def apply(graph: PlaceGraph, delta: PlaceDelta, replaces: bool) -> Step:
     return Step(after, previous, moved, touched, upserted=rows, removed=np.flatnonzero(~kept))
 
 
+def with_neighbours(graph: ReceivedGraph, mask: np.ndarray) -> np.ndarray:
+    """Mask (place,) grown by one edge."""
+    grown = mask.copy()
+    if mask.any():
+        grown[graph.edges[mask[graph.edges[:, 0]], 1]] = True
+        grown[graph.edges[mask[graph.edges[:, 1]], 0]] = True
+    return grown
+
+
 def _join_edges(
-    graph: PlaceGraph, after: PlaceGraph, delta: PlaceDelta, merged: list[tuple[int, int]], replaces: bool
+    graph: ReceivedGraph, after: ReceivedGraph, delta: PlaceDelta, merged: list[tuple[int, int]], replaces: bool
 ) -> np.ndarray:
     """Fill in the edges of `after`, and return the rows of `after` at their changed ends.
 
@@ -156,14 +137,14 @@ def _join_edges(
     return ends[ends >= 0]
 
 
-def _mark(graph: PlaceGraph, place_ids: np.ndarray) -> np.ndarray:
+def _mark(graph: ReceivedGraph, place_ids: np.ndarray) -> np.ndarray:
     """Mask (place,) of these places."""
     mask, rows = np.zeros(len(graph.ids), dtype=bool), graph.rows(place_ids)
     mask[rows[rows >= 0]] = True
     return mask
 
 
-def _edge_numbers(graph: PlaceGraph, pairs: np.ndarray) -> np.ndarray:
+def _edge_numbers(graph: ReceivedGraph, pairs: np.ndarray) -> np.ndarray:
     """Which edges join these pairs (n, 2) of place ids, in any order; pairs without an edge are left out."""
     if not (len(pairs) and len(graph.edges)):
         return np.zeros(0, dtype=np.int64)

@@ -1,20 +1,17 @@
-"""What the objects of the map are, in the prior's terms, and what followers have been told of them (pure)."""
+"""What the objects of the map are, in the prior's terms (pure)."""
 
-from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
 
 from prior_sg.schemas.features import TextEmbeddings
-from prior_sg.schemas.objects import ObjectDelta, SceneObject
+from prior_sg.schemas.objects import SceneObject
 from prior_sg.schemas.priors import Prior
-from prior_sg.services.segmenter.core.experts.context import ObjectView, standardised
-from prior_sg.services.segmenter.core.map.received import PlaceGraph
+from prior_sg.services.segmenter.core.experts.context import standardised
+from prior_sg.services.segmenter.core.map.received import ReceivedGraph
 from prior_sg.services.segmenter.core.objects import sizes
 from prior_sg.services.segmenter.core.objects.sizes import SizeConfig
 from prior_sg.services.segmenter.core.objects.tracks import Track, TrackingConfig, Tracks, descriptor
-
-VISIBLE_CHANGE = 0.02  # smaller changes of a probability are not sent
 
 
 class Named(NamedTuple):
@@ -26,90 +23,13 @@ class Named(NamedTuple):
     sought: float  # share of the detectors' votes that name one of the prior's objects
 
 
-@dataclass
-class ObjectLedger:
-    """What followers know."""
-
-    told: dict[int, Named] = field(default_factory=dict)
-    digest: str = ""
-    revision: int = -1
-    stamp_ns: int = 0
-
-    def view(self) -> ObjectView:
-        """The objects that carry a label or have a say, for regions and experts."""
-        named = [item for item in self.told.values() if item.entry.label or item.weight > 0]
-        if not named:
-            return ObjectView()
-        return ObjectView(
-            ids=np.array([item.entry.id for item in named], np.int64),
-            positions_m=np.array([item.entry.position_m for item in named]),
-            concepts=np.array([item.concepts for item in named]),
-            weights=np.array([item.weight for item in named]),
-            sought=np.array([item.sought for item in named]),
-        )
-
-    def snapshot(self, robot: str, epoch: int) -> ObjectDelta:
-        """Everything told so far; before the first delta, the empty state that it follows on."""
-        return self._delta(robot, epoch, [item.entry for _, item in sorted(self.told.items())], snapshot=True)
-
-    def tell(
-        self,
-        robot: str,
-        epoch: int,
-        stamp_ns: int,
-        *,
-        now: dict[int, Named],
-        merged: list[tuple[int, int]],
-        digest: str,
-    ) -> ObjectDelta | None:
-        """The delta from what is known to what is so; None when nothing changed visibly."""
-        known = self.told if digest == self.digest else {}
-        upserts = [item for number, item in now.items() if number not in known or _differs(item, known[number])]
-        heirs = dict(merged)
-        joined = []
-        for gone in sorted(self.told.keys() & heirs.keys() - now.keys()):
-            into = heirs[gone]
-            while into not in now and into in heirs:
-                into = heirs[into]
-            joined += [(gone, into)] if into in now else []
-        removed = sorted(self.told.keys() - now.keys() - {gone for gone, _ in joined})
-        if not (upserts or joined or removed):
-            return None
-        self.told = {number: known.get(number, item) for number, item in now.items()}
-        self.told |= {item.entry.id: item for item in upserts}
-        self.digest, self.revision, self.stamp_ns = digest, self.revision + 1, stamp_ns
-        return self._delta(robot, epoch, [item.entry for item in upserts], removed, joined)
-
-    def _delta(
-        self,
-        robot: str,
-        epoch: int,
-        entries: list[SceneObject],
-        removed: list[int] | None = None,
-        joined: list[tuple[int, int]] | None = None,
-        *,
-        snapshot: bool = False,
-    ) -> ObjectDelta:
-        return ObjectDelta(
-            robot=robot,
-            epoch=epoch,
-            revision=self.revision,
-            stamp_ns=self.stamp_ns,
-            prior_digest=self.digest,
-            snapshot=snapshot,
-            objects=entries,
-            removed_ids=np.array(removed or [], np.int64),
-            merged_ids=np.array(joined or [], np.int64).reshape(-1, 2),
-        )
-
-
 def named(
     tracks: Tracks,
     prior: Prior | None,
     text: TextEmbeddings | None,
     cfg: TrackingConfig,
     *,
-    graph: PlaceGraph,
+    graph: ReceivedGraph,
     size_cfg: SizeConfig,
 ) -> dict[int, Named]:
     """Every object that was seen often enough; without a prior and its text, none has a label."""
@@ -189,17 +109,4 @@ def _entry(track: Track, label: str, probability: float, known: float, cfg: Trac
         min_m=tuple(low_m.tolist()),
         max_m=tuple(high_m.tolist()),
         frames=track.frames,
-    )
-
-
-def _differs(now: Named, before: Named) -> bool:
-    """Whether somebody who looks would see it; a number of frames counts when it has doubled."""
-    one, other = now.entry, before.entry
-    return (
-        (one.label, one.min_m, one.max_m) != (other.label, other.min_m, other.max_m)
-        or abs(one.probability - other.probability) > VISIBLE_CHANGE
-        or abs(one.known - other.known) > VISIBLE_CHANGE
-        or one.frames >= 2 * other.frames
-        or one.frames < other.frames
-        or len(now.concepts) != len(before.concepts)
     )

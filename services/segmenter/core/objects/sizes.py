@@ -19,7 +19,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from prior_sg.schemas.priors import ObjectPrior
-from prior_sg.services.segmenter.core.map.received import PlaceGraph
+from prior_sg.services.segmenter.core.map.received import ReceivedGraph
 from prior_sg.services.segmenter.core.objects.tracks import Track, TrackingConfig, unpacked
 
 ANGLES = np.radians(np.arange(0, 90, 5))  # directions tried for the sides of a rotated thing
@@ -55,7 +55,7 @@ class Boxes(NamedTuple):
     cell_m: float
 
 
-def measured(tracks: Sequence[Track], tracking: TrackingConfig, graph: PlaceGraph, cfg: SizeConfig) -> Boxes:
+def measured(tracks: Sequence[Track], tracking: TrackingConfig, graph: ReceivedGraph, cfg: SizeConfig) -> Boxes:
     """The boxes of some objects above the floor that the places nearby show."""
     cell_m = tracking.cell_m
     numbers = [unpacked(track.firm(tracking.box_share)) for track in tracks]
@@ -77,7 +77,7 @@ def sides(cells: np.ndarray) -> np.ndarray:
     return np.array((max(longest, shortest), min(longest, shortest), height))
 
 
-def floor_below(points_m: np.ndarray, graph: PlaceGraph, steps: int) -> np.ndarray:
+def floor_below(points_m: np.ndarray, graph: ReceivedGraph, steps: int) -> np.ndarray:
     """Height (point,) of the floor at the place nearest to each point; NaN where there are no places.
 
     The free sphere of a place ends at or above the floor; of some place nearby it rests on it. The lowest sphere within

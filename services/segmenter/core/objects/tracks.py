@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 
 import msgspec
 import numpy as np
+from numba import njit
 from scipy.optimize import linear_sum_assignment
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
@@ -24,7 +25,6 @@ from prior_sg.schemas.codec import copied
 from prior_sg.schemas.objects import Detections
 from prior_sg.services.geometry import inverse, transform
 from prior_sg.services.segmenter.core.evidence import kernel
-from prior_sg.services.segmenter.core.loops import count_near
 
 AXIS_BITS = 21  # of a cell's number for each axis: 200 km of 0.1 m cells
 _STEPS = np.stack(np.meshgrid(*[(-1, 0, 1)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -418,6 +418,22 @@ def descriptor(embeddings: list[np.ndarray]) -> np.ndarray:
 def shared(cells: np.ndarray, others: np.ndarray) -> float:
     """Share of the cells that are at most one cell from one of the others (both sorted)."""
     return count_near(cells, others, COLUMNS) / len(cells)
+
+
+@njit(cache=True, nogil=True)
+def count_near(cells: np.ndarray, others: np.ndarray, steps: np.ndarray) -> int:
+    """How many of the cells have, at one of the steps from them, one of the others or its neighbour on the last axis.
+
+    All int64 and sorted; a step along the last axis is 1.
+    """
+    count = 0
+    for cell in cells:
+        for step in steps:
+            at = np.searchsorted(others, cell + step - 1)
+            if at < len(others) and others[at] <= cell + step + 1:
+                count += 1
+                break
+    return count
 
 
 def _frames(sources: set[tuple[str, int, int]]) -> int:

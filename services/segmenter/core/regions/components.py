@@ -10,23 +10,23 @@ from scipy.spatial import ConvexHull, cKDTree
 
 from prior_sg.schemas.regions import NO_REGION, RegionEvent, Transition
 from prior_sg.services.segmenter.core.experts.context import ObjectView
-from prior_sg.services.segmenter.core.map.received import PlaceGraph
+from prior_sg.services.segmenter.core.map.received import ReceivedGraph
 
 HULL_CORNERS = 8  # of the polygon that stands for a sphere in a hull
 OBJECT_REACH_M = 1.5  # an object stands in a region when one of its places is at most this far
 SIDE_BY_SIDE_M = 1.0  # edges across a border whose middles are closer than this lead through the same opening
 
 
-def components(labels: np.ndarray, edges: np.ndarray) -> np.ndarray:
+def numbered(labels: np.ndarray, edges: np.ndarray) -> np.ndarray:
     """Component number (place,) of each place in the graph of same-label edges (eq. connected_components).
 
     Numbers count from 0 in the order of each component's first place.
     """
-    return _components(labels, edges)
+    return _numbered(labels, edges)
 
 
 @njit(cache=True, nogil=True)
-def _components(labels, edges):  # noqa: ANN001, ANN202
+def _numbered(labels, edges):  # noqa: ANN001, ANN202
     """Union by the smaller row, which is then the component's first place."""
     parent = np.arange(len(labels))
     for edge in range(len(edges)):
@@ -54,7 +54,7 @@ def _components(labels, edges):  # noqa: ANN001, ANN202
 def track(component: np.ndarray, previous: np.ndarray, next_id: int) -> tuple[np.ndarray, int]:
     """Region id (place,) of each place, and the next unused id.
 
-    `component` (place,) from `components`, places in the order of their ids; `previous` (place,) holds the region ids
+    `component` (place,) from `numbered`, places in the order of their ids; `previous` (place,) holds the region ids
     before, NO_REGION for new places. An id follows the component that keeps most of its places (a split: the larger
     part), and a component that several ids would follow takes the one that brings most places (a merge); ties go to the
     older id and to the component of the older place. Components without an heir get new ids, in order.
@@ -154,7 +154,7 @@ class Border(NamedTuple):
     transitions: dict[int, list[Transition]]
 
 
-def border(graph: PlaceGraph, region_of: np.ndarray, ids: set[int], door_clearance_m: float) -> Border:
+def border(graph: ReceivedGraph, region_of: np.ndarray, ids: set[int], door_clearance_m: float) -> Border:
     """Neighbours and transitions of the regions `ids`; `region_of` (place,).
 
     Edges across a border that lie side by side are one way. It counts as a door where even the widest of them has at

@@ -1,27 +1,15 @@
 """What followers have been told, and the smallest delta to what they should know (pure)."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
+import msgspec
 import numpy as np
 
 from prior_sg.schemas.regions import Region, RegionDelta, RegionEvent
 
 _NONE = np.zeros(0, dtype=np.int64)
-
-
-class Source(NamedTuple):
-    """Where and from what a delta is made; fields as in RegionDelta."""
-
-    robot: str
-    epoch: int
-    stamp_ns: int = 0
-    prior_digest: str = ""
-    environment: str = ""
-    task: str = ""
-    space: str = ""
-    labels: tuple[str, ...] = ()
-    energy: float = 0.0
 
 
 class Beliefs(NamedTuple):
@@ -44,12 +32,35 @@ class Beliefs(NamedTuple):
         return cls(_NONE, _NONE, np.zeros((0, labels), np.float16), half, np.zeros(0, dtype=bool))
 
 
+def nothing(robot: str, epoch: int, labels: Sequence[str] = ()) -> RegionDelta:
+    """The empty state that the first delta follows on; with what a map is made from, the head of its deltas."""
+    return RegionDelta(
+        robot=robot,
+        epoch=epoch,
+        revision=-1,
+        stamp_ns=0,
+        prior_digest="",
+        environment="",
+        task="",
+        space="",
+        labels=list(labels),
+        regions=[],
+        removed_ids=_NONE,
+        place_ids=_NONE,
+        place_regions=_NONE,
+        posteriors=np.zeros((0, len(labels)), np.float16),
+        unknown=np.zeros(0, np.float16),
+        removed_place_ids=_NONE,
+        energy=0.0,
+    )
+
+
 @dataclass
 class Ledger:
     """Everything that a follower of all deltas knows. Places are kept by slot, so a delta costs what it changes."""
 
     revision: int = -1
-    source: Source | None = None
+    head: RegionDelta | None = None  # from what the last delta was made, without what it told
     regions: dict[int, Region] = field(default_factory=dict)
     told: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=bool))  # (slot,)
     beliefs: Beliefs = field(default_factory=lambda: Beliefs.none(0))  # (slot,)
@@ -64,7 +75,7 @@ class Ledger:
 
     def tell(
         self,
-        source: Source,
+        head: RegionDelta,
         slots: np.ndarray,
         now: Beliefs,
         regions: dict[int, Region],
@@ -75,15 +86,16 @@ class Ledger:
     ) -> RegionDelta | None:
         """The delta from what is known to what is so; None when there is nothing to tell.
 
-        `now` holds the places in `slots` (sorted by id), which are all that may have changed, or all with `everything`.
+        `head` is a delta that says from what this one is made, with nothing to tell, see `nothing`. `now` holds the
+        places in `slots` (sorted by id), which are all that may have changed, or all with `everything`.
         A belief is sent when the region of the place changed or a probability moved by more than `tolerance` since it
         was last sent.
         """
-        self._reserve(int(slots.max(initial=-1)) + 1, len(source.labels), everything)
+        self._reserve(int(slots.max(initial=-1)) + 1, len(head.labels), everything)
         sent = np.flatnonzero(~self.told[slots] | self._differs(slots, now, tolerance))
         upserts = [region for _, region in sorted(regions.items()) if self.regions.get(region.id) != region]
         gone_regions = sorted(self.regions.keys() - regions.keys())
-        moved_on = self.source is not None and source.space != self.source.space
+        moved_on = self.head is not None and head.space != self.head.space
         if not (everything or moved_on or len(sent) or upserts or gone_regions or self.gone or events):
             return None
         for known, news in zip(self.beliefs, now, strict=True):
@@ -91,10 +103,10 @@ class Ledger:
         self.told[slots[sent]] = True
         gone_places = [] if everything else sorted(self.gone)
         self.gone.clear()
-        self.source, self.regions, self.revision = source, dict(regions), self.revision + 1
+        self.head, self.regions, self.revision = head, dict(regions), self.revision + 1
         listed = list(self.regions.values()) if everything else upserts
         return self._delta(
-            source,
+            head,
             sorted(listed, key=lambda region: region.id),
             now.at(sent),
             removed=([] if everything else gone_regions, gone_places),
@@ -109,12 +121,12 @@ class Ledger:
         whole = Beliefs(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
         whole = whole.at(np.argsort(whole.place_ids, kind="stable"))
         listed = [region for _, region in sorted(self.regions.items())]
-        source = Source(robot, epoch) if self.source is None else self.source
-        return self._delta(source, listed, whole, removed=([], []), events=[], snapshot=True)
+        head = nothing(robot, epoch) if self.head is None else self.head
+        return self._delta(head, listed, whole, removed=([], []), events=[], snapshot=True)
 
     def _delta(
         self,
-        source: Source,
+        head: RegionDelta,
         regions: list[Region],
         beliefs: Beliefs,
         *,
@@ -122,9 +134,8 @@ class Ledger:
         events: list[RegionEvent],
         snapshot: bool,
     ) -> RegionDelta:
-        about = source._asdict() | {"labels": list(source.labels)}
-        return RegionDelta(
-            **about,
+        return msgspec.structs.replace(
+            head,
             revision=self.revision,
             snapshot=snapshot,
             regions=regions,

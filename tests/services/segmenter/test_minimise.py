@@ -6,9 +6,12 @@ import gco
 import numpy as np
 import pytest
 
-from prior_sg.services.segmenter.core.energy import swap
-from prior_sg.services.segmenter.core.energy.maxflow import CUTS, binary_minimum
-from prior_sg.services.segmenter.core.energy.solver import Settings
+from prior_sg.services.segmenter.core.energy import maxflow
+from prior_sg.services.segmenter.core.energy.maxflow import CUTS, NoSuchLibrary, binary_minimum, min_cut_in_use
+from prior_sg.services.segmenter.core.energy.mrf import Field, energy
+from prior_sg.services.segmenter.core.energy.posteriors import conditional_costs
+from prior_sg.services.segmenter.core.energy.solver import Settings, minimise
+from prior_sg.services.segmenter.core.map.arcs import arcs_of
 from tests.help.fields import all_energies, best_swap, random_field
 
 
@@ -38,8 +41,8 @@ def test_binary_minimum_takes_negative_costs_and_no_edges():
 def test_energy_and_conditional_costs_equal_their_sums():
     field = random_field(4, places=8, labels=4)
     labels = np.random.default_rng(5).integers(0, 4, 8)
-    assert swap.energy(field, labels) == pytest.approx(literal_energy(field, labels))
-    costs = swap.conditional_costs(field, labels)
+    assert energy(field, labels) == pytest.approx(literal_energy(field, labels))
+    costs = conditional_costs(field, arcs_of(8, field.edges, field.weights), labels, np.arange(8))
     for place, label in itertools.product(range(8), range(4)):
         changed = labels.copy()
         changed[place] = label
@@ -51,7 +54,7 @@ def test_energy_and_conditional_costs_equal_their_sums():
 def test_no_swap_of_any_pair_improves_the_result(seed):
     field = random_field(seed, places=8, labels=3)
     start = np.random.default_rng(seed).integers(0, 3, 8)
-    labels = swap.minimise(field, start)
+    labels = minimise(field, start)
     found = literal_energy(field, labels)
     assert found <= literal_energy(field, start) + 1e-9
     for pair in itertools.combinations(range(3), 2):
@@ -65,7 +68,7 @@ def test_no_swap_of_any_pair_improves_the_result(seed):
 @pytest.mark.parametrize("seed", range(8))
 def test_two_labels_reach_the_global_minimum(seed):
     field = random_field(seed, places=10, labels=2)
-    labels = swap.minimise(field, np.zeros(10, dtype=int))
+    labels = minimise(field, np.zeros(10, dtype=int))
     best = min(literal_energy(field, choice) for choice in itertools.product((0, 1), repeat=10))
     assert literal_energy(field, labels) == pytest.approx(best, abs=1e-9)
 
@@ -85,6 +88,39 @@ def test_min_cut_libraries_agree(seed):
     assert found[1] == pytest.approx(found[0], rel=1e-6)
 
 
+@pytest.mark.parametrize("metric", [False, True])
+def test_scipy_cuts_lead_to_energies_as_low_as_pymaxflow_and_gco(metric):
+    """Every cut goes to the library, none to compiled code."""
+    for seed in range(4):
+        field = random_field(seed, places=300, labels=6, degree=6, metric=metric)
+        start = field.unary.argmin(axis=1)
+        ours = [energy(field, minimise(field, start, Settings(compiled_up_to=0, min_cut=name))) for name in CUTS]
+        assert ours[1] == pytest.approx(ours[0], rel=1e-6)
+        assert ours[1] < 1.003 * energy(field, gco_swap(field, start))
+
+
+def test_scipy_rounds_by_less_than_it_says():
+    """Costs over nine decades: the excess over the least sum stays below total (n + m) / 2^30."""
+    rng = np.random.default_rng(3)
+    field = random_field(3, places=400, labels=2, degree=6)
+    costs = [rng.uniform(0, 1, 400) * 10.0 ** rng.integers(-6, 4, 400) for _ in range(2)]
+    lean = costs[1] - costs[0]
+    total = min(lean[lean > 0].sum(), -lean[lean < 0].sum())
+    exact, rounded = (
+        cost_of(CUTS[name](*costs, field.edges, field.weights), *costs, field.edges, field.weights)
+        for name in ("pymaxflow", "scipy")
+    )
+    assert exact - 1e-9 <= rounded <= exact + total * (400 + len(field.edges)) / 2**30
+
+
+def test_without_pymaxflow_scipy_cuts_and_says_so(monkeypatch):
+    assert min_cut_in_use("auto") == "pymaxflow"
+    monkeypatch.setattr(maxflow, "library", None)
+    assert min_cut_in_use("auto") == min_cut_in_use("scipy") == "scipy"
+    with pytest.raises(NoSuchLibrary, match=r"pip install 'prior-sg\[fast-cut\]'"):
+        min_cut_in_use("pymaxflow")
+
+
 def test_the_global_optimum_of_small_fields(capsys):
     """How often it is reached, by us and by gco's swap from the same start, and the gaps; printed with `pytest -s`."""
     gaps = {"ours": [], "gco": []}
@@ -93,8 +129,8 @@ def test_the_global_optimum_of_small_fields(capsys):
         places, labels = int(rng.integers(4, 9)), int(rng.integers(2, 5))
         field = random_field(seed, places, labels, degree=4)
         start, best = field.unary.argmin(axis=1), all_energies(field)[1].min()
-        gaps["ours"].append(swap.energy(field, swap.minimise(field, start)) / best - 1)
-        gaps["gco"].append(swap.energy(field, gco_swap(field, start)) / best - 1)
+        gaps["ours"].append(energy(field, minimise(field, start)) / best - 1)
+        gaps["gco"].append(energy(field, gco_swap(field, start)) / best - 1)
     with capsys.disabled():
         for name, values in gaps.items():
             reached = np.mean(np.array(values) < 1e-9)
@@ -129,9 +165,9 @@ def test_as_low_as_gco_on_random_fields(metric):
         field = random_field(seed, places=300, labels=6, degree=6, metric=metric)
         start = field.unary.argmin(axis=1)
         theirs = gco_swap(field, start)
-        ours = swap.minimise(field, start)
-        assert swap.energy(field, ours) < swap.energy(field, start)
-        ratios.append(swap.energy(field, ours) / swap.energy(field, theirs))
+        ours = minimise(field, start)
+        assert energy(field, ours) < energy(field, start)
+        ratios.append(energy(field, ours) / energy(field, theirs))
     assert max(ratios) < 1.003
     assert np.mean(ratios) < 0.998
 
@@ -141,31 +177,31 @@ def test_no_cut_of_the_whole_field_improves_the_result(settings):
     """Pairs solved core by core end where cuts of all places of a pair find nothing more."""
     for seed in range(4):
         field = random_field(seed, places=120, labels=5, degree=5)
-        labels = swap.minimise(field, field.unary.argmin(axis=1), settings)
-        found = swap.energy(field, labels)
+        labels = minimise(field, field.unary.argmin(axis=1), settings)
+        found = energy(field, labels)
         for pair in itertools.combinations(range(5), 2):
-            assert swap.energy(field, best_swap(field, labels, pair)) >= found - 1e-6
+            assert energy(field, best_swap(field, labels, pair)) >= found - 1e-6
 
 
 def test_the_non_metric_detour_is_taken():
     """Kitchen to bathroom is dear, through a corridor cheap: three places in a row, the middle one undecided."""
     pairwise = np.array([[0.0, 0.2, 9.0], [0.2, 0.0, 0.2], [9.0, 0.2, 0.0]])
     unary = np.array([[0.0, 5.0, 5.0], [1.0, 1.2, 1.0], [5.0, 5.0, 0.0]])
-    field = swap.Field(unary, np.array([[0, 1], [1, 2]]), np.ones(2), pairwise)
-    assert swap.minimise(field, unary.argmin(axis=1)).tolist() == [0, 1, 2]
+    field = Field(unary, np.array([[0, 1], [1, 2]]), np.ones(2), pairwise)
+    assert minimise(field, unary.argmin(axis=1)).tolist() == [0, 1, 2]
 
 
 def test_same_input_same_labels_and_input_untouched():
     field = random_field(7, places=200, labels=5)
     start = np.zeros(200, dtype=int)
-    first, second = swap.minimise(field, start), swap.minimise(field, start)
+    first, second = minimise(field, start), minimise(field, start)
     assert first.tobytes() == second.tobytes()
     assert not start.any()
-    assert np.array_equal(swap.minimise(field, first), first)
+    assert np.array_equal(minimise(field, first), first)
 
 
 def test_empty_and_single_label_fields():
     none = np.zeros((0, 2), dtype=np.int64)
-    assert len(swap.minimise(swap.Field(np.zeros((0, 3)), none, np.zeros(0), np.ones((3, 3))), np.zeros(0, int))) == 0
-    alone = swap.Field(np.ones((4, 1)), np.array([[0, 1]]), np.ones(1), np.zeros((1, 1)))
-    assert swap.minimise(alone, np.zeros(4, int)).tolist() == [0, 0, 0, 0]
+    assert len(minimise(Field(np.zeros((0, 3)), none, np.zeros(0), np.ones((3, 3))), np.zeros(0, int))) == 0
+    alone = Field(np.ones((4, 1)), np.array([[0, 1]]), np.ones(1), np.zeros((1, 1)))
+    assert minimise(alone, np.zeros(4, int)).tolist() == [0, 0, 0, 0]

@@ -1,0 +1,254 @@
+"""A running system as Python programs want it: ask, switch the task, correct poses, follow what changes."""
+
+import contextlib
+import queue
+import threading
+import time
+import weakref
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Self
+
+import numpy as np
+
+from prior_sg.deploy.api.errors import NotInSceneError, PosesError, TaskError
+from prior_sg.deploy.api.scene import Scene
+from prior_sg.deploy.settings import DEFAULT_CONNECT, DEFAULT_ROBOT
+from prior_sg.schemas.codec import DecodeError, Message, decode
+from prior_sg.schemas.frames import PoseUpdate
+from prior_sg.schemas.priors import Prior, Task
+from prior_sg.schemas.regions import PosteriorReply, PosteriorRequest, RegionDelta
+from prior_sg.schemas.scene import Scene as SceneMessage
+from prior_sg.schemas.scene import SceneRequest
+from prior_sg.schemas.status import Consumed, ServiceStatus
+from prior_sg.schemas.topics import (
+    JOURNAL,
+    OBJECT_DELTA,
+    PLACE_DELTA,
+    POSE_UPDATE,
+    POSTERIOR,
+    REGION_DELTA,
+    SCENE,
+    SCENE_REVISION,
+)
+from prior_sg.services.runtime.bus import Bus, BusError, Sample
+from prior_sg.services.runtime.client import BusClient
+from prior_sg.services.runtime.zenoh_bus import ZenohBus
+
+ROUTER_WAIT_S = 2.0
+STORE_POLL_S = 0.1
+DELTAS = (PLACE_DELTA, REGION_DELTA, OBJECT_DELTA)
+
+
+@dataclass(frozen=True)
+class Switch:
+    """A task that is in force: its scene, its prior, and how long its regions took from being asked for."""
+
+    scene: Scene
+    prior: Prior
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Health:
+    """Every process that is alive; of those that do not answer, why, by instance."""
+
+    processes: list[ServiceStatus]
+    silent: dict[str, str]
+
+
+class Changes:
+    """Messages as they arrive; iteration waits for the next and ends when the client, or this, is closed."""
+
+    def __init__(self) -> None:
+        self._arrived: queue.SimpleQueue[Message | None] = queue.SimpleQueue()
+
+    def __iter__(self) -> Iterator[Message]:
+        while (message := self._arrived.get()) is not None:
+            yield message
+
+    def put(self, message: Message) -> None:
+        """One more message, from any thread."""
+        self._arrived.put(message)
+
+    def close(self) -> None:
+        """End the iteration after what has arrived."""
+        self._arrived.put(None)
+
+
+class Client:
+    """One robot of a running system. Use as a context manager, or call `close`. Raises BusError when no router answers.
+
+    `bus` takes the place of a connection of its own, for tests and for programs that hold one.
+    """
+
+    def __init__(self, connect: str = DEFAULT_CONNECT, robot: str = DEFAULT_ROBOT, *, bus: Bus | None = None) -> None:
+        self.robot = robot
+        self._client = BusClient(ZenohBus(connect, ROUTER_WAIT_S) if bus is None else bus)
+        self._lock = threading.Lock()
+        self._followers: dict[str, weakref.WeakSet[Changes]] = {}  # by topic
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Leave the system; whoever iterates over `changes` comes to the end."""
+        self._client.bus.close()
+        with self._lock:
+            for follower in {one for followers in self._followers.values() for one in followers}:
+                follower.close()
+
+    def scene(self) -> Scene:
+        """The scene graph as stored now. Raises BusError."""
+        message: SceneMessage = self._client.ask(SCENE, SceneRequest(robot=self.robot))
+        return Scene(message)
+
+    def explain(self, place: int) -> PosteriorReply:
+        """Why a place carries its label. Raises NotInSceneError, BusError."""
+        reply: PosteriorReply = self._client.ask(POSTERIOR, PosteriorRequest(robot=self.robot, place_id=place))
+        if not reply.found:
+            raise NotInSceneError(f"{self.robot} has no labelled place {place}; Scene.places.ids lists them")
+        return reply
+
+    def task(
+        self, text: str, environment: str | None = None, regions: Sequence[str] | None = None, timeout_s: float = 60.0
+    ) -> Scene:
+        """Give the robot a task and wait for its regions; `environment` is the one in force unless named, `regions`
+        fixes their names. Raises TaskError, NoPriorError, BusError.
+        """
+        return self.switch(text, environment, regions, timeout_s).scene
+
+    def switch(
+        self,
+        text: str,
+        environment: str | None = None,
+        regions: Sequence[str] | None = None,
+        timeout_s: float = 60.0,
+        *,
+        waiting: Callable[[str], None] = lambda reason: None,
+        on_prior: Callable[[Prior], None] = lambda prior: None,
+    ) -> Switch:
+        """As `task`, with all that came of it. `waiting` is told why there is no prior yet, `on_prior` the prior."""
+        environment = environment or self.scene().environment
+        if not environment:
+            raise TaskError(f"{self.robot} has no environment yet; name one (--environment) with the task")
+        task = Task(
+            robot=self.robot,
+            stamp_ns=time.time_ns(),
+            environment=environment,
+            task=text,
+            regions=list(regions or ()),
+        )
+        arrivals = _Arrivals(task)
+        self._client.listen(REGION_DELTA, self.robot, arrivals.see)
+        prior = self._client.give_task(task, timeout_s, waiting)
+        on_prior(prior)
+        end_s = time.monotonic() + timeout_s
+        seconds = arrivals.wait(prior.digest(), end_s)
+        scene = self._stored(prior.digest(), end_s) if seconds is not None else None
+        if seconds is None or scene is None:
+            raise TaskError(f"no regions for the new task within {timeout_s:.0f} s; see `prior-sg health`")
+        return Switch(scene, prior, seconds)
+
+    def _stored(self, prior_digest: str, end_s: float) -> Scene | None:
+        """The scene once the store has taken the regions of this prior; None when it has not by then."""
+        while (scene := self.scene()).message.prior_digest != prior_digest:
+            if time.monotonic() > end_s:
+                return None
+            time.sleep(STORE_POLL_S)
+        return scene
+
+    def correct_poses(self, poses: Mapping[int, np.ndarray[Any, Any]], timeout_s: float = 60.0) -> float:
+        """Give keyframes, by number, their corrected world_from_camera (4, 4), as after a loop closure, and wait until
+        the map has taken them; returns the seconds. Raises PosesError.
+        """
+        update = self._pose_update(poses)
+        if "place_graph" not in self._client.alive().values():
+            raise PosesError("no place_graph is running to take the poses; start it with `prior-sg up`")
+        taken = threading.Event()
+
+        def see(sample: Sample) -> None:
+            with contextlib.suppress(DecodeError):
+                entry = decode(Consumed, sample.payload)
+                if (entry.service, entry.topic, entry.writer) == ("place_graph", POSE_UPDATE.name, self._client.writer):
+                    taken.set()
+
+        self._client.listen(JOURNAL, self.robot, see)
+        started_s = time.monotonic()
+        self._client.publish(POSE_UPDATE, update)
+        if not taken.wait(timeout_s):
+            raise PosesError(f"the map took no poses within {timeout_s:.0f} s; see `prior-sg health`")
+        return time.monotonic() - started_s
+
+    def _pose_update(self, poses: Mapping[int, np.ndarray[Any, Any]]) -> PoseUpdate:
+        if not poses:
+            raise PosesError("there are no poses to correct")
+        try:
+            return PoseUpdate(
+                robot=self.robot,
+                epoch=time.time_ns(),
+                revision=0,
+                stamp_ns=time.time_ns(),
+                frame_ids=np.array(list(poses), np.int64),
+                world_from_camera=np.stack([np.asarray(pose, np.float64) for pose in poses.values()]),
+            )
+        except ValueError as error:
+            raise PosesError(f"the poses cannot be used: {error}") from error
+
+    def changes(self, deltas: bool = False) -> Changes:
+        """From now on, a SceneRevision whenever the store has made a change durable; with `deltas`, also every
+        PlaceDelta, RegionDelta and ObjectDelta, beginning with the latest that their writers keep.
+        """
+        changes = Changes()
+        for topic in (SCENE_REVISION, *(DELTAS if deltas else ())):
+            with self._lock:
+                known = topic.name in self._followers
+                self._followers.setdefault(topic.name, weakref.WeakSet()).add(changes)
+            if not known:
+                self._client.listen(topic, self.robot, self._saw)
+        return changes
+
+    def _saw(self, sample: Sample) -> None:
+        with contextlib.suppress(DecodeError):
+            message = decode(sample.topic.type, sample.payload)
+            with self._lock:
+                for follower in self._followers[sample.topic.name]:
+                    follower.put(message)
+
+    def health(self) -> Health:
+        """What every process says of itself."""
+        processes, silent = [], {}
+        for instance, service in sorted(self._client.alive().items()):
+            try:
+                processes.append(self._client.status(service, instance))
+            except BusError as error:
+                silent[instance] = str(error)
+        return Health(processes, silent)
+
+
+class _Arrivals:
+    """When the regions of a task arrived, by the prior they follow."""
+
+    def __init__(self, task: Task) -> None:
+        self._task = task
+        self._since_s = time.monotonic()
+        self._found_s: dict[str, float] = {}
+        self._changed = threading.Condition()
+
+    def see(self, sample: Sample) -> None:
+        """A delta sent after the task was given counts; the history may hold older ones of the same task."""
+        with contextlib.suppress(DecodeError):
+            delta = decode(RegionDelta, sample.payload)
+            if sample.sent_ns > self._task.stamp_ns and delta.task == self._task.task:
+                with self._changed:
+                    self._found_s.setdefault(delta.prior_digest, time.monotonic())
+                    self._changed.notify()
+
+    def wait(self, prior_digest: str, end_s: float) -> float | None:
+        """Seconds from the task to the first regions of this prior; None when there are none by then."""
+        with self._changed:
+            there = self._changed.wait_for(lambda: prior_digest in self._found_s, max(end_s - time.monotonic(), 0))
+        return self._found_s[prior_digest] - self._since_s if there else None

@@ -1,0 +1,109 @@
+"""`prior-sg check`: what a source is, and what is wrong with it, before it is mapped."""
+
+import argparse
+import json
+from typing import TYPE_CHECKING
+
+from rich.progress import BarColumn, MofNCompleteColumn, Progress
+from rich.table import Table
+
+from prior_sg.deploy.cli.shared import Commands, add_settings, console
+from prior_sg.deploy.cli.source_options import add_source_options, read_options
+from prior_sg.deploy.errors import UserError
+from prior_sg.deploy.terminal import Description, Terminal, line
+
+if TYPE_CHECKING:
+    from prior_sg.deploy.inspecting.check import Report
+    from prior_sg.services.ingest.core.config import Config
+
+STYLE = {"ok": "green", "note": "yellow", "problem": "bold red"}
+
+
+class HopelessSource(UserError):
+    """No map can come of a source; the message says why and what to do."""
+
+
+def add_commands(commands: Commands) -> None:
+    """`check`."""
+    parser = commands.add(
+        "check",
+        cmd_check,
+        "say what a source is and what is wrong with it",
+        "prior-sg check recordings/home",
+        needs="map",
+    )
+    parser.add_argument("source", help="a folder in a known layout (docs/sources.md) or an MCAP log")
+    parser.add_argument("--json", action="store_true", help="print JSON")
+    add_settings(parser)
+    add_source_options(parser)
+
+
+def cmd_check(arguments: argparse.Namespace) -> int:
+    """Check a source and show what was found; 1 when there are problems."""
+    report = _checked(arguments.source, read_options(arguments))
+    if arguments.json:
+        print(json.dumps(as_builtins(report)))
+    else:
+        show(report, console)
+    return 1 if report.verdict == "problem" else 0
+
+
+def before_start(path: str, cfg: "Config", console: Terminal) -> "Report":
+    """A brief check: one line about the source and one for each problem. Raises HopelessSource and SourceError."""
+    from prior_sg.deploy.inspecting.check import check
+    from prior_sg.services.ingest.sources import open_source
+
+    report = check(open_source(path, options=cfg), cfg, brief=True)
+    console.print(report.summary)
+    for finding in report.findings:
+        if finding.verdict == "problem" or (finding.topic, finding.verdict) == ("ground truth", "note"):
+            console.print(line((finding.verdict, STYLE[finding.verdict]), f" {finding.topic}: {finding.line()}"))
+    if report.problems and report.problems[0].hopeless:
+        raise HopelessSource(f"{report.source}: {report.problems[0].line()}; `prior-sg check` says more")
+    return report
+
+
+def show(report: "Report", console: Terminal) -> None:
+    """A table of all findings, and a closing line."""
+    table = Table("", "what", "found", "mend", title=report.source)
+    for finding in report.findings:
+        verdict = line((finding.verdict, STYLE[finding.verdict]))
+        table.add_row(verdict, finding.topic, finding.text, finding.mend)
+    console.print(table)
+    count = len(report.problems)
+    console.print(f"{count or 'no'} problem{'s' * (count != 1)}, {report.seconds:.1f} s")
+
+
+def as_builtins(report: "Report") -> dict:
+    """The report for `--json`."""
+    import msgspec
+
+    return {
+        "source": report.source,
+        "layout": report.layout,
+        "verdict": report.verdict,
+        "seconds": round(report.seconds, 3),
+        "findings": msgspec.to_builtins(report.findings),
+    }
+
+
+def _checked(path: str, cfg: "Config") -> "Report":
+    from prior_sg.deploy.inspecting.check import check, unreadable
+    from prior_sg.services.ingest.sources import SourceError, open_source
+
+    with _progress() as progress:
+        bar = progress.add_task("reading", total=None)
+
+        def show_progress(done: int, total: int) -> None:
+            progress.update(bar, completed=done, total=total or None)
+
+        try:
+            return check(open_source(path, options=cfg), cfg, progress=show_progress)
+        except SourceError as error:
+            return unreadable(path, str(error))
+
+
+def _progress() -> Progress:
+    """A bar on the terminal's error stream, so that JSON stays clean."""
+    columns = Description(), BarColumn(), MofNCompleteColumn()
+    return Progress(*columns, console=Terminal(stderr=True), transient=True)

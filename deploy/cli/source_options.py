@@ -1,0 +1,107 @@
+"""Options of every command that reads a source: one table, each option one setting of ingest."""
+
+import argparse
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from prior_sg.deploy.settings import resolved_config
+
+if TYPE_CHECKING:
+    from prior_sg.services.ingest.core.config import Config
+
+GROUP = "how the source is read, where its files do not say or say it wrongly"
+
+
+@dataclass(frozen=True)
+class Option:
+    """One option and the setting it stands for."""
+
+    flag: str
+    setting: str  # of ingest
+    metavar: str
+    help: str
+    listed: bool = False  # numbers separated by commas
+    choices: tuple[str, ...] = ()
+
+    @property
+    def dest(self) -> str:
+        """Its name among the parsed arguments."""
+        return f"source_{self.setting}"
+
+
+OPTIONS = (
+    Option(
+        "--layout",
+        "layout",
+        "NAME",
+        "layout, as docs/sources.md names it; default: recognised by its files",
+    ),
+    Option("--rate", "rate_hz", "HZ", "frames per second, in place of the source's stamps"),
+    Option("--stamp-unit", "stamp_unit", "UNIT", "unit of written stamps", choices=("s", "ms", "us", "ns")),
+    Option("--stamp-offset", "stamp_offset_s", "SECONDS", "added to the stamps of poses in a list of their own"),
+    Option("--depth-scale", "depth_scale_m", "METRES", "metres per unit of depth"),
+    Option(
+        "--depth-invalid", "depth_invalid", "VALUE,…", "stored depth that means nothing (default: 65535)", listed=True
+    ),
+    Option("--depth-min", "depth_min_m", "METRES", "nearer depth is no measurement"),
+    Option("--depth-max", "depth_max_m", "METRES", "farther depth is no measurement"),
+    Option(
+        "--poses",
+        "poses",
+        "CONVENTION",
+        "what the written poses map",
+        choices=("world_from_camera", "camera_from_world"),
+    ),
+    Option("--quaternion", "quaternion", "ORDER", "order of written quaternions", choices=("xyzw", "wxyz")),
+    Option(
+        "--axes",
+        "camera_axes",
+        "AXES",
+        "camera axes: opencv (y down), opengl (y up, z back), ros (x ahead, z up), ned (x ahead, z down)",
+        choices=("opencv", "opengl", "ros", "ned"),
+    ),
+    Option("--intrinsics", "intrinsics", "FX,FY,CX,CY[,W,H]", "the camera, pixels", listed=True),
+    Option("--camera-model", "camera_model", "MODEL", "of the lens", choices=("pinhole", "opencv", "fisheye")),
+    Option(
+        "--distortion",
+        "distortion",
+        "K1,K2,…",
+        "coefficients of the lens as OpenCV orders them (--distortion=-0.3,0.1,0,0)",
+        listed=True,
+    ),
+    Option("--origin", "origin", "keep|auto|X,Y,Z", "new zero of the world; auto: recentred when kilometres away"),
+    Option("--up", "world_up", "X,Y,Z", "direction that points up in the source's world", listed=True),
+    Option("--floor", "floor_m", "METRES", "height of the floor in the source's world, along up"),
+)
+
+
+def add_source_options(parser: argparse.ArgumentParser) -> None:
+    """Give a command the options."""
+    group = parser.add_argument_group(GROUP)
+    for option in OPTIONS:
+        group.add_argument(
+            option.flag,
+            dest=option.dest,
+            default=None,
+            choices=option.choices or None,
+            metavar=option.metavar,
+            help=option.help + (f": {', '.join(option.choices)}" if option.choices else ""),
+        )
+
+
+def source_settings(arguments: argparse.Namespace) -> list[str]:
+    """Settings of ingest for the options that were given; none for a command that has no such options."""
+    given = ((option, getattr(arguments, option.dest, None)) for option in OPTIONS)
+    return [f"ingest.{option.setting}={_value(option, text)}" for option, text in given if text is not None]
+
+
+def read_options(arguments: argparse.Namespace) -> "Config":
+    """What the options, `--config` and `--set` say, for a command that reads a source itself. Raises ConfigError."""
+    from prior_sg.services.registry import BY_NAME
+
+    config, settings = getattr(arguments, "config", "") or "", getattr(arguments, "set", None) or []
+    return resolved_config(BY_NAME["ingest"], config, [*source_settings(arguments), *settings])
+
+
+def _value(option: Option, text: str) -> str:
+    return f"[{text.strip().strip('[]').strip().replace(' ', ',')}]" if option.listed else text

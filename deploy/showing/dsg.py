@@ -1,0 +1,173 @@
+"""A scene graph as a Spark-DSG graph."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import spark_dsg
+
+from prior_sg.deploy.showing.export import adjacent_regions, members_of, objects_with_places, surfaces_of
+from prior_sg.deploy.showing.map import label_colors
+from prior_sg.schemas.objects import SceneObject
+from prior_sg.schemas.regions import Region
+from prior_sg.schemas.scene import Scene
+
+OBJECT, PLACE, PLACE_2D, ROOM, BUILDING = "O", "p", "P", "R", "B"  # node prefixes of Spark-DSG
+
+
+def spark_dsg_graph(scene: Scene) -> spark_dsg.DynamicSceneGraph:
+    """The scene in Spark-DSG's layers: objects, places above them, rooms, one building above the rooms.
+
+    A place keeps its radius as `distance`, a room the mean posterior of its places as `semantic_class_probabilities`;
+    what Spark-DSG has no field for stands in the nodes' and the graph's metadata. Edges between places weigh their
+    clearance; rooms are joined where their places are. Labels are numbered as in `scene.labels`.
+    """
+    graph = spark_dsg.DynamicSceneGraph()
+    colors = label_colors(scene)
+    surfaces = surfaces_of(scene)
+    prefix = PLACE_2D if surfaces else PLACE
+    layer = "MESH_PLACES" if surfaces else spark_dsg.DsgLayers.PLACES
+    if surfaces:
+        graph.add_layer(3, 1, layer)
+    for row, place in enumerate(scene.place_ids.tolist()):
+        node = _ground_node(scene, row, surfaces[place]) if place in surfaces else _place_node(scene, row)
+        _describe_place(node, scene, row, prefix, colors)
+        _add(graph, layer, prefix, place, node)
+    for (a, b), clearance_m in zip(scene.edges.tolist(), scene.clearances_m.tolist(), strict=True):
+        weight = spark_dsg.EdgeAttributes()
+        weight.weighted, weight.weight = True, clearance_m
+        graph.insert_edge(_symbol(prefix, a), _symbol(prefix, b), weight)
+    for item, place in objects_with_places(scene):
+        _add(graph, spark_dsg.DsgLayers.OBJECTS, OBJECT, item.id, _object_node(scene, item))
+        if place is not None:
+            graph.insert_edge(_symbol(prefix, place), _symbol(OBJECT, item.id), enforce_single_parent=True)
+    members = members_of(scene)
+    for region in scene.regions:
+        rows = members[region.id]
+        _add(graph, spark_dsg.DsgLayers.ROOMS, ROOM, region.id, _room_node(scene, region, rows, colors))
+        for place in scene.place_ids[rows].tolist():
+            graph.insert_edge(_symbol(ROOM, region.id), _symbol(prefix, place), enforce_single_parent=True)
+    for a, b in sorted(adjacent_regions(scene)):
+        graph.insert_edge(_symbol(ROOM, a), _symbol(ROOM, b))
+    if scene.regions:
+        _add(graph, spark_dsg.DsgLayers.BUILDINGS, BUILDING, 0, _building_node(scene))
+        for region in scene.regions:
+            graph.insert_edge(_symbol(BUILDING, 0), _symbol(ROOM, region.id), enforce_single_parent=True)
+    about = {"robot": scene.robot, "environment": scene.environment, "task": scene.task}
+    about |= {"prior_digest": scene.prior_digest, "embedding_space": scene.space}
+    graph.metadata.set(about | {"origin_m": list(scene.origin_m)})
+    labelspace = spark_dsg.Labelspace(dict(enumerate(scene.labels)))  # kept in the metadata, hence after them
+    for named in (layer, spark_dsg.DsgLayers.ROOMS):
+        key = graph.get_layer_key(named)
+        graph.set_labelspace(labelspace, key.layer, key.partition)
+    return graph
+
+
+def save_spark_dsg(scene: Scene, path: str | Path) -> None:
+    """Write a file that `DynamicSceneGraph.load` reads: JSON, or binary when the name ends in `.sparkdsg`."""
+    spark_dsg_graph(scene).save(str(path), include_mesh=False)
+
+
+def _place_node(scene: Scene, row: int) -> spark_dsg.PlaceNodeAttributes:
+    """A sphere; one beside unobserved space is an active frontier whose x axis leads there."""
+    node = spark_dsg.PlaceNodeAttributes()
+    node.distance = float(scene.radii_m[row])
+    node.num_basis_points = int(scene.basis_points[row])
+    node.real_place = True
+    opening = np.flatnonzero(scene.frontier_ids == scene.place_ids[row])
+    if len(opening):
+        x, y, z = scene.frontier_directions[opening[0]].astype(float)
+        side_m = float(scene.frontier_areas_m2[opening[0]]) ** 0.5
+        node.active_frontier = True
+        node.frontier_scale = np.array((0.0, side_m, side_m))
+        # Half the turn from the x axis: the axis halfway between the two, as a quaternion (w, cross product).
+        turn = np.array((1 + x, 0.0, -z, y)) if x > -1 + 1e-6 else np.array((0.0, 0.0, 0.0, 1.0))
+        node.orientation = spark_dsg.Quaternion(*(turn / np.linalg.norm(turn)))
+    return node
+
+
+def _ground_node(scene: Scene, row: int, surface: tuple[np.ndarray, np.ndarray]) -> spark_dsg.Place2dNodeAttributes:
+    """A piece of ground: its hull, and the ellipse as the matrix that makes it of the unit circle, and its inverse."""
+    (long_m, short_m, angle_rad), hull_m = surface[0].astype(float), surface[1].astype(float)
+    cosine, sine = np.cos(angle_rad), np.sin(angle_rad)
+    expand = np.array(((cosine, -sine), (sine, cosine))) * (long_m, short_m)
+    height_m = float(scene.positions_m[row, 2])
+    node = spark_dsg.Place2dNodeAttributes()
+    node.boundary = [np.array((x, y, height_m)) for x, y in hull_m]
+    node.ellipse_centroid = scene.positions_m[row].astype(float)
+    node.ellipse_matrix_expand, node.ellipse_matrix_compress = expand, np.linalg.inv(expand)
+    return node
+
+
+def _describe_place(
+    node: spark_dsg.SemanticNodeAttributes,
+    scene: Scene,
+    row: int,
+    prefix: str,
+    colors: dict[str, tuple[int, int, int]],
+) -> None:
+    """What places of both kinds tell."""
+    names = {region.id: region.label for region in scene.regions}
+    label = names.get(int(scene.place_regions[row]), "")
+    node.position = scene.positions_m[row].astype(float)
+    node.last_update_time_ns = scene.stamp_ns
+    node.name = str(_symbol(prefix, int(scene.place_ids[row])))
+    node.metadata.set({"label": label, "unknown": float(scene.unknown[row])})
+    _label_node(node, label, scene, colors)
+
+
+def _object_node(scene: Scene, item: SceneObject) -> spark_dsg.ObjectNodeAttributes:
+    node = spark_dsg.ObjectNodeAttributes()
+    node.position = np.array(item.position_m)
+    node.last_update_time_ns = scene.stamp_ns
+    node.name = item.label
+    low_m, high_m = np.array(item.min_m), np.array(item.max_m)
+    node.bounding_box = spark_dsg.BoundingBox(high_m - low_m, (high_m + low_m) / 2)
+    node.registered = True
+    node.metadata.set({"probability": item.probability, "known": item.known, "frames": item.frames})
+    return node
+
+
+def _room_node(
+    scene: Scene, region: Region, rows: np.ndarray, colors: dict[str, tuple[int, int, int]]
+) -> spark_dsg.RoomNodeAttributes:
+    node = spark_dsg.RoomNodeAttributes()
+    node.position = np.array(region.position_m)
+    node.last_update_time_ns = scene.stamp_ns
+    node.name = region.label
+    node.metadata.set({"area_m2": region.area_m2, "probability": region.probability})
+    _label_node(node, region.label, scene, colors)
+    if len(rows):
+        posterior = scene.posteriors[rows].astype(float).mean(axis=0)
+        node.semantic_class_probabilities = dict(zip(scene.labels, posterior.tolist(), strict=True))
+        low = (scene.positions_m[rows] - scene.radii_m[rows, None]).min(axis=0)
+        high = (scene.positions_m[rows] + scene.radii_m[rows, None]).max(axis=0)
+        node.bounding_box = spark_dsg.BoundingBox(high - low, (high + low) / 2)
+    return node
+
+
+def _building_node(scene: Scene) -> spark_dsg.SemanticNodeAttributes:
+    node = spark_dsg.SemanticNodeAttributes()
+    node.position = np.mean([region.position_m for region in scene.regions], axis=0)
+    node.last_update_time_ns = scene.stamp_ns
+    node.name = scene.environment
+    return node
+
+
+def _label_node(
+    node: spark_dsg.SemanticNodeAttributes, label: str, scene: Scene, colors: dict[str, tuple[int, int, int]]
+) -> None:
+    if label in scene.labels:
+        node.semantic_label = scene.labels.index(label)
+    if label in colors:
+        node.color = np.array(colors[label], np.uint8)
+
+
+def _add(graph: spark_dsg.DynamicSceneGraph, layer: str, prefix: str, index: int, node: Any) -> None:
+    """Spark-DSG refuses a node without an error: make it one."""
+    if not graph.add_node(layer, _symbol(prefix, index), node):
+        raise ValueError(f"Spark-DSG does not take node {prefix}{index}")
+
+
+def _symbol(prefix: str, index: int) -> spark_dsg.NodeSymbol:
+    return spark_dsg.NodeSymbol(prefix, index)

@@ -1,0 +1,5 @@
+"""The one base of everything that goes wrong for a user (pure)."""
+
+
+class PriorSgError(Exception):
+    """What was asked cannot be done; the message is one sentence that says what to do."""

@@ -1,0 +1,83 @@
+"""How a source is read where its own files do not say, or say it wrongly (pure).
+
+Every field has a value that means "as the files or the layout say". The fields are settings of ingest.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import Literal
+
+import msgspec
+
+PoseConvention = Literal["world_from_camera", "camera_from_world"]
+QuaternionOrder = Literal["xyzw", "wxyz"]
+CameraAxes = Literal["opencv", "opengl", "ros", "ned"]
+StampUnit = Literal["s", "ms", "us", "ns"]
+LensModel = Literal["pinhole", "opencv", "fisheye"]
+COEFFICIENTS: dict[str, tuple[int, ...]] = {"pinhole": (0,), "opencv": (4, 5, 8), "fisheye": (4,)}
+ORIGIN_KEPT, ORIGIN_AUTO = "keep", "auto"
+
+
+class ReadOptions(msgspec.Struct, frozen=True, kw_only=True):
+    """What the user says about a source. Raises ValueError with one sentence for what cannot be meant."""
+
+    source_robot: str = ""  # of a log with several robots: the one to read; empty = the first
+    layout: str = ""  # name of a layout in docs/sources.md; empty = recognised by its files
+    world_up: list[float] = msgspec.field(default_factory=list)  # up in the source's world; empty = as the layout says
+    floor_m: float = 0.0  # height of the floor in the source's world, measured along world_up; becomes z = 0
+    origin: str = ORIGIN_AUTO  # keep, auto (recentred when kilometres away), or x,y,z in the levelled world
+    rate_hz: float = 0.0  # frames per second, in place of the source's stamps; 0 = by its stamps
+    stamp_unit: Literal["", StampUnit] = ""  # of written stamps; empty = detected from their size and spacing
+    stamp_offset_s: float | None = None  # added to the stamps of separately stamped poses; none = detected
+    depth_scale_m: float | None = None  # metres per depth unit; none = as the source says
+    depth_invalid: list[float] | None = None  # depth values that mean nothing, besides 0; none = 65535
+    depth_min_m: float = 0.0  # nearer depth is no measurement
+    depth_max_m: float = 0.0  # farther depth is no measurement; 0 = no limit
+    poses: Literal["", PoseConvention] = ""  # what the written poses map
+    quaternion: Literal["", QuaternionOrder] = ""  # order of the written quaternions
+    camera_axes: Literal["", CameraAxes] = ""  # opencv: x right, y down; opengl: y up, z back; ros: x ahead, z up;
+    # ned: x ahead, z down
+    intrinsics: list[float] = msgspec.field(default_factory=list)  # fx fy cx cy, pixels; then width height, if other
+    camera_model: Literal["", LensModel] = ""  # of the lens; opencv = radial and tangential, fisheye = Kannala-Brandt
+    distortion: list[float] = msgspec.field(default_factory=list)  # its coefficients, as OpenCV orders them
+
+    def __post_init__(self) -> None:
+        if self.depth_scale_m is not None and not (math.isfinite(self.depth_scale_m) and self.depth_scale_m > 0):
+            raise ValueError(f"depth_scale_m must be a positive number of metres, got {self.depth_scale_m}")
+        if not (math.isfinite(self.rate_hz) and self.rate_hz >= 0):
+            raise ValueError(f"rate_hz must be a number of frames per second, got {self.rate_hz}")
+        if not 0 <= self.depth_min_m < (self.depth_max_m or math.inf):
+            raise ValueError("depth_min_m must be at least 0 and below depth_max_m")
+        if self.intrinsics and not (
+            len(self.intrinsics) in (4, 6) and all(math.isfinite(v) and v > 0 for v in self.intrinsics)
+        ):
+            raise ValueError("intrinsics must be fx fy cx cy, or fx fy cx cy width height, in pixels")
+        check_lens(self.camera_model, self.distortion)
+        offset_of(self.origin)
+
+    def frame_ns(self, published_hz: float) -> float:
+        """Nanoseconds between frames of a layout without stamps."""
+        return 1e9 / (self.rate_hz or published_hz)
+
+
+def check_lens(model: str, coefficients: Sequence[float]) -> None:
+    """Raise ValueError unless a lens of this model (empty = the one that fits) can have these coefficients."""
+    if not all(math.isfinite(value) for value in coefficients):
+        raise ValueError("a distortion coefficient is not finite")
+    allowed = COEFFICIENTS["opencv"] if not model else COEFFICIENTS[model]
+    if coefficients and len(coefficients) not in allowed:
+        counts = " or ".join(map(str, allowed))
+        raise ValueError(f"a {model or 'opencv'} lens has {counts} distortion coefficients, not {len(coefficients)}")
+
+
+def offset_of(origin: str) -> tuple[float, float, float] | None:
+    """The coordinates of the new origin, in the levelled world; None = keep or auto. Raises ValueError."""
+    if origin in (ORIGIN_KEPT, ORIGIN_AUTO):
+        return None
+    try:
+        x_m, y_m, z_m = (float(word) for word in origin.replace(",", " ").split())
+    except ValueError:
+        raise ValueError(f"origin must be keep, auto, or x,y,z in metres; got {origin!r}") from None
+    if not all(map(math.isfinite, (x_m, y_m, z_m))):
+        raise ValueError(f"origin must be finite, got {origin!r}")
+    return x_m, y_m, z_m

@@ -1,0 +1,540 @@
+"""The one step that every source passes: sizes, lens, depth, poses and origin become what the pipeline expects."""
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import msgspec
+import numpy as np
+
+from prior_sg.schemas.frames import Intrinsics
+from prior_sg.services.ingest.core.options import ORIGIN_AUTO, ReadOptions, check_lens, offset_of
+from prior_sg.services.ingest.core.selection import BadFrame, RawFrame
+from prior_sg.services.ingest.sources.base import (
+    MILLIMETRE,
+    Camera,
+    Entry,
+    Found,
+    FrameError,
+    Images,
+    Source,
+    Wanted,
+    color_pixels,
+    depth_pixels,
+    levelling,
+)
+from prior_sg.services.ingest.sources.images import JPEG_MAGIC, ImageError, is_sized, trimmed
+from prior_sg.services.ingest.sources.pixels import encoded, measured, millimetres, stored
+from prior_sg.services.ingest.sources.poses import EXACT, PoseError, rigid, stretch
+from prior_sg.services.ingest.sources.tables import FEW, SourceError
+
+UNUSABLE = (FrameError, PoseError, ImageError)
+LOOKED_AT, TRIED = 8, 64  # frames that are decoded when a source is opened, and how many may be bad before them
+ASPECT_TOLERANCE = 0.01
+FAR_M, HIGH_M = 1000.0, 50.0  # coordinates beyond are of a map's grid, or above the sea
+EYE_LEVEL_M = 1.5
+FLIGHT_M_S, WALK_M_S = 10.0, 2.5  # a camera faster than this is refused as a jump; how fast one is carried
+SLOWER_HZ = (10.0, 5.0, 2.0, 1.0)
+DEEPEST_M, SHALLOWEST_M = 200.0, 0.01  # no room and no street has a median depth beyond
+EDGE = 0.45  # share of the image by which a principal point may be off its middle; a crop may have 0.4
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """Width and height, pixels, that most images of a source have."""
+
+    color: tuple[int, int]
+    depth: tuple[int, int]
+
+
+@dataclass(frozen=True)
+class Depth:
+    """How depth images are read."""
+
+    scale_m: float  # metres per unit of whole numbers
+    float_scale_m: float  # the same of floating-point numbers
+    invalid: tuple[float, ...]
+    nearest_m: float
+    farthest_m: float  # 0 = no limit
+
+
+@dataclass(frozen=True)
+class Normaliser:
+    """What is done to every frame of a source."""
+
+    intrinsics: Intrinsics
+    sizes: Sizes
+    depth: Depth
+    maps: tuple[np.ndarray, np.ndarray] | None  # where the pixels of a straight image lie in a bent one
+    world_from_source: np.ndarray | None  # None = nothing to be done, so that poses pass unchanged
+    origin_m: tuple[float, float, float]  # where the frames' world has its zero in the source's, levelled
+
+    def frame(  # noqa: PLR0917
+        self, index: int, total: int, frame_id: int, stamp_ns: int, source_from_camera: np.ndarray, images: Images
+    ) -> RawFrame:
+        """A frame whose images fit the camera and whose pose is a rigid motion. Raises one of UNUSABLE."""
+        depth, depth_scale_m = self.depth_image(images.depth)
+        try:
+            return RawFrame(
+                frame_id=frame_id,
+                stamp_ns=stamp_ns,
+                intrinsics=self.intrinsics,
+                world_from_camera=self.pose(source_from_camera),
+                color=self.color_image(images.color),
+                depth=depth,
+                mask=self.mask_image(images.mask),
+                depth_scale_m=depth_scale_m,
+                index=index,
+                total=total,
+                origin_m=self.origin_m,
+            )
+        except UNUSABLE:
+            raise
+        except ValueError as error:
+            raise FrameError(str(error)) from error
+
+    def bare(  # noqa: PLR0917
+        self, index: int, total: int, frame_id: int, stamp_ns: int, source_from_camera: np.ndarray, images: Images
+    ) -> RawFrame:
+        """The frame without its images, of which only the files' headers and ends are looked at. Raises UNUSABLE."""
+        kinds = (images.color, self.sizes.color, "colour"), (images.depth, self.sizes.depth, "depth")
+        for data, expected, name in kinds:
+            if isinstance(data, bytes) and is_sized(data):
+                width_px, height_px, _ = measured(trimmed(data))
+                self._check_size((width_px, height_px), expected, name)
+        return RawFrame(
+            frame_id=frame_id,
+            stamp_ns=stamp_ns,
+            intrinsics=self.intrinsics,
+            world_from_camera=self.pose(source_from_camera),
+            color=b"",
+            depth=b"",
+            depth_scale_m=self.depth.scale_m,
+            index=index,
+            total=total,
+        )
+
+    def pose(self, source_from_camera: np.ndarray) -> np.ndarray:
+        """world_from_camera (4, 4), or of several (n, 4, 4). Raises PoseError."""
+        pose = np.asarray(source_from_camera, np.float64)
+        pose = rigid(pose) if pose.ndim == 2 else pose
+        return pose if self.world_from_source is None else self.world_from_source @ pose
+
+    def color_image(self, data: bytes) -> bytes:
+        """The file as it is where it fits, else a JPEG of a JPEG and a PNG of all else. Raises UNUSABLE."""
+        try:
+            width_px, height_px, bits = measured(data)
+        except ImageError as error:
+            raise FrameError(f"the colour image is damaged: {error}") from error
+        self._check_size((width_px, height_px), self.sizes.color, "colour")
+        target = (self.intrinsics.width_px, self.intrinsics.height_px)
+        if is_sized(data) and bits == 8 and self.sizes.color == target and self.maps is None:
+            return trimmed(data)
+        image = color_pixels(data)
+        if self.sizes.color != target:
+            image = cv2.resize(image, target, interpolation=cv2.INTER_AREA)
+        if self.maps is not None:
+            image = cv2.remap(image, *self.maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return encoded(image, ".jpg" if data.startswith(JPEG_MAGIC) else ".png")
+
+    def depth_image(self, data: bytes | np.ndarray) -> tuple[bytes, float]:
+        """A PNG of 16 bits, 0 = no measurement, and metres per unit. Raises UNUSABLE."""
+        units, scale_m = self._depth_units(data)
+        measured_m = units.astype(np.float64) * scale_m
+        kept = _valid(units, () if isinstance(data, np.ndarray) else self.depth.invalid)
+        kept &= measured_m >= self.depth.nearest_m
+        kept &= (measured_m <= self.depth.farthest_m) if self.depth.farthest_m else True
+        if units.dtype == np.uint16:
+            untouched = bool((kept | (units == 0)).all()) and self.maps is None
+            if untouched and isinstance(data, bytes) and is_sized(data):
+                return trimmed(data), scale_m
+            return encoded(self._straight(np.where(kept, units, 0).astype(np.uint16)), ".png"), scale_m
+        return encoded(self._straight(millimetres(np.where(kept, measured_m, 0))), ".png"), MILLIMETRE
+
+    def mask_image(self, data: bytes) -> bytes:
+        """The mask at depth's size, straight where the lens bends."""
+        target = (self.intrinsics.width_px, self.intrinsics.height_px)
+        if not data or (self.sizes.color == target and self.maps is None):
+            return data
+        try:
+            mask = stored(data)
+        except ImageError as error:
+            raise FrameError(f"the mask image is damaged: {error}") from error
+        return encoded(self._straight(cv2.resize(mask, target, interpolation=cv2.INTER_NEAREST)), ".png")
+
+    def _depth_units(self, data: bytes | np.ndarray) -> tuple[np.ndarray, float]:
+        """Numbers of a depth image (h, w) as stored, and metres per unit."""
+        if isinstance(data, np.ndarray):
+            units, scale_m = data, 1.0
+        else:
+            units = depth_pixels(data)
+            scale_m = self.depth.float_scale_m if units.dtype.kind == "f" else self.depth.scale_m
+        if units.dtype.itemsize == 1:
+            raise FrameError("the depth image has 8 bits per channel instead of 16")
+        if units.ndim != 2:
+            raise FrameError(f"the depth image has {units.shape[2]} channels instead of one")
+        self._check_size((units.shape[1], units.shape[0]), self.sizes.depth, "depth")
+        return units, scale_m
+
+    def _straight(self, image: np.ndarray) -> np.ndarray:
+        """An image of measurements, without the lens's distortion; no measurement is made up."""
+        return image if self.maps is None else cv2.remap(image, *self.maps, cv2.INTER_NEAREST)
+
+    def _check_size(self, size: tuple[int, int], expected: tuple[int, int], name: str) -> None:
+        if size != expected:
+            whose = "camera" if expected == (self.intrinsics.width_px, self.intrinsics.height_px) else "others"
+            raise FrameError(
+                f"the {name} image has {size[0]} x {size[1]} pixels, the {whose} {expected[0]} x {expected[1]}"
+            )
+
+
+def _valid(units: np.ndarray, invalid: Sequence[float]) -> np.ndarray:
+    """Where a depth image (h, w) holds a measurement."""
+    with np.errstate(invalid="ignore"):
+        valid = np.isfinite(units) & (units > 0) if units.dtype.kind == "f" else units > 0
+    for value in invalid:
+        valid &= units != value
+    return valid
+
+
+def finish(found: Found, options: ReadOptions) -> Source:
+    """The source of what a loader found. Raises SourceError."""
+    samples, reasons = _look(found.entries)
+    if not samples and len(found.entries) >= FEW:
+        raise SourceError(f"none of the frames of {found.path} can be read: {_most_common(reasons)}")
+    poses = [pose for pose, _ in samples]
+    normaliser, notes = prepare(found, options, samples)
+    corrections = [
+        msgspec.structs.replace(correction, world_from_camera=normaliser.pose(correction.world_from_camera))
+        for correction in found.corrections
+    ]
+    entries, paced = _paced(found, options)
+    total = len(entries)
+    return Source(
+        layout=found.layout,
+        path=found.path,
+        intrinsics=normaliser.intrinsics,
+        total=total,
+        frames=lambda: _frames(normaliser, entries),
+        ground_truth=shifted_truth(found.ground_truth, normaliser.origin_m),
+        corrections=lambda: iter(corrections),
+        why=found.why,
+        notes=(*found.notes, *paced, *_rounded(poses), *notes),
+        origin_m=normaliser.origin_m,
+        convention=found.convention,
+        world_from_source=normaliser.world_from_source,
+        thinned=lambda wanted: _frames(normaliser, entries, wanted),
+    )
+
+
+def _frames(
+    normaliser: Normaliser, entries: Sequence[Entry], wanted: Wanted | None = None
+) -> Iterator[RawFrame | BadFrame]:
+    total = len(entries)
+    for index, entry in enumerate(entries):
+        try:
+            pose = entry.pose()
+            whole = wanted is None or wanted(index, normaliser.pose(pose))
+            make = normaliser.frame if whole else normaliser.bare
+            yield make(index, total, entry.frame_id, entry.stamp_ns, pose, entry.images())
+        except UNUSABLE as error:
+            yield BadFrame(frame_id=entry.frame_id, reason=str(error), index=index, total=total)
+
+
+def _paced(found: Found, options: ReadOptions) -> tuple[Sequence[Entry], tuple[str, ...]]:
+    """The entries with stamps at which the camera walks rather than flies, and a note on the rate."""
+    if options.rate_hz:
+        return found.entries, (f"{options.rate_hz:g} frames a second, as told",)
+    if not found.assumed_hz:
+        return found.entries, ()
+    steps_m = _steps_m(found.entries)
+    step_m = float(np.quantile(steps_m, 0.9)) if len(steps_m) >= FEW else 0.0
+    if step_m * found.assumed_hz <= FLIGHT_M_S:
+        return found.entries, (f"there are no stamps: {found.assumed_hz:g} frames a second are assumed",)
+    rate_hz = next((rate for rate in SLOWER_HZ if step_m * rate <= WALK_M_S), SLOWER_HZ[-1])
+    slower = [replace(entry, stamp_ns=round(entry.stamp_ns * found.assumed_hz / rate_hz)) for entry in found.entries]
+    return slower, (
+        f"there are no stamps: {rate_hz:g} frames a second are assumed, as steps of {step_m:.2f} m are too long for "
+        f"{found.assumed_hz:g} (--rate says it)",
+    )
+
+
+def _steps_m(entries: Sequence[Entry]) -> list[float]:
+    """How far the camera moves from one number to the next, at places from all over the source."""
+    steps = []
+    for index in spread(len(entries) - 1, TRIED, TRIED):
+        first, second = entries[index : index + 2]
+        try:
+            moved_m = np.linalg.norm(second.pose()[:3, 3] - first.pose()[:3, 3])
+        except UNUSABLE:
+            continue
+        if np.isfinite(moved_m) and second.frame_id > first.frame_id:
+            steps.append(float(moved_m) / (second.frame_id - first.frame_id))
+    return steps
+
+
+def _look(entries: Sequence[Entry]) -> tuple[list[tuple[np.ndarray, Images]], list[str]]:
+    """Poses and images of a few frames from all over the source, and why others could not be read."""
+    samples: list[tuple[np.ndarray, Images]] = []
+    reasons: list[str] = []
+    for index in spread(len(entries), LOOKED_AT, TRIED):
+        if len(samples) == LOOKED_AT:
+            break
+        try:
+            pose = entries[index].pose()
+            rigid(pose)
+            samples.append((pose, entries[index].images()))
+        except UNUSABLE as error:
+            reasons.append(str(error))
+    return samples, reasons
+
+
+def spread(count: int, first: int, most: int) -> list[int]:
+    """Up to `most` indices below `count`; the first few are spread evenly, the others lie between them."""
+    few = np.unique(np.linspace(0, count - 1, min(first, count)).astype(int)).tolist() if count else []
+    more = np.unique(np.linspace(0, count - 1, min(most, count)).astype(int)).tolist() if count else []
+    return few + [index for index in more if index not in set(few)]
+
+
+def _most_common(reasons: Sequence[str]) -> str:
+    return Counter(reasons).most_common(1)[0][0] if reasons else "it holds none"
+
+
+def _rounded(poses: Sequence[np.ndarray]) -> tuple[str, ...]:
+    """A note on rotations that few decimals made inexact."""
+    worst = max((stretch(pose) for pose in poses), default=0.0)
+    return (f"rotations are made orthonormal again (off by up to {worst:.2%})",) if worst > EXACT else ()
+
+
+def prepare(
+    found: Found, options: ReadOptions, samples: Sequence[tuple[np.ndarray, Images]]
+) -> tuple[Normaliser, tuple[str, ...]]:
+    """What is to be done to the frames of a source, and the notes on it. Raises SourceError."""
+    notes: list[str] = []
+    images = [images for _, images in samples]
+    sizes = _sizes(images, found.camera.intrinsics)
+    camera = _camera(found, options, sizes, notes)
+    depth = _depth(found, options, images, notes)
+    world_from_source = levelling(list(options.world_up) or found.up, options.floor_m)
+    origin_m = _origin([pose for pose, _ in samples], world_from_source, options, notes)
+    if any(origin_m):
+        world_from_source = np.eye(4) if world_from_source is None else world_from_source
+        world_from_source[:3, 3] -= origin_m
+    normaliser = Normaliser(camera.intrinsics, sizes, depth, _maps(camera), world_from_source, origin_m)
+    _check_frames(normaliser, found.path, samples)
+    return normaliser, tuple(notes)
+
+
+def _sizes(images: Sequence[Images], camera: Intrinsics) -> Sizes:
+    """The sizes most images have; the camera's where none can be read."""
+    camera_size = (camera.width_px, camera.height_px)
+    colors = Counter(filter(None, (_size(image.color) for image in images)))
+    depths = Counter(filter(None, (_size(image.depth) for image in images)))
+    return Sizes(_commonest(colors, camera_size), _commonest(depths, camera_size))
+
+
+def _commonest(counts: Counter, camera_size: tuple[int, int]) -> tuple[int, int]:
+    """The camera's own size wins a draw."""
+    return max(counts, key=lambda size: (counts[size], size == camera_size), default=camera_size)
+
+
+def _size(data: bytes | np.ndarray) -> tuple[int, int] | None:
+    if isinstance(data, np.ndarray):
+        return data.shape[1], data.shape[0]
+    try:
+        width_px, height_px, _ = measured(data)
+    except ImageError:
+        return None
+    return width_px, height_px
+
+
+def _camera(found: Found, options: ReadOptions, sizes: Sizes, notes: list[str]) -> Camera:
+    """The camera of the depth images. Raises SourceError."""
+    camera = _told(found.camera, options)
+    try:
+        check_lens(camera.model, camera.distortion)
+    except ValueError as error:
+        raise SourceError(f"the camera of {found.path} cannot be: {error}") from error
+    own = (camera.intrinsics.width_px, camera.intrinsics.height_px)
+    if not _same_aspect(sizes.color, sizes.depth):
+        raise SourceError(
+            f"the colour images of {found.path} have {_by(sizes.color)} pixels and the depth images "
+            f"{_by(sizes.depth)}: they do not show the same view; register depth to colour first"
+        )
+    if sizes.color != sizes.depth:
+        notes.append(f"colour of {_by(sizes.color)} pixels is resampled onto depth's {_by(sizes.depth)}")
+    if own != sizes.depth:
+        if not _same_aspect(own, sizes.depth):
+            raise SourceError(
+                f"the camera of {found.path} is for {_by(own)} pixels, the images have {_by(sizes.depth)}: "
+                "give --intrinsics FX,FY,CX,CY,WIDTH,HEIGHT for the images as they are"
+            )
+        notes.append(f"the camera of {_by(own)} pixels is scaled to the images' {_by(sizes.depth)}")
+        camera = replace(camera, intrinsics=scaled(camera.intrinsics, sizes.depth))
+    _check_principal_point(camera, found.path)
+    if camera.model == "fisheye" or any(camera.distortion):
+        notes.append(f"images are undistorted ({camera.model or 'opencv'} lens, {len(camera.distortion)} coefficients)")
+    return camera
+
+
+def _told(camera: Camera, options: ReadOptions) -> Camera:
+    """The camera with what the user says instead."""
+    model = options.camera_model or ("" if options.distortion else camera.model)
+    distortion = tuple(options.distortion) or (() if options.camera_model == "pinhole" else camera.distortion)
+    intrinsics, published = camera.intrinsics, camera.published
+    if options.intrinsics:
+        size = options.intrinsics[4:] or (intrinsics.width_px, intrinsics.height_px)
+        intrinsics, published = Intrinsics(int(size[0]), int(size[1]), *options.intrinsics[:4]), False
+    return Camera(intrinsics, "" if model == "pinhole" else model, () if model == "pinhole" else distortion, published)
+
+
+def _same_aspect(a: tuple[int, int], b: tuple[int, int]) -> bool:
+    return abs(a[0] * b[1] - a[1] * b[0]) <= ASPECT_TOLERANCE * max(a[0] * b[1], a[1] * b[0])
+
+
+def _by(size: tuple[int, int]) -> str:
+    return f"{size[0]} x {size[1]}"
+
+
+def scaled(camera: Intrinsics, size: tuple[int, int]) -> Intrinsics:
+    """The camera of the same picture with another number of pixels."""
+    x, y = size[0] / camera.width_px, size[1] / camera.height_px
+    center = (camera.cx_px + 0.5) * x - 0.5, (camera.cy_px + 0.5) * y - 0.5
+    return Intrinsics(*size, camera.fx_px * x, camera.fy_px * y, *center)
+
+
+def _check_principal_point(camera: Camera, path: Path) -> None:
+    of = camera.intrinsics
+    for name, center, size in (("x", of.cx_px, of.width_px), ("y", of.cy_px, of.height_px)):
+        if not camera.published and not abs(center - (size - 1) / 2) <= EDGE * size:
+            raise SourceError(
+                f"the camera of {path} has its principal point at {name} = {center:.1f} of {size} pixels, outside the "
+                "image: it belongs to another image size; give --intrinsics FX,FY,CX,CY,WIDTH,HEIGHT"
+            )
+
+
+def _maps(camera: Camera) -> tuple[np.ndarray, np.ndarray] | None:
+    if camera.model != "fisheye" and not any(camera.distortion):
+        return None
+    of = camera.intrinsics
+    matrix = np.array(((of.fx_px, 0, of.cx_px), (0, of.fy_px, of.cy_px), (0, 0, 1)))
+    size = (of.width_px, of.height_px)
+    if camera.model == "fisheye":
+        coefficients = np.array(camera.distortion or (0.0,) * 4)
+        return cv2.fisheye.initUndistortRectifyMap(matrix, coefficients, np.eye(3), matrix, size, cv2.CV_32FC1)
+    x, y = cv2.initUndistortRectifyMap(matrix, np.array(camera.distortion), np.eye(3), matrix, size, cv2.CV_32FC1)
+    return x, y
+
+
+def _depth(found: Found, options: ReadOptions, images: Sequence[Images], notes: list[str]) -> Depth:
+    """How the depth images are read. Raises SourceError when nothing real is that deep."""
+    scale_m = found.depth_scale_m if options.depth_scale_m is None else options.depth_scale_m
+    if not (np.isfinite(scale_m) and scale_m > 0):
+        raise SourceError(f"depth_scale_m of {found.path} is {scale_m}: it must be positive; give --depth-scale METRES")
+    invalid = found.depth_invalid if options.depth_invalid is None else tuple(options.depth_invalid)
+    units = [array for array in (_stored(image.depth) for image in images) if array is not None]
+    measured_m = [array[_valid(array, ())] for array in (i.depth for i in images) if isinstance(array, np.ndarray)]
+    whole = [array for array in units if array.dtype.kind != "f"]
+    floats = [array for array in units if array.dtype.kind == "f"]
+    float_scale_m = _float_scale(floats, invalid, scale_m, options, notes)
+    lost = sum(int(np.isin(array, [v for v in invalid if v]).sum()) for array in units)
+    if lost:
+        told = ", ".join(f"{value:g}" for value in invalid if value)
+        share = lost / sum(array.size for array in units)
+        notes.append(f"depth of {told} is taken as no measurement ({share:.1%} of the pixels looked at)")
+    measured_m += [array[_valid(array, invalid)] * scale_m for array in whole]
+    measured_m += [array[_valid(array, invalid)] * float_scale_m for array in floats]
+    medians = [float(np.median(values)) for values in measured_m if values.size]
+    if medians and not SHALLOWEST_M <= (median_m := float(np.median(medians))) <= DEEPEST_M:
+        used = float_scale_m if floats and not whole else scale_m
+        raise SourceError(
+            f"the median depth of {found.path} is {median_m:.4g} m: check depth_scale_m ({used:g} metres per unit); "
+            "--depth-scale METRES sets it"
+        )
+    return Depth(scale_m, float_scale_m, invalid, options.depth_min_m, options.depth_max_m)
+
+
+def _float_scale(
+    floats: Sequence[np.ndarray], invalid: Sequence[float], scale_m: float, options: ReadOptions, notes: list[str]
+) -> float:
+    """Metres per unit of floating-point depth: metres, unless these would be absurd and the source's unit is not."""
+    if options.depth_scale_m is not None or not floats:
+        return scale_m if options.depth_scale_m is not None else 1.0
+    values = np.concatenate([array[_valid(array, invalid)] for array in floats])
+    median = float(np.median(values)) if values.size else 1.0
+    absurd = not SHALLOWEST_M <= median <= DEEPEST_M and SHALLOWEST_M <= median * scale_m <= DEEPEST_M
+    notes.append(f"depth of floating-point numbers is read as {f'units of {scale_m:g} m' if absurd else 'metres'}")
+    return scale_m if absurd else 1.0
+
+
+def _stored(data: bytes | np.ndarray) -> np.ndarray | None:
+    """Numbers of a depth image that can be used."""
+    if isinstance(data, np.ndarray):
+        return None
+    try:
+        units = stored(data)
+    except ImageError:
+        return None
+    return units if units.ndim == 2 and units.dtype.itemsize > 1 else None
+
+
+def _origin(
+    poses: Sequence[np.ndarray], world_from_source: np.ndarray | None, options: ReadOptions, notes: list[str]
+) -> tuple[float, float, float]:
+    """Where the new origin lies in the levelled world."""
+    if (told := offset_of(options.origin)) is not None:
+        notes.append(f"the origin is moved to {_place(told)}, as told")
+        return told
+    if options.origin != ORIGIN_AUTO or not poses:
+        return 0.0, 0.0, 0.0
+    places = np.array(
+        [pose[:3, 3] if world_from_source is None else (world_from_source @ pose)[:3, 3] for pose in poses]
+    )
+    x_m, y_m, z_m = np.median(places, axis=0)
+    if max(abs(x_m), abs(y_m), abs(z_m)) < FAR_M:
+        return 0.0, 0.0, 0.0
+    high = abs(z_m) >= HIGH_M and not options.floor_m
+    floor_m = float(np.floor(places[:, 2].min() - EYE_LEVEL_M)) if high else 0.0
+    origin_m = float(np.round(x_m)), float(np.round(y_m)), floor_m
+    height = ", with the floor taken to be there (--floor says it)" if high else ""
+    notes.append(
+        f"the coordinates are kilometres away: recentred at {_place(origin_m)}{height}; --origin keep does not"
+    )
+    return origin_m
+
+
+def _place(origin_m: Sequence[float]) -> str:
+    return " ".join(f"{value:.10g}" for value in origin_m) + " m"
+
+
+def _check_frames(normaliser: Normaliser, path: Path, samples: Sequence[tuple[np.ndarray, Images]]) -> None:
+    """Raise SourceError when not one of the frames looked at can be used."""
+    reasons = []
+    for pose, images in samples:
+        try:
+            normaliser.frame(0, 0, 0, 0, pose, images)
+            return
+        except UNUSABLE as error:
+            reasons.append(str(error))
+    if len(reasons) >= FEW:
+        raise SourceError(f"none of the frames of {path} can be used: {_most_common(reasons)}")
+
+
+def shifted_truth(truth: Any, origin_m: Sequence[float]) -> Any:
+    """Regions of a ground truth in the recentred world; what is not ours is handed on as it is."""
+    if not any(origin_m) or not isinstance(truth, dict):
+        return truth
+    x_m, y_m, z_m = origin_m
+    try:
+        regions = [
+            {**region, "polygon_m": [[x - x_m, y - y_m] for x, y in region["polygon_m"]]} for region in truth["regions"]
+        ]
+        floors = [
+            {**floor, "z_min_m": floor["z_min_m"] - z_m, "z_max_m": floor["z_max_m"] - z_m} for floor in truth["floors"]
+        ]
+    except (TypeError, KeyError, ValueError, AttributeError):
+        return truth
+    return {**truth, "regions": regions, "floors": floors}

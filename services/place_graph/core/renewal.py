@@ -1,0 +1,49 @@
+"""What follows from the map, renewed where labels changed: distances, places, edges, openings (pure)."""
+
+import numpy as np
+
+from prior_sg.services.place_graph.core.config import Config
+from prior_sg.services.place_graph.core.ground import GroundGraph
+from prior_sg.services.place_graph.core.skeleton import distance, places
+from prior_sg.services.place_graph.core.skeleton.graph import Changes, PlaceGraph
+from prior_sg.services.place_graph.core.state import State
+from prior_sg.services.place_graph.core.volume.grid import Box, VoxelGrid
+
+TILE_VOXELS = 128  # side of the windows in which far-flung changes are worked off
+
+
+def renew(state: State, changed: np.ndarray, cfg: Config) -> Changes:
+    """Bring distances, places and edges up to date after the labels of the voxels (n, 3) changed."""
+    changes, tiles = Changes(), _tiles(changed)
+    if isinstance(state.graph, GroundGraph):
+        boxes = [Box(tile.min(axis=0), tile.max(axis=0) + 1) for tile in tiles]
+        for box in boxes:
+            changes.add(state.graph.renew(state.grid, box))
+    else:
+        fields = [distance.refresh(state.grid, tile, cfg.field_rules) for tile in tiles]
+        boxes = [box for box in fields if box is not None]
+        for box in boxes:
+            changes.add(_renewed_places(state.grid, state.graph, box, cfg))
+    for box in boxes:
+        changes.opened |= state.openings.renew(state.grid, state.graph, box)
+    return changes
+
+
+def _tiles(changed: np.ndarray) -> list[np.ndarray]:
+    """Voxels (n, 3) in groups that fit a window each."""
+    if not len(changed):
+        return []
+    if (np.ptp(changed, axis=0) <= 2 * TILE_VOXELS).all():
+        return [changed]
+    _, group = np.unique(np.floor_divide(changed, TILE_VOXELS), axis=0, return_inverse=True)
+    return [changed[group == number] for number in range(group.max() + 1)]
+
+
+def _renewed_places(grid: VoxelGrid, graph: PlaceGraph, changed: Box, cfg: Config) -> Changes:
+    cell_voxels = cfg.cell_voxels
+    everything = places.whole_cells(grid.bounds, cell_voxels)
+    # A changed group may win or lose a neighbour, one cell on, from or to a place one further. Places that touch lie up
+    # to three cells apart: each has a group in the cell beside its own.
+    region = places.whole_cells(changed, cell_voxels, 2).clipped(everything)
+    window = region.grown(3 * cell_voxels).clipped(everything)
+    return graph.update(grid, places.extract(grid, window, cfg.extraction_rules), region, changed)

@@ -1,0 +1,48 @@
+"""All that is known of one robot's map (pure)."""
+
+from dataclasses import dataclass, field
+
+from prior_sg.schemas.frames import Keyframe
+from prior_sg.services.deltas import PoseCorrections
+from prior_sg.services.place_graph.core.archive import DepthArchive
+from prior_sg.services.place_graph.core.config import Config
+from prior_sg.services.place_graph.core.ground import GroundGraph
+from prior_sg.services.place_graph.core.ledger import PlaceLedger
+from prior_sg.services.place_graph.core.openings import Openings
+from prior_sg.services.place_graph.core.skeleton.graph import PlaceGraph
+from prior_sg.services.place_graph.core.trajectory import Trajectory
+from prior_sg.services.place_graph.core.volume.grid import VoxelGrid
+
+
+@dataclass
+class State:
+    """Map and graph of one robot, and what its readers were told."""
+
+    robot: str
+    epoch: int
+    graph: PlaceGraph
+    archive: DepthArchive
+    openings: Openings
+    grid: VoxelGrid = field(default_factory=VoxelGrid)
+    ledger: PlaceLedger = field(default_factory=PlaceLedger)
+    trajectory: Trajectory = field(default_factory=Trajectory)
+    cameras_m: dict[int, tuple[float, float, float]] = field(default_factory=dict)  # by frame id, of those fused
+    seen: set[int] = field(default_factory=set)  # frame ids of all keyframes, also the refused
+    corrections: PoseCorrections = field(default_factory=PoseCorrections)
+    rejected: int = 0  # keyframes that could not be used
+    joined_frame_id: int = 0  # first keyframe heard live; earlier ones come from the archive
+    revision: int = -1
+    stamp_ns: int = 0
+    frame_id: int = -1
+    origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of the world, as the newest keyframe says
+
+    def heard(self, keyframe: Keyframe) -> None:
+        """The next delta follows from this keyframe."""
+        self.stamp_ns, self.frame_id = max(self.stamp_ns, keyframe.stamp_ns), keyframe.frame_id
+        self.seen.add(keyframe.frame_id)
+
+
+def empty(robot: str, epoch: int, cfg: Config) -> State:
+    """A map without observations."""
+    graph = GroundGraph(cfg.ground_rules) if cfg.places == "2d" else PlaceGraph(cfg.graph_rules)
+    return State(robot, epoch, graph, DepthArchive(cfg.archive_mb * 1e6), Openings(int(1.5 * cfg.cell_voxels)))

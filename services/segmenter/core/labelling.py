@@ -1,0 +1,54 @@
+"""What the labels rest on beside the evidence, and what is still to be done for them (pure)."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from prior_sg.services.segmenter.core.appearance.adaptation import Adaptation
+from prior_sg.services.segmenter.core.energy.solver import Solver
+
+
+@dataclass
+class Labelling:
+    """The solver of the field, what this map taught about its labels, and how much of it has changed since."""
+
+    solver: Solver
+    adaptation: Adaptation = field(default_factory=Adaptation)
+    bias: np.ndarray = field(default_factory=lambda: np.zeros(0))  # (label,) of the visual scores in this map
+    unadapted: int = (
+        0  # places whose evidence changed, or that left, since that was looked at; at least one if any edge did
+    )
+    compared: int = 0  # places whose similarity was computed, or that left, since the bias was
+    dirty: bool = False  # something changed since the last solution
+
+    def map_changed(self, left: int, touched: bool) -> None:
+        """So many places left; `touched`: some came or moved, or an edge changed."""
+        self.compared += left
+        self.unadapted += left + touched  # at least one: the map is another
+        self.dirty = True
+
+    def start_afresh(self, labels: int, places: int) -> None:
+        """A prior with so many labels has come into force on a map of so many places."""
+        self.bias, self.compared, self.adaptation = np.zeros(labels), places, Adaptation()
+
+    def forget_appearance(self) -> None:
+        """The evidence is of another embedding space."""
+        self.adaptation, self.dirty = Adaptation(), True
+
+    def adaptation_due(self, seen: int, rests: bool, patience: float) -> bool:
+        """Whether enough of `seen` observed places changed to look at them again; if so, that counts as done."""
+        due = bool(rests and self.unadapted) or self.unadapted > patience * seen
+        if due:
+            self.unadapted = 0
+        return due
+
+    def bias_due(self, seen: int, idle: bool, patience: float) -> bool:
+        """Whether enough of `seen` observed places changed to find the bias again; if so, that counts as done."""
+        due = bool(self.compared) and (idle or self.compared > patience * seen)
+        if due:
+            self.compared = 0
+        return due
+
+    def labelled(self) -> None:
+        """The labels are published; what was not finished remains to be done."""
+        self.dirty = self.solver.pending > 0 or self.compared > 0 or self.unadapted > 0

@@ -1,0 +1,83 @@
+"""The map: the place graph as followed, how firmly its edges bind, and what is known of each place (pure)."""
+
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from prior_sg.schemas.places import PlaceDelta
+from prior_sg.services.deltas import Follower
+from prior_sg.services.segmenter.core.config import Config
+from prior_sg.services.segmenter.core.map import inclination
+from prior_sg.services.segmenter.core.map.received import ReceivedGraph, Step, apply, with_neighbours
+from prior_sg.services.segmenter.core.map.table import Places
+
+
+class MapChange(NamedTuple):
+    """What one delta changed."""
+
+    step: Step
+    gone_ids: np.ndarray  # (removed,) places that left
+    gone_slots: np.ndarray  # (removed,) where their evidence is
+    gone_regions: np.ndarray  # (removed,) the regions that they were in
+
+
+@dataclass
+class PlaceMap:
+    """The place graph as followed, the weights of its edges, and the table of its places."""
+
+    follower: Follower[PlaceDelta] = field(default_factory=Follower)
+    epoch: int = -1  # of the graph's writer
+    graph: ReceivedGraph = field(default_factory=ReceivedGraph)
+    weights: np.ndarray = field(default_factory=lambda: np.zeros(0))  # (edge,) w_dist
+    places: Places = field(default_factory=Places.none)
+    asked_snapshot: bool = False
+
+    def take(self, delta: PlaceDelta) -> list[PlaceDelta]:
+        """The deltas to apply now, in order."""
+        if delta.snapshot:
+            self.asked_snapshot = False
+        return self.follower.take(delta)
+
+    def ask_for_snapshot(self) -> bool:
+        """Whether a snapshot is missing and not asked for yet; if so, it counts as asked for."""
+        due = self.follower.needs_snapshot and not self.asked_snapshot
+        self.asked_snapshot |= due
+        return due
+
+    def advance(self, delta: PlaceDelta, cfg: Config) -> MapChange:
+        """Apply a delta, and mark the places around which it changed the graph."""
+        step = apply(self.graph, delta, replaces=delta.snapshot or delta.epoch != self.epoch)
+        before, places, gone = self.graph, self.places, step.removed
+        change = MapChange(step, before.ids[gone], places.slots[gone], places.regions[gone])
+        self.graph, self.epoch = step.graph, delta.epoch
+        self.weights = edge_weights(self.graph, cfg)
+        self.places = places.realigned(step)
+        self.places.reshaped |= inclination.disturbed(before, step, cfg.geometry.neighbourhood_m)
+        around = with_neighbours(self.graph, step.touched)
+        self.places.unsettled |= around
+        self.places.unshared |= around
+        self.places.unbelieved |= around
+        self.places.doubtful |= step.moved
+        return change
+
+    def relabel(self, labels: int) -> None:
+        """Nothing is known any more of any place under these so many labels."""
+        self.places = self.places.relabelled(labels)
+
+
+def edge_weights(graph: ReceivedGraph, cfg: Config) -> np.ndarray:
+    """w_dist (edge,) of eq. pairwise_potential: falls with length, then scaled symmetrically.
+
+    With w and the sums of w at both ends, d_u and d_v, the weight is edge_sum w / sqrt(d_u d_v): a place is held by its
+    neighbours about as firmly in a dense graph of small rooms as in a sparse one of large halls.
+    """
+    first, second = graph.edges.T
+    weights = np.exp(-graph.lengths_m / cfg.edge_decay_m)
+    if cfg.edge_sum > 0:
+        weights = np.maximum(weights, np.finfo(float).tiny)
+        sums = np.bincount(graph.edges.reshape(-1), np.repeat(weights, 2), minlength=len(graph.ids))
+        weights = cfg.edge_sum * weights / (np.sqrt(sums[first]) * np.sqrt(sums[second]))
+    if cfg.edge_clearance_m > 0:
+        weights = weights * np.minimum(graph.clearances_m / cfg.edge_clearance_m, 1.0)
+    return weights

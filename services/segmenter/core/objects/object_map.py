@@ -1,0 +1,59 @@
+"""The objects of the map: their tracks, what experts see of them, and what followers know (pure)."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from prior_sg.schemas.objects import Detections, ObjectDelta
+from prior_sg.schemas.priors import Prior
+from prior_sg.services.segmenter.core.experts.context import ObjectView
+from prior_sg.services.segmenter.core.objects import tracks
+from prior_sg.services.segmenter.core.objects.ledger import ObjectLedger
+from prior_sg.services.segmenter.core.objects.names import Named
+from prior_sg.services.segmenter.core.objects.tracks import TrackingConfig, Tracks
+
+
+@dataclass
+class ObjectMap:
+    """Objects as tracked, as experts see them, and as followers know them."""
+
+    tracks: Tracks
+    view: ObjectView = field(default_factory=ObjectView)
+    ledger: ObjectLedger = field(default_factory=ObjectLedger)
+
+    def observe(self, detections: Detections, cfg: TrackingConfig) -> bool:
+        """Associate one frame's detections; False for those that cannot be used."""
+        return tracks.observe(self.tracks, detections, cfg)
+
+    def move(self, poses: Mapping[int, np.ndarray]) -> None:
+        """Frames have other poses (4, 4), by frame id."""
+        tracks.move(self.tracks, dict(poses))
+
+    def floor_changed(self) -> None:
+        """Heights of objects count from the floor: they are to be named again."""
+        self.tracks.changed = True
+
+    def renew(self, space: str, rests: bool, cfg: TrackingConfig) -> bool:
+        """Go on with associating afresh where that is due; whether the objects are those of the space."""
+        if tracks.outdated(self.tracks, space):
+            tracks.renew(self.tracks, space, cfg.renew_frames_at_rest if rests else cfg.renew_frames, cfg)
+        return self.tracks.space == space
+
+    def tell(self, robot: str, epoch: int, stamp_ns: int, *, now: dict[int, Named], digest: str) -> ObjectDelta | None:
+        """The delta to the objects as they are `now`, named by the prior with this digest; None without news."""
+        merged = self.tracks.merged
+        self.tracks.merged, self.tracks.changed = [], False
+        return self.ledger.tell(robot, epoch, stamp_ns, now=now, merged=merged, digest=digest)
+
+    def see(self, view: ObjectView) -> np.ndarray:
+        """From now on these are the objects of the map; where (n, 3) some are new, changed or gone."""
+        changed_m = view.changed_m(self.view)
+        self.view = view
+        return changed_m
+
+    def start_afresh(self, prior: Prior, switched: bool) -> None:
+        """A prior has come into force, with `switched` after another: the objects are to be named in its terms."""
+        if len(prior.objects) != self.view.concepts.shape[1] or switched:
+            self.view = ObjectView()  # its columns are the former prior's objects
+        self.tracks.changed = True
