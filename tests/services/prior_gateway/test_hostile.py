@@ -1,13 +1,16 @@
 """Tasks, priors and questions that nobody means: refused in one sentence, and the gateway goes on."""
 
+import asyncio
+
 import msgspec
 import pytest
 
 from prior_sg.schemas.priors import Keep, PriorRequest, PriorRevision, Task
 from prior_sg.services.prior_gateway import service
 from prior_sg.services.prior_gateway.core.config import Config
-from prior_sg.services.prior_gateway.outside.archive import PREFERRED, PriorShelf, file_name
+from prior_sg.services.prior_gateway.outside.archive import PREFERRED, PriorShelf, file_name, open_keep
 from prior_sg.services.refusals import InputRefused
+from prior_sg.services.runtime.service import Identity
 from tests.help.examples import PRIOR
 from tests.help.gateway import Gateway
 
@@ -54,9 +57,9 @@ def test_names_are_names_whatever_they_look_like(regions):
 def test_no_question_is_a_path(question, tmp_path):
     assert file_name(question).isalnum() and len(file_name(question)) == 32
     archive = tmp_path / "archive"
-    gateway = Gateway(Config(archive=str(archive)))
+    keep = open_keep(Config(archive=str(archive)), Identity("*", "g1", 1))
     made = msgspec.structs.replace(PRIOR.provenance, question=question)
-    gateway.do(Keep(prior=msgspec.structs.replace(PRIOR, provenance=made), question=question))
+    asyncio.run(keep(Keep(prior=msgspec.structs.replace(PRIOR, provenance=made), question=question)))
     kept = [path for path in tmp_path.rglob("*") if path.is_file()]
     assert len(kept) == 1 and kept[0].parent.parent == archive and kept[0].stem != PREFERRED
     folder = PriorShelf(str(archive)).folder(PRIOR.environment, PRIOR.task, PRIOR.vocabulary)
