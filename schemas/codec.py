@@ -9,14 +9,18 @@ equal names within one message must have equal length. Decoding checks all of it
 the boundary and nowhere else.
 """
 
+import math
 import struct
 import threading
 from collections.abc import Iterator
 from functools import cache
+from types import UnionType
 from typing import Annotated, Any, ClassVar, TypeVar, get_args, get_origin, get_type_hints
 
 import msgspec
 import numpy as np
+
+from prior_sg.schemas.names import fault_of_robot
 
 ARRAY_EXT_CODE = 1
 DTYPES = (
@@ -80,8 +84,12 @@ class Message(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     schemas/migrations.py."""
 
     VERSION: ClassVar[int] = 1
+    OF_A_ROBOT: ClassVar[bool] = True  # its field `robot`, if it has one, never means the fleet
 
     def __post_init__(self) -> None:
+        _check_plain(self)
+        if self.OF_A_ROBOT and (fault := fault_of_robot(getattr(self, "robot", "robot"))):
+            raise ValueError(fault)
         lengths: dict[str, int] = {}
         for field, shape in _array_fields(type(self)):
             shape.check(field, getattr(self, field), lengths)
@@ -98,6 +106,40 @@ class Message(msgspec.Struct, frozen=True, kw_only=True, eq=False):
 
 
 M = TypeVar("M", bound=Message)
+
+
+def _check_plain(value: msgspec.Struct) -> None:
+    """Whole numbers fit 64 bits, as arrays and databases hold them; all others are finite."""
+    whole, real = _numbers(type(value))
+    for field in whole:
+        if not -(2**63) <= getattr(value, field) < 2**63:
+            raise ValueError(f"{field}: does not fit 64 bits")
+    for field in real:
+        numbers = getattr(value, field)
+        numbers = numbers if isinstance(numbers, tuple) else (numbers,)
+        if not all(number is None or math.isfinite(number) for number in numbers):
+            raise ValueError(f"{field}: not finite")
+
+
+@cache
+def _numbers(kind: type[msgspec.Struct]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Names of the fields that hold a whole number, and of those that hold one or a few real ones, or None."""
+    hints = get_type_hints(kind)
+    kinds = {name: {*(get_args(hint) if isinstance(hint, UnionType) else (hint,))} for name, hint in hints.items()}
+    whole = tuple(name for name, hint in hints.items() if hint is int)
+    real = tuple(
+        name
+        for name, parts in kinds.items()
+        if any(part is float or (get_origin(part) is tuple and set(get_args(part)) == {float}) for part in parts)
+    )
+    return whole, real
+
+
+class Part(msgspec.Struct, frozen=True, kw_only=True):
+    """Base of what messages are made of."""
+
+    def __post_init__(self) -> None:
+        _check_plain(self)
 
 
 @cache
@@ -198,7 +240,10 @@ def prepare() -> None:
     """Build now what decoding needs of every message type defined so far, those inside others included."""
     for kind in message_types():
         _array_fields(kind)
+        _numbers(kind)
         _decoder(kind)
+    for part in Part.__subclasses__():
+        _numbers(part)
 
 
 def encode(message: Message) -> bytes:

@@ -5,7 +5,7 @@ from typing import Annotated
 import msgspec
 import numpy as np
 
-from prior_sg.schemas.codec import Message, Shape
+from prior_sg.schemas.codec import Message, Part, Shape
 from prior_sg.schemas.frames import Intrinsics, Pose, check_pose
 
 _NO_NAMES = msgspec.field(default_factory=lambda: np.zeros(0, np.int16))
@@ -47,7 +47,7 @@ class Detections(Message, frozen=True, kw_only=True):
             raise ValueError("point_counts do not fit the points")
 
 
-class SceneObject(msgspec.Struct, frozen=True, kw_only=True):
+class SceneObject(Part, frozen=True, kw_only=True):
     """One object of the scene; world, metres."""
 
     id: int

@@ -8,11 +8,12 @@ import msgspec
 import numpy as np
 
 from prior_sg.schemas.codec import Message, Shape, encode
+from prior_sg.schemas.names import LONGEST_NAME, fault_of_names, fault_of_text, key_part
 
 SUM_TOLERANCE = 1e-3
 # No prior that somebody means is larger; a message beyond is refused wherever it arrives.
 MOST_REGIONS, MOST_OBJECTS, MOST_PHRASES = 64, 512, 64
-LONGEST_NAME, LONGEST_PHRASE = 80, 240
+LONGEST_PHRASE = 240
 LARGEST_M, MOST_SPREAD = 1000.0, 2.0  # of an object's sides, and of their logarithm
 
 
@@ -24,6 +25,19 @@ class Task(Message, frozen=True, kw_only=True):
     environment: str
     task: str
     regions: list[str] = []
+
+    def fault(self) -> str:
+        """Why nobody can answer this task, as a sentence; empty when nothing speaks against it."""
+        return fault_of_task(self.environment, self.task, self.regions)
+
+
+def fault_of_task(environment: str, task: str, regions: list[str]) -> str:
+    """What is wrong with what is asked, as a sentence; empty when nothing is."""
+    return (
+        fault_of_text("the environment", environment)
+        or fault_of_text("the task", task)
+        or fault_of_names("region", regions, MOST_REGIONS)
+    )
 
 
 class TaskRequest(Message, frozen=True, kw_only=True):
@@ -205,6 +219,9 @@ class PriorClaim(Message, frozen=True, kw_only=True):
     question: str
     holder: str
     state: Literal["wants", "works", "gave up"]
+
+    def check(self) -> None:
+        key_part(self.question)
 
 
 class PriorEvidence(Message, frozen=True, kw_only=True):

@@ -5,13 +5,13 @@ from typing import Annotated, Literal
 import msgspec
 import numpy as np
 
-from prior_sg.schemas.codec import Message, Shape
+from prior_sg.schemas.codec import Message, Part, Shape
 
 NO_REGION = -1  # in place of a region id: not labelled yet
 _NO_IDS = msgspec.field(default_factory=lambda: np.zeros(0, np.int64))
 
 
-class Transition(msgspec.Struct, frozen=True, kw_only=True):
+class Transition(Part, frozen=True, kw_only=True):
     """One way from a region into another: edges of the place graph that cross the border side by side."""
 
     region: int  # on the other side
@@ -21,7 +21,7 @@ class Transition(msgspec.Struct, frozen=True, kw_only=True):
     door: bool  # narrow, as doorways are
 
 
-class Region(msgspec.Struct, frozen=True, kw_only=True):
+class Region(Part, frozen=True, kw_only=True):
     """One connected set of places with one label."""
 
     id: int
@@ -42,7 +42,7 @@ class Region(msgspec.Struct, frozen=True, kw_only=True):
 EventKind = Literal["appeared", "split", "merged", "relabelled", "removed"]
 
 
-class RegionEvent(msgspec.Struct, frozen=True, kw_only=True):
+class RegionEvent(Part, frozen=True, kw_only=True):
     """What became of one region in one update."""
 
     kind: EventKind

@@ -1,5 +1,7 @@
 """What services say about themselves: consumption journal, health."""
 
+from typing import ClassVar
+
 import msgspec
 
 from prior_sg.schemas.codec import Message
@@ -11,6 +13,8 @@ class Consumed(Message, frozen=True, kw_only=True):
     `key`, `writer` and `sequence` point at a recorded message. Inputs that no topic carries (start, ticks, replies to
     questions, messages of unknown writers) travel whole in `inline`.
     """
+
+    OF_A_ROBOT: ClassVar[bool] = False
 
     robot: str
     service: str
@@ -28,6 +32,8 @@ class Started(Message, frozen=True, kw_only=True):
     """Opens a journal: everything replay needs to build the same state. It never goes beyond version 1: it tells those
     of the messages that its journal holds `inline`.
     """
+
+    OF_A_ROBOT: ClassVar[bool] = False
 
     robot: str
     service: str
@@ -74,6 +80,8 @@ class StatusRequest(Message, frozen=True, kw_only=True):
 
 class ServiceStatus(Message, frozen=True, kw_only=True):
     """Health of one process."""
+
+    OF_A_ROBOT: ClassVar[bool] = False
 
     service: str
     instance: str

@@ -15,6 +15,7 @@ from typing import Literal
 from prior_sg.schemas.codec import Message, prepare
 from prior_sg.schemas.features import Backfill, Pyramid, TextEmbeddings, TextRequest
 from prior_sg.schemas.frames import ArchiveReply, ArchiveRequest, CameraState, IngestState, Keyframe, PoseUpdate
+from prior_sg.schemas.names import key_part
 from prior_sg.schemas.objects import Detections, ObjectDelta
 from prior_sg.schemas.places import MapRequest, PlaceDelta, SnapshotRequest, VoxelMap
 from prior_sg.schemas.priors import (
@@ -51,11 +52,11 @@ class Topic:
     cache: int = 0  # samples a publisher keeps for late and lossy readers (`every`)
 
     def key_of(self, message: Message) -> str:
-        """The key this message is published on."""
+        """The key this message is published on. Raises ValueError where a field cannot be part of one."""
         fields = {"robot": getattr(message, "robot", ""), "question": getattr(message, "question", "")}
         if "{digest}" in self.key:
             fields["digest"] = message.digest()  # type: ignore[attr-defined]
-        return self.key.format(**fields)
+        return self.key.format(**{name: key_part(text) for name, text in fields.items() if f"{{{name}}}" in self.key})
 
     def pattern(self, robot: str) -> str:
         """The key expression that matches this topic of `robot` (`*` = of all robots)."""
@@ -72,8 +73,9 @@ class Query:
     key: str
 
     def key_of(self, request: Message) -> str:
-        """The key this request is asked on."""
-        return self.key.format(**{name: getattr(request, name) for name in request.__struct_fields__})
+        """The key this request is asked on. Raises ValueError where a field cannot be part of one."""
+        fields = {name: getattr(request, name) for name in request.__struct_fields__ if f"{{{name}}}" in self.key}
+        return self.key.format(**{name: "/".join(map(key_part, text.split("/"))) for name, text in fields.items()})
 
 
 KEYFRAME = Topic("KEYFRAME", Keyframe, f"{ROOT}/{{robot}}/keyframe", "every", 2, recorded=True, cache=32)

@@ -2,17 +2,15 @@
 
 import argparse
 import json
-import sys
 from typing import TYPE_CHECKING
 
-from rich.console import Console
-from rich.markup import escape
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress
 from rich.table import Table
 
 from prior_sg.deploy.cli.shared import Commands, add_settings, console
 from prior_sg.deploy.cli.source_options import add_source_options, read_options
 from prior_sg.deploy.errors import UserError
+from prior_sg.deploy.terminal import Description, Terminal, line
 
 if TYPE_CHECKING:
     from prior_sg.deploy.inspecting.check import Report
@@ -50,27 +48,27 @@ def cmd_check(arguments: argparse.Namespace) -> int:
     return 1 if report.verdict == "problem" else 0
 
 
-def before_start(path: str, cfg: "Config", console: Console) -> "Report":
+def before_start(path: str, cfg: "Config", console: Terminal) -> "Report":
     """A brief check: one line about the source and one for each problem. Raises HopelessSource and SourceError."""
     from prior_sg.deploy.inspecting.check import check
     from prior_sg.services.ingest.sources import open_source
 
     report = check(open_source(path, options=cfg), cfg, brief=True)
-    console.print(escape(report.summary))
+    console.print(report.summary)
     for finding in report.findings:
         if finding.verdict == "problem" or (finding.topic, finding.verdict) == ("ground truth", "note"):
-            console.print(f"[{STYLE[finding.verdict]}]{finding.verdict}[/] {finding.topic}: {escape(finding.line())}")
+            console.print(line((finding.verdict, STYLE[finding.verdict]), f" {finding.topic}: {finding.line()}"))
     if report.problems and report.problems[0].hopeless:
         raise HopelessSource(f"{report.source}: {report.problems[0].line()}; `prior-sg check` says more")
     return report
 
 
-def show(report: "Report", console: Console) -> None:
+def show(report: "Report", console: Terminal) -> None:
     """A table of all findings, and a closing line."""
-    table = Table("", "what", "found", "mend", title=escape(report.source))
+    table = Table("", "what", "found", "mend", title=report.source)
     for finding in report.findings:
-        verdict = f"[{STYLE[finding.verdict]}]{finding.verdict}[/]"
-        table.add_row(verdict, finding.topic, escape(finding.text), escape(finding.mend))
+        verdict = line((finding.verdict, STYLE[finding.verdict]))
+        table.add_row(verdict, finding.topic, finding.text, finding.mend)
     console.print(table)
     count = len(report.problems)
     console.print(f"{count or 'no'} problem{'s' * (count != 1)}, {report.seconds:.1f} s")
@@ -107,5 +105,5 @@ def _checked(path: str, cfg: "Config") -> "Report":
 
 def _progress() -> Progress:
     """A bar on the terminal's error stream, so that JSON stays clean."""
-    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn()
-    return Progress(*columns, console=Console(file=sys.stderr), transient=True)
+    columns = Description(), BarColumn(), MofNCompleteColumn()
+    return Progress(*columns, console=Terminal(stderr=True), transient=True)

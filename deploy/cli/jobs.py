@@ -4,8 +4,9 @@ import argparse
 from pathlib import Path
 
 from prior_sg.deploy.cli.check import before_start
-from prior_sg.deploy.cli.shared import Commands, add_bus, add_settings, console, names_in
+from prior_sg.deploy.cli.shared import Commands, add_bus, add_settings, console
 from prior_sg.deploy.cli.source_options import add_source_options, read_options, source_settings
+from prior_sg.deploy.edge import names_in
 from prior_sg.deploy.errors import UserError
 from prior_sg.deploy.sample import COARSE, SAMPLE
 from prior_sg.deploy.settings import DEMO_ENVIRONMENT, DEMO_TASK

@@ -6,8 +6,9 @@ from pathlib import Path
 
 from prior_sg.deploy.cli.check import before_start
 from prior_sg.deploy.cli.jobs import add_run_options, settings_of
-from prior_sg.deploy.cli.shared import Commands, add_bus, console, names_in, open_client
+from prior_sg.deploy.cli.shared import Commands, add_bus, console, open_client
 from prior_sg.deploy.cli.source_options import add_source_options, read_options
+from prior_sg.deploy.edge import names_in
 from prior_sg.deploy.errors import UserError
 from prior_sg.deploy.running import serve
 from prior_sg.services.errors import PriorSgError

@@ -7,13 +7,14 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
-from rich.console import Console
 from rich.table import Table
 
 from prior_sg.deploy.cli.prior_file import PriorError, Rows, adjacency, containment, existence, read, write
-from prior_sg.deploy.cli.shared import names_in, open_client
+from prior_sg.deploy.cli.shared import open_client
+from prior_sg.deploy.edge import names_in
 from prior_sg.deploy.running.inprocess import InProcess
 from prior_sg.deploy.settings import resolved_config
+from prior_sg.deploy.terminal import Terminal, line
 from prior_sg.schemas.codec import DecodeError, decode
 from prior_sg.schemas.priors import ObjectPrior, Prior, PriorRevision, Provenance, Task
 from prior_sg.schemas.topics import PRIOR, PRIOR_REVISION
@@ -79,7 +80,7 @@ def wanted(arguments: argparse.Namespace, cfg: Config) -> Prior:
 def verdict(prior: Prior, cfg: Config, library: Library) -> str:
     """What speaks for a prior's origin."""
     if not prior.provenance.signature and prior.provenance.source == "library" and not prior.provenance.parent_digest:
-        task = Task(robot="", stamp_ns=0, environment=prior.environment, task=prior.task, regions=prior.vocabulary)
+        task = Task(robot="cli", stamp_ns=0, environment=prior.environment, task=prior.task, regions=prior.vocabulary)
         try:
             said = library.answer(task, cfg)
             same = msgspec.structs.replace(said, provenance=prior.provenance).digest() == prior.digest()
@@ -89,7 +90,7 @@ def verdict(prior: Prior, cfg: Config, library: Library) -> str:
     return Signer(cfg.signing_key, cfg.trusted_keys).check(prior)[1]
 
 
-def make(arguments: argparse.Namespace, console: Console) -> int:
+def make(arguments: argparse.Namespace, console: Terminal) -> int:
     """A gateway in this process does exactly what the service does."""
     cfg, task = settings(arguments), task_of(arguments)
     gateway = InProcess("cli", Path(), list(arguments.set), arguments.config)
@@ -110,7 +111,7 @@ def make(arguments: argparse.Namespace, console: Console) -> int:
     return 0
 
 
-def show(arguments: argparse.Namespace, console: Console) -> int:
+def show(arguments: argparse.Namespace, console: Terminal) -> int:
     """Tables, and a picture."""
     from prior_sg.deploy.showing.prior import draw
 
@@ -126,7 +127,7 @@ def show(arguments: argparse.Namespace, console: Console) -> int:
     return 0
 
 
-def export(arguments: argparse.Namespace, console: Console) -> int:
+def export(arguments: argparse.Namespace, console: Terminal) -> int:
     """JSON that `import` reads."""
     prior = wanted(arguments, settings(arguments))
     write(prior, arguments.out)
@@ -134,7 +135,7 @@ def export(arguments: argparse.Namespace, console: Console) -> int:
     return 0
 
 
-def bring(arguments: argparse.Namespace, console: Console) -> int:
+def bring(arguments: argparse.Namespace, console: Terminal) -> int:
     """A prior from elsewhere is checked like a model's."""
     cfg, prior = settings(arguments), read(arguments.file)
     said = verdict(prior, cfg, load())
@@ -147,7 +148,7 @@ def bring(arguments: argparse.Namespace, console: Console) -> int:
     return 0
 
 
-def list_all(arguments: argparse.Namespace, console: Console) -> int:
+def list_all(arguments: argparse.Namespace, console: Terminal) -> int:
     """The library, then what the archive holds."""
     table = Table("environment", "task", "regions", show_lines=True)
     for listing in environments():
@@ -171,13 +172,13 @@ def list_all(arguments: argparse.Namespace, console: Console) -> int:
     return 0
 
 
-def diff(arguments: argparse.Namespace, console: Console) -> int:
+def diff(arguments: argparse.Namespace, console: Terminal) -> int:
     """What one prior has and the other has not, and where they differ."""
     cfg = settings(arguments)
     before, after = find(arguments.what, cfg), find(arguments.other, cfg)
     lines = differences(before, after, arguments.least)
-    for line in lines:
-        console.print(line)
+    for text in lines:
+        console.print(text)
     if not lines:
         console.print(f"no difference of {arguments.least:g} or more")
     return 0
@@ -205,10 +206,10 @@ def differences(before: Prior, after: Prior, least: float) -> list[str]:
                 was, now = old_rows[row][column], new_rows[row][column]
                 if abs(now - was) >= least:
                     found.append((-abs(now - was), f"{title} {row}, {column}: {was:.2f} -> {now:.2f}"))
-    return lines + [line for _, line in sorted(found)]
+    return lines + [text for _, text in sorted(found)]
 
 
-def revise(arguments: argparse.Namespace, console: Console) -> int:
+def revise(arguments: argparse.Namespace, console: Terminal) -> int:
     """The running gateway revises and publishes; robots that work under the prior take it over at once."""
     task = task_of(arguments)
     found: list[Prior] = []
@@ -242,7 +243,7 @@ def revise(arguments: argparse.Namespace, console: Console) -> int:
     return 0
 
 
-def describe(prior: Prior, cfg: Config, console: Console) -> None:
+def describe(prior: Prior, cfg: Config, console: Terminal) -> None:
     """Each region with what tells it from the others, and where the prior comes from."""
     from prior_sg.deploy.showing.prior import merits
 
@@ -254,13 +255,16 @@ def describe(prior: Prior, cfg: Config, console: Console) -> None:
         slope = f"{np.degrees(region.inclination_mean_rad):.0f}±{np.degrees(region.inclination_std_rad):.0f}° steep"
         zone = f", {region.parent}" if region.parent else ""
         console.print(
-            f"[bold]{region.name}[/]  {share} of the places{zone}, {slope}, r_Q {region.query_radius_m:.2f} m"
+            line(
+                (region.name, "bold"),
+                f"  {share} of the places{zone}, {slope}, r_Q {region.query_radius_m:.2f} m",
+            )
         )
         console.print("    holds " + ", ".join(f"{prior.objects[j].name} {prior.containment[i, j]:.0%}" for j in best))
         console.print("    touches " + ", ".join(f"{prior.regions[j].name} {prior.adjacency[i, j]:.0%}" for j in near))
         console.print("    looks like " + "; ".join(region.phrases[:3]))
     if sized := [_size(item) for item in prior.objects if item.size_m is not None]:
-        console.print("[bold]sizes[/]  " + ", ".join(sized))
+        console.print(line(("sizes", "bold"), "  ", ", ".join(sized)))
     made = prior.provenance
     console.print(f"prior {prior.digest()}: {len(prior.regions)} regions, {len(prior.objects)} objects")
     console.print(f"made by {made.source} ({made.detail}){_when(made)}: {made.note}")
@@ -286,7 +290,7 @@ def _when(made: Provenance) -> str:
     return f" at {at} by {made.made_by}, prompts {made.prompts}, {made.samples} samples"
 
 
-ACTIONS: dict[str, Callable[[argparse.Namespace, Console], int]] = {
+ACTIONS: dict[str, Callable[[argparse.Namespace, Terminal], int]] = {
     "list": list_all,
     "make": make,
     "show": show,

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
 from rich.table import Table
 
 from prior_sg.deploy.errors import UserError
@@ -15,6 +14,7 @@ from prior_sg.deploy.evaluation.object_metrics import NO_DETECTOR, OBJECT_SHARES
 from prior_sg.deploy.inspecting.replay import Log, message_differences, undisturbed
 from prior_sg.deploy.running.job import Result
 from prior_sg.deploy.showing.export import map_png, places_png, scene_json
+from prior_sg.deploy.terminal import Terminal
 from prior_sg.deploy.truth import GroundTruth, TrueObject
 from prior_sg.schemas.codec import decode, encode
 from prior_sg.schemas.places import VoxelMap
@@ -53,7 +53,7 @@ def write(
     result: Result,
     out: Path,
     truth: dict[str, Any] | None,
-    console: Console,
+    console: Terminal,
     objects: Sequence[TrueObject] = (),
 ) -> None:
     """Print the regions and the scores, and write scene.json, dsg.json, map.png, map-3d.png and metrics.json.
@@ -85,7 +85,7 @@ def write(
 
 
 def compare(
-    result: Result, truth: dict[str, Any] | None, objects: Sequence[TrueObject], console: Console
+    result: Result, truth: dict[str, Any] | None, objects: Sequence[TrueObject], console: Terminal
 ) -> dict[str, float | None]:
     """Scores of regions and objects, as far as there is a ground truth of them, also printed; None = no such score."""
     scene, metrics = result.scene, dict[str, float]()

@@ -4,14 +4,13 @@ import argparse
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from rich.console import Console
-
 from prior_sg.deploy.settings import DEFAULT_ROBOT, connect_in_force
+from prior_sg.deploy.terminal import Terminal
 
 if TYPE_CHECKING:
     from prior_sg.services.runtime.client import BusClient
 
-console = Console(highlight=False)
+console = Terminal()
 
 Run = Callable[[argparse.Namespace], int]  # does what a command was told; its exit status
 
@@ -56,8 +55,3 @@ def open_client(connect: str) -> "BusClient":
     from prior_sg.services.runtime.zenoh_bus import ZenohBus
 
     return BusClient(ZenohBus(connect, wait_s=2.0))
-
-
-def names_in(text: str) -> list[str]:
-    """Names separated by commas."""
-    return [name.strip() for name in text.split(",") if name.strip()]

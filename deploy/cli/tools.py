@@ -11,6 +11,7 @@ from rich.table import Table
 from prior_sg.deploy.cli.shared import Commands, add_bus, console, open_client
 from prior_sg.deploy.errors import UserError
 from prior_sg.deploy.evaluation import command as evaluation
+from prior_sg.deploy.terminal import Part, line
 
 if TYPE_CHECKING:
     from prior_sg.schemas.status import ServiceStatus, TopicCount
@@ -18,6 +19,12 @@ if TYPE_CHECKING:
 
 def add_commands(commands: Commands) -> None:
     """`export`, `explain`, `record`, `replay`, `topics`, `health`, `eval` and `bench`."""
+    _add_results(commands)
+    _add_logs(commands)
+    _add_system(commands)
+
+
+def _add_results(commands: Commands) -> None:
     export = commands.add(
         "export",
         cmd_export,
@@ -44,6 +51,8 @@ def add_commands(commands: Commands) -> None:
     explain.add_argument("--json", action="store_true", help="print JSON")
     add_bus(explain)
 
+
+def _add_logs(commands: Commands) -> None:
     record = commands.add(
         "record", cmd_record, "record all topics into a log, until Ctrl-C", "prior-sg record out/log.mcap"
     )
@@ -62,6 +71,8 @@ def add_commands(commands: Commands) -> None:
     replay.add_argument("service")
     replay.add_argument("--diff", action="store_true", help="compare with what was recorded; exit 1 on differences")
 
+
+def _add_system(commands: Commands) -> None:
     topics = commands.add(
         "topics",
         cmd_topics,
@@ -244,19 +255,21 @@ def _print_health(statuses: list["ServiceStatus"], silent: list[dict]) -> None:
     """Two lines a process: what it is doing, and what went through each topic."""
     for status in statuses:
         waits = f", waits for {', '.join(status.waiting_for)}" if status.waiting_for else ""
-        console.print(
-            f"[bold]{status.instance}[/]  pid {status.pid}, up {status.uptime_s:.0f} s, busy {status.busy_share:.0%}, "
+        figures = (
+            f"  pid {status.pid}, up {status.uptime_s:.0f} s, busy {status.busy_share:.0%}, "
             f"step {status.step_ms_p50:.1f} ms (p99 {status.step_ms_p99:.1f}), {status.resident_mb:.0f} MB, "
             f"backlog {status.backlog}{waits}"
         )
-        console.print("    " + " · ".join(map(_topic_line, status.topics)))
+        console.print(line((status.instance, "bold"), figures))
+        parts = [part for count in status.topics for part in (" · ", *_topic_line(count))]
+        console.print(line("    ", *parts[1:]))
     for entry in silent:
-        console.print(f"[red]{entry['error']}[/]")
+        console.print(line((entry["error"], "red")))
     if not statuses and not silent:
         console.print("no service is running; start them with `prior-sg up`")
 
 
-def _topic_line(count: "TopicCount") -> str:
+def _topic_line(count: "TopicCount") -> list[Part]:
     """One topic's counts; what should not happen stands out."""
     parts = [
         (count.consumed, "in"),
@@ -266,8 +279,9 @@ def _topic_line(count: "TopicCount") -> str:
     ]
     texts = [f"{number} {word}" for number, word in parts if number]
     faults = [(count.malformed, "malformed"), (count.missed, "missed")]
-    texts += [f"[red]{number} {word}[/]" for number, word in faults if number]
-    return f"{count.topic} {', '.join(texts) or '-'}"
+    styled: list[Part] = [*texts, *((f"{number} {word}", "red") for number, word in faults if number)]
+    separated = [part for entry in styled for part in (", ", entry)]
+    return [f"{count.topic} ", *(separated[1:] or ["-"])]
 
 
 def cmd_bench(arguments: argparse.Namespace) -> int:

@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rich.box import SIMPLE
-from rich.console import Console
 from rich.table import Table
 
 from prior_sg.deploy.cli.shared import add_settings
 from prior_sg.deploy.evaluation.kinds import BASELINES, ORACLES, OURS, SWEEPS
 from prior_sg.deploy.settings import DEMO_TASK, Layers, settings_layers
+from prior_sg.deploy.terminal import Description, Terminal
 
 if TYPE_CHECKING:
     from prior_sg.deploy.evaluation.methods import Method
@@ -64,7 +64,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_settings(parser)
 
 
-def run(arguments: argparse.Namespace, console: Console) -> int:
+def run(arguments: argparse.Namespace, console: Terminal) -> int:
     """Evaluate, print, and write eval.json (and report.html) to the output folder. Raises EvaluationError."""
     from prior_sg.deploy.evaluation import runner
     from prior_sg.deploy.evaluation.perception import Cache, EvaluationError, Perceiver
@@ -75,7 +75,7 @@ def run(arguments: argparse.Namespace, console: Console) -> int:
     methods = chosen_methods(arguments, layers)
     datasets = chosen_datasets(arguments.datasets, arguments.environment, arguments.task)
     arguments.out.mkdir(parents=True, exist_ok=True)
-    with progress(Console(stderr=True)) as report:
+    with progress(Terminal(stderr=True)) as report:
         perceiver = Perceiver(layers, Cache(arguments.out / "cache"), report)
         results = runner.run(
             datasets, methods, perceiver.perceive, report, priors=arguments.priors, strength=arguments.strength
@@ -88,7 +88,7 @@ def run(arguments: argparse.Namespace, console: Console) -> int:
         print_tables(results, console)
     if arguments.html:
         _write_page(results, arguments)
-        Console(stderr=True).print(f"written to {arguments.out}: eval.json, report.html")
+        Terminal(stderr=True).print(f"written to {arguments.out}: eval.json, report.html")
     return 0
 
 
@@ -132,7 +132,7 @@ def chosen_datasets(paths: Sequence[Path], environments: Sequence[str], task: st
     return datasets
 
 
-def print_tables(results: "Results", console: Console) -> None:
+def print_tables(results: "Results", console: Terminal) -> None:
     """One table per dataset, then the mean over all; percent."""
     console.width = max(console.width, TABLE_COLUMNS)
     names = [dataset.name for dataset in results.sequences]
@@ -163,11 +163,11 @@ def _objects(results: "Results", method: str, sequence: str) -> str:
 
 
 @contextmanager
-def progress(console: Console) -> "Iterator[Report]":
+def progress(console: Terminal) -> "Iterator[Report]":
     """A line that says what is being done and how far it is."""
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeElapsedColumn
 
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    columns = (Description(), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     with Progress(*columns, console=console, transient=True) as bar:
         line = bar.add_task("", total=None)
         yield lambda what, done, total: bar.update(line, description=what, completed=done, total=total or None)

@@ -3,6 +3,8 @@
 from collections.abc import Mapping, Sequence
 from html import escape
 
+from prior_sg.schemas.names import shown
+
 Point = tuple[float, float]
 
 WIDTH_PX, HEIGHT_PX, LEFT_PX, RIGHT_PX, TOP_PX, BOTTOM_PX = 430, 280, 46, 12, 14, 42
@@ -63,7 +65,7 @@ def _polyline(points: Sequence[Point], color: str, style: str = "") -> str:
 
 
 def _text(x: float, y: float, text: str, anchor: str, color: str = "#4b525c") -> str:
-    return f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}" fill="{color}">{escape(text)}</text>'
+    return f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}" fill="{color}">{escape(shown(text))}</text>'
 
 
 def _x(x: float) -> float:

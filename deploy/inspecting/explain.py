@@ -5,10 +5,10 @@ from collections import defaultdict
 from pathlib import Path
 
 from rich.box import SIMPLE
-from rich.console import Console
 from rich.table import Table
 
 from prior_sg.deploy.inspecting import replay
+from prior_sg.deploy.terminal import Terminal
 from prior_sg.schemas.regions import PosteriorReply, PosteriorRequest
 from prior_sg.schemas.topics import POSTERIOR
 from prior_sg.services.runtime.record import LogError
@@ -28,7 +28,7 @@ def from_log(path: Path, robot: str, place_id: int) -> PosteriorReply:
         return reply
 
 
-def show(reply: PosteriorReply, console: Console) -> None:
+def show(reply: PosteriorReply, console: Terminal) -> None:
     """A sentence, the labels with what speaks for each, the experts, and the neighbours."""
     console.width = max(console.width, 100)  # lines that wrap are better than cells cut short
     seen = f"seen in {reply.frames} keyframes with trust {reply.trust:.1f}" if reply.frames else "never seen"

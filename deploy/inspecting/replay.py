@@ -15,6 +15,7 @@ from prior_sg.schemas.frames import Keyframe
 from prior_sg.schemas.migrations import journalled
 from prior_sg.schemas.status import Consumed, Started, Tick
 from prior_sg.schemas.topics import JOURNAL, KEYFRAME, QUERIES, TOPICS, Topic
+from prior_sg.services.refusals import InputRefused
 from prior_sg.services.registry import BY_NAME
 from prior_sg.services.runtime import config
 from prior_sg.services.runtime.record import LogError, Logged, read_log
@@ -136,7 +137,7 @@ def replay_life(log: Log, life: Life) -> Iterator[tuple[Topic, Message]]:
     """The outputs of one life, made again from its recorded inputs and config."""
     with revived(log, life) as runner:
         for entry in life.inputs:
-            yield from runner.feed(log.input(entry))
+            yield from _fed(runner, log.input(entry))
 
 
 def revived(log: Log, life: Life) -> Runner:
@@ -149,8 +150,16 @@ def final(log: Log, life: Life) -> Runner:
     """The service after the recorded inputs of one life; the caller closes it."""
     runner = revived(log, life)
     for entry in life.inputs:
-        runner.feed(log.input(entry))
+        _fed(runner, log.input(entry))
     return runner
+
+
+def _fed(runner: Runner, message: Message) -> list[tuple[Topic, Message]]:
+    """As a host steps: an input that was refused changed nothing."""
+    try:
+        return list(runner.feed(message))
+    except InputRefused:
+        return []
 
 
 def compare(log: Log, life: Life) -> Comparison:

@@ -9,14 +9,15 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TaskID, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TaskID, TimeElapsedColumn
 
+from prior_sg.deploy.edge import check_robot, check_task
 from prior_sg.deploy.errors import UserError
 from prior_sg.deploy.running.inprocess import InProcess
 from prior_sg.deploy.running.recorder import Recorder, Settling
 from prior_sg.deploy.running.supervisor import Supervisor
 from prior_sg.deploy.settings import DEFAULT_CONNECT, DEFAULT_ROBOT, check_settings
+from prior_sg.deploy.terminal import Description, Terminal
 from prior_sg.schemas.codec import DecodeError, Message, decode, encode
 from prior_sg.schemas.features import Pyramid
 from prior_sg.schemas.frames import IngestState, Keyframe
@@ -59,6 +60,11 @@ class Job:
     config: str = ""
     in_process: bool = False  # all services in this process on the local bus
     on_started: Callable[[str, dict[str, int]], None] = lambda endpoint, pids: None
+
+    def __post_init__(self) -> None:
+        """Raises UserError for names and texts that no service would take."""
+        check_robot(self.robot)
+        check_task(self.environment, self.task, self.regions)
 
 
 @dataclass
@@ -114,7 +120,7 @@ def make_folder(path: Path) -> None:
         raise RunError(f"cannot write to {path} ({error.strerror}); choose another folder with --out") from error
 
 
-def run(job: Job, console: Console) -> Result:
+def run(job: Job, console: Terminal) -> Result:
     """Run one source to its end. Raises RunError, BusError, ChildFailed; KeyboardInterrupt ends it early, cleanly."""
     make_folder(job.out)
     database = job.out / "scene.sqlite"
@@ -142,7 +148,7 @@ def run(job: Job, console: Console) -> Result:
         stop_router()
 
 
-def _run_on(bus: Bus, supervisor: "Supervisor | InProcess", job: Job, console: Console) -> Result:
+def _run_on(bus: Bus, supervisor: "Supervisor | InProcess", job: Job, console: Terminal) -> Result:
     started_s = time.monotonic()
     with BusClient(bus) as client:
         recorder = Recorder(client, job.out / "log.mcap")
@@ -159,7 +165,7 @@ class Run:
     def __init__(
         self,
         job: Job,
-        console: Console,
+        console: Terminal,
         client: BusClient,
         recorder: Recorder,
         supervisor: "Supervisor | InProcess",
@@ -259,10 +265,10 @@ def _description(counts: Counts, finished: bool) -> str:
     return ("settling: " if finished else "streaming: ") + encoded + regions
 
 
-def _progress(console: Console) -> Progress:
+def _progress(console: Terminal) -> Progress:
     return Progress(
         SpinnerColumn(),
-        TextColumn("{task.description}"),
+        Description(),
         BarColumn(),
         MofNCompleteColumn(),
         TimeElapsedColumn(),

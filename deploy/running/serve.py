@@ -12,7 +12,10 @@ import uuid
 from pathlib import Path
 
 from prior_sg import services
+from prior_sg.deploy.edge import check_arguments
+from prior_sg.deploy.errors import UserError
 from prior_sg.deploy.settings import DEFAULT_ROBOT, connect_in_force, resolved_config
+from prior_sg.deploy.terminal import complain
 from prior_sg.services.runtime import extras
 from prior_sg.services.runtime.bus import BusError
 from prior_sg.services.runtime.config import ConfigError
@@ -99,7 +102,13 @@ def main() -> int:
     """Entry point of `python -m prior_sg.deploy.running.serve`."""
     parser = argparse.ArgumentParser(description=__doc__)
     add_arguments(parser)
-    return run(parser.parse_args())
+    arguments = parser.parse_args()
+    try:
+        check_arguments(arguments)
+    except UserError as error:
+        complain(str(error))
+        return EXIT_HOPELESS
+    return run(arguments)
 
 
 if __name__ == "__main__":

@@ -13,12 +13,14 @@ import cv2
 import numpy as np
 
 from prior_sg.deploy.truth import voxel_owners
+from prior_sg.schemas.names import shown
 from prior_sg.schemas.objects import SceneObject
 from prior_sg.schemas.places import VoxelMap
 from prior_sg.schemas.scene import Scene
 
 Color = tuple[int, int, int]  # red, green, blue
 
+LONGEST_LINE = 300  # characters of a text that are looked at
 WIDTH_PX, MARGIN_PX, LEGEND_PX, TITLE_PX, FOOT_PX = 1600, 44, 330, 96, 64
 MAX_MAP_HEIGHT_PX, MIN_MAP_HEIGHT_PX = 1100, 420
 SUPERSAMPLING = 2
@@ -510,6 +512,7 @@ def _swatch(view: View, left: int, baseline: int, color: Color) -> None:
 
 def _fitted(text: str, size: int, width_px: int, bold: bool = False) -> str:
     """The text, shortened to a width in pixels of the result."""
+    text = shown(text)[:LONGEST_LINE].replace("\n", " ")
     while len(text) > 1 and _text_width(text, size * SUPERSAMPLING, bold) > width_px * SUPERSAMPLING:
         text = text.rstrip("…")[:-1] + "…"
     return text

@@ -8,6 +8,7 @@ from typing import Protocol
 import cv2
 import numpy as np
 
+from prior_sg.schemas.names import shown
 from prior_sg.schemas.priors import Prior
 
 Color = tuple[int, int, int]  # red, green, blue
@@ -87,7 +88,7 @@ class Svg:
         self._parts.append(
             f'<text x="{at[0]:.1f}" y="{at[1]:.1f}" font-size="{size:.0f}" fill="rgb{color}" '
             f'text-anchor="{placed}"{turn}{around}>'
-            f"{html.escape(text)}</text>"
+            f"{html.escape(shown(text))}</text>"
         )
 
     def save(self, path: Path) -> None:
@@ -113,7 +114,7 @@ class Png:
     def text(
         self, at: Point, text: str, size: float, color: Color, *, anchor: str = "start", halo: bool = False
     ) -> None:
-        scale, plain = 2 * size / 30, text.encode("ascii", "replace").decode()
+        scale, plain = 2 * size / 30, shown(text).encode("ascii", "replace").decode()
         (width, height), below = cv2.getTextSize(plain, cv2.FONT_HERSHEY_SIMPLEX, scale, 2)
         if anchor == "slant":
             self._slanted(_twice(at), plain, scale, (width, height + below), color)

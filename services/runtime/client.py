@@ -105,12 +105,15 @@ class BusClient:
             waiting(reply.reason)
         return found[0]
 
-    def alive(self, settle_s: float = 0.3) -> dict[str, str]:
-        """Instance to service of everything alive now."""
+    def alive(self, settle_s: float = 0.3, patience_s: float = 2.0) -> dict[str, str]:
+        """Instance to service of everything alive now; on a busy host the first to be seen may take `patience_s`."""
         if not self._watching:
             self._watching = True
             self.bus.watch(alive_key("*", "*"), self._saw)
+            end_s = time.monotonic() + patience_s
             time.sleep(settle_s)
+            while not self._alive and time.monotonic() < end_s:
+                time.sleep(settle_s)
         return dict(self._alive)
 
     def status(self, service: str, instance: str, timeout_s: float = 3.0) -> ServiceStatus:

@@ -3,7 +3,8 @@
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from types import UnionType
+from typing import Any, Literal, TypeVar, Union, get_args, get_origin
 
 import msgspec
 
@@ -22,8 +23,8 @@ def read_file(path: str | Path | None) -> dict[str, dict[str, Any]]:
     if not path:
         return {}
     try:
-        return tomllib.loads(Path(path).read_text())
-    except (OSError, tomllib.TOMLDecodeError) as error:
+        return tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise ConfigError(f"cannot read the configuration {path}: {error}") from error
 
 
@@ -118,7 +119,7 @@ def _checked(config_type: type, section: str, values: Mapping[str, Any]) -> dict
         if dot:
             inner.setdefault(field, {})[rest] = value
         else:
-            found[field] = _decoded(f"{section}.{field}", value)
+            found[field] = _decoded(f"{section}.{field}", value, fields[field])
     for field, rest_values in inner.items():
         found[field] = {**found.get(field, {}), **rest_values}
     for field, value in found.items():
@@ -131,8 +132,18 @@ def _is_group(kind: Any) -> bool:
     return isinstance(kind, type) and issubclass(kind, msgspec.Struct)
 
 
-def _decoded(name: str, value: Any) -> Any:
-    if not (isinstance(value, str) and value.startswith(("[", "{"))):
+def _takes_text(kind: Any) -> bool:
+    """Whether a field of this type can hold a text as it is."""
+    if get_origin(kind) in (Union, UnionType):
+        return any(map(_takes_text, get_args(kind)))
+    return kind is str or get_origin(kind) is Literal
+
+
+def _decoded(name: str, value: Any, kind: Any) -> Any:
+    """A text as the type of its field reads it: as JSON where that is a list or a group, else as it is."""
+    if isinstance(value, str) and ("\0" in value or any("\ud800" <= c <= "\udfff" for c in value)):
+        raise ConfigError(f"{name}: {value!a} is not valid text: give it in UTF-8")
+    if not (isinstance(value, str) and value.startswith(("[", "{"))) or _takes_text(kind):
         return value
     try:
         return msgspec.json.decode(value)

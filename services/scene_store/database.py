@@ -4,6 +4,7 @@ A process killed at any moment leaves the state before or after a delta, never b
 """
 
 import json
+import logging
 import sqlite3
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -14,12 +15,14 @@ import msgspec
 import numpy as np
 
 from prior_sg.schemas.codec import encode
+from prior_sg.schemas.names import fault_of_robot
 from prior_sg.schemas.objects import SceneObject
 from prior_sg.schemas.priors import Prior, Task
 from prior_sg.schemas.regions import Region
 from prior_sg.services.runtime.service import ServiceError
 from prior_sg.services.scene_store.core import graph as core
 
+log = logging.getLogger(__name__)
 APPLICATION_ID = 0x70736753  # "psgS", in the header of the file
 LAYOUT_VERSION = 5
 
@@ -156,7 +159,10 @@ class Database:
 
     def graphs(self) -> dict[str, core.Graph]:
         """Every robot's graph as of the last commit, by robot."""
-        return {name: self._graph(name, robot) for name, robot in sorted(self._robots.items())}
+        usable = {name: robot for name, robot in sorted(self._robots.items()) if not fault_of_robot(name)}
+        if odd := self._robots.keys() - usable.keys():
+            log.warning("robots whose names cannot be used are left out", extra={"robots": sorted(map(ascii, odd))})
+        return {name: self._graph(name, robot) for name, robot in usable.items()}
 
     def _graph(self, name: str, robot: int) -> core.Graph:
         graph = core.Graph(name)

@@ -32,7 +32,10 @@ import numpy as np
 
 from prior_sg.schemas.frames import Intrinsics
 from prior_sg.services.geometry import inverse, transform
+from prior_sg.services.ingest.core.lidar import depth_image
 from prior_sg.services.ingest.core.options import ReadOptions
+from prior_sg.services.ingest.core.pixels import encoded
+from prior_sg.services.ingest.core.poses import quaternion_of
 from prior_sg.services.ingest.sources import base
 from prior_sg.services.ingest.sources.base import (
     MILLIMETRE,
@@ -46,9 +49,6 @@ from prior_sg.services.ingest.sources.base import (
     numbered,
     truth_beside,
 )
-from prior_sg.services.ingest.sources.lidar import depth_image
-from prior_sg.services.ingest.sources.pixels import encoded
-from prior_sg.services.ingest.sources.poses import quaternion_of
 from prior_sg.services.ingest.sources.tables import stamps_ns, table, text_of
 
 NAME = "coda"

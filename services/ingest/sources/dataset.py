@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from prior_sg.services.ingest.core.options import ReadOptions
+from prior_sg.services.ingest.core.poses import Convention
 from prior_sg.services.ingest.core.selection import Correction
 from prior_sg.services.ingest.sources.base import (
     CAMERA,
@@ -30,7 +31,6 @@ from prior_sg.services.ingest.sources.base import (
     read_bytes,
     truth_beside,
 )
-from prior_sg.services.ingest.sources.poses import Convention
 from prior_sg.services.ingest.sources.tables import (
     check_stamps,
     csv_rows,

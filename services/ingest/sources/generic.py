@@ -22,7 +22,22 @@ from typing import Any
 import numpy as np
 
 from prior_sg.schemas.frames import Intrinsics
+from prior_sg.services.ingest.core.detection import (
+    CHOICES,
+    LEAST_SHARE,
+    OPTIONS,
+    USUAL_UNIT_M,
+    Verdict,
+    Written,
+    meaning_of,
+    moving_pairs,
+    plausible_units,
+    up_of,
+)
+from prior_sg.services.ingest.core.headers import ImageError
 from prior_sg.services.ingest.core.options import ReadOptions
+from prior_sg.services.ingest.core.pixels import NPY_MAGIC, stored
+from prior_sg.services.ingest.core.poses import Convention, PoseError, matrix_of, rigid
 from prior_sg.services.ingest.sources.base import (
     Camera,
     Entry,
@@ -36,22 +51,7 @@ from prior_sg.services.ingest.sources.base import (
     read_bytes,
     truth_beside,
 )
-from prior_sg.services.ingest.sources.detection import (
-    CHOICES,
-    LEAST_SHARE,
-    OPTIONS,
-    USUAL_UNIT_M,
-    Verdict,
-    Written,
-    meaning_of,
-    moving_pairs,
-    plausible_units,
-    up_of,
-)
-from prior_sg.services.ingest.sources.images import ImageError
 from prior_sg.services.ingest.sources.normalise import scaled
-from prior_sg.services.ingest.sources.pixels import NPY_MAGIC, stored
-from prior_sg.services.ingest.sources.poses import Convention, PoseError, matrix_of, rigid
 from prior_sg.services.ingest.sources.tables import read_json, stamps_ns, text_of
 
 NAME = "generic"

@@ -18,6 +18,7 @@ from pathlib import Path
 
 from prior_sg.schemas.frames import Intrinsics
 from prior_sg.services.ingest.core.options import ReadOptions
+from prior_sg.services.ingest.core.poses import Convention
 from prior_sg.services.ingest.sources.base import (
     MILLIMETRE,
     Camera,
@@ -29,7 +30,6 @@ from prior_sg.services.ingest.sources.base import (
     numbered,
     truth_beside,
 )
-from prior_sg.services.ingest.sources.poses import Convention
 
 NAME = "hm3d"
 COLORS, DEPTHS, POSES = "rgb", "depth", "pose"

@@ -20,6 +20,7 @@ import numpy as np
 
 from prior_sg.schemas.frames import Intrinsics
 from prior_sg.services.ingest.core.options import ReadOptions
+from prior_sg.services.ingest.core.poses import quaternion_of
 from prior_sg.services.ingest.sources.base import (
     Camera,
     Entry,
@@ -30,7 +31,6 @@ from prior_sg.services.ingest.sources.base import (
     read_bytes,
     truth_beside,
 )
-from prior_sg.services.ingest.sources.poses import quaternion_of
 from prior_sg.services.ingest.sources.tables import table
 
 NAME = "icl-nuim"

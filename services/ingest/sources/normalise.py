@@ -11,7 +11,10 @@ import msgspec
 import numpy as np
 
 from prior_sg.schemas.frames import Intrinsics
+from prior_sg.services.ingest.core.headers import JPEG_MAGIC, ImageError, is_sized, trimmed
 from prior_sg.services.ingest.core.options import ORIGIN_AUTO, ReadOptions, check_lens, offset_of
+from prior_sg.services.ingest.core.pixels import encoded, measured, millimetres, stored
+from prior_sg.services.ingest.core.poses import EXACT, PoseError, rigid, stretch
 from prior_sg.services.ingest.core.selection import BadFrame, RawFrame
 from prior_sg.services.ingest.sources.base import (
     MILLIMETRE,
@@ -26,9 +29,6 @@ from prior_sg.services.ingest.sources.base import (
     depth_pixels,
     levelling,
 )
-from prior_sg.services.ingest.sources.images import JPEG_MAGIC, ImageError, is_sized, trimmed
-from prior_sg.services.ingest.sources.pixels import encoded, measured, millimetres, stored
-from prior_sg.services.ingest.sources.poses import EXACT, PoseError, rigid, stretch
 from prior_sg.services.ingest.sources.tables import FEW, SourceError
 
 UNUSABLE = (FrameError, PoseError, ImageError)

@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from prior_sg.services.ingest.core.options import ReadOptions
+from prior_sg.services.ingest.core.poses import Convention
 from prior_sg.services.ingest.sources.base import (
     Entry,
     Found,
@@ -26,7 +27,6 @@ from prior_sg.services.ingest.sources.base import (
     numbered,
     truth_beside,
 )
-from prior_sg.services.ingest.sources.poses import Convention
 from prior_sg.services.ingest.sources.tables import read_json, table
 
 NAME = "replica"

@@ -21,6 +21,8 @@ import numpy as np
 
 from prior_sg.schemas.frames import Intrinsics
 from prior_sg.services.ingest.core.options import ReadOptions
+from prior_sg.services.ingest.core.pixels import encoded
+from prior_sg.services.ingest.core.poses import Convention
 from prior_sg.services.ingest.sources.base import (
     MILLIMETRE,
     Camera,
@@ -35,8 +37,6 @@ from prior_sg.services.ingest.sources.base import (
     numbered,
     truth_beside,
 )
-from prior_sg.services.ingest.sources.pixels import encoded
-from prior_sg.services.ingest.sources.poses import Convention
 from prior_sg.services.ingest.sources.tables import text_of
 
 NAME = "scannet"

@@ -12,7 +12,9 @@ from pathlib import Path
 import numpy as np
 
 from prior_sg.schemas.frames import Intrinsics
+from prior_sg.services.ingest.core.headers import ImageError, image_size
 from prior_sg.services.ingest.core.options import ReadOptions
+from prior_sg.services.ingest.core.poses import Convention
 from prior_sg.services.ingest.sources.base import (
     MILLIMETRE,
     Camera,
@@ -24,8 +26,6 @@ from prior_sg.services.ingest.sources.base import (
     read_bytes,
     truth_beside,
 )
-from prior_sg.services.ingest.sources.images import ImageError, image_size
-from prior_sg.services.ingest.sources.poses import Convention
 from prior_sg.services.ingest.sources.tables import text_of
 
 NAME = "7-scenes"

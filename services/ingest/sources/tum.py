@@ -23,6 +23,7 @@ import numpy as np
 
 from prior_sg.schemas.frames import Intrinsics
 from prior_sg.services.ingest.core.options import ReadOptions
+from prior_sg.services.ingest.core.poses import Convention
 from prior_sg.services.ingest.sources.base import (
     CAMERA,
     Camera,
@@ -35,7 +36,6 @@ from prior_sg.services.ingest.sources.base import (
     read_bytes,
     truth_beside,
 )
-from prior_sg.services.ingest.sources.poses import Convention
 from prior_sg.services.ingest.sources.tables import FEW, lines_of, named, read_json, stamps_ns, table
 
 NAME = "tum"

@@ -2,16 +2,15 @@
 
 import math
 from collections.abc import Sequence
-from typing import Any, TypeVar
+from typing import Any
 
 import msgspec
 
-from prior_sg.schemas.priors import LONGEST_NAME, LONGEST_PHRASE
+from prior_sg.schemas.names import LONGEST_NAME, fault_of_name, fault_of_text
+from prior_sg.schemas.priors import LONGEST_PHRASE
 
 MOST_LISTED = 16  # objects or phrases of one region
 LARGEST_CM, HIGHEST_CM = 10_000, 2_000  # sides of an object, and its lower edge above the floor
-
-A = TypeVar("A")
 
 
 class Described(msgspec.Struct):
@@ -52,25 +51,6 @@ class NamedList(msgspec.Struct):
     regions: list[Named]
 
 
-def parse(text: str, kind: type[A]) -> tuple[A | None, list[str]]:
-    """The JSON object in an answer, decoded and typed, or the one fault that prevents it. Thoughts before and a code
-    fence around it are ignored; text in its place is no answer."""
-    start, end = text.find("{"), text.rfind("}")
-    if "</think>" in text:
-        start = text.find("{", text.rfind("</think>"))
-    if start < 0:
-        said = " ".join(text.split())[:120]
-        return None, [f"there is no JSON object in it, but: {said!r}" if said else "it is empty"]
-    if end < start:
-        return None, ["the JSON object is cut off; answer more briefly"]
-    try:
-        return msgspec.json.decode(text[start : end + 1], type=kind), []
-    except msgspec.ValidationError as error:
-        return None, [f"it does not have the form asked for: {error}"]
-    except msgspec.DecodeError as error:
-        return None, [f"it is not valid JSON: {error}"]
-
-
 def unknown(found: dict[str, Any], known: Sequence[str]) -> list[str]:
     """Names found that are none of those known."""
     return [name for name in found if name not in known]
@@ -89,7 +69,10 @@ def faults_of_names(kind: str, names: Sequence[str]) -> list[str]:
         for name in names
         if not any(c.isalnum() for c in name)
     ]
-    return faults + [f"the name {name[:LONGEST_NAME]!r}... is too long" for name in names if len(name) > LONGEST_NAME]
+    faults += [f"the name {name[:LONGEST_NAME]!r}... is too long" for name in names if len(name) > LONGEST_NAME]
+    return faults + list(
+        filter(None, (fault_of_name(f"the {kind} name", name[:LONGEST_NAME]) for name in names if name))
+    )
 
 
 def faults_of_places(found: dict[str, Placed]) -> list[str]:
@@ -120,11 +103,7 @@ def faults_of_description(name: str, entry: Described) -> list[str]:
         faults.append(f"{name!r}: there is no phrase")
     if not 1 <= len(entry.objects) <= MOST_LISTED or len(entry.phrases) > MOST_LISTED:
         faults.append(f"{name!r}: give 1 to {MOST_LISTED} objects and as many phrases at most")
-    faults += [
-        f"{name!r}: a phrase is longer than {LONGEST_PHRASE} characters"
-        for p in entry.phrases
-        if len(p) > LONGEST_PHRASE
-    ]
+    faults += filter(None, (fault_of_text(f"{name!r}: the phrase", phrase, LONGEST_PHRASE) for phrase in entry.phrases))
     if not (0 <= entry.inclination_deg <= 90 and 0 < entry.inclination_spread_deg <= 90):
         faults.append(f"{name!r}: inclination must be 0 to 90 degrees, its spread above 0")
     if not 10 <= entry.scale_cm <= 10000:

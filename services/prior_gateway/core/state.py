@@ -5,7 +5,16 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from prior_sg.schemas.codec import copied
-from prior_sg.schemas.priors import Prior, PriorEvidence, PriorList, PriorRequest, PriorRevision, Recalled, Task
+from prior_sg.schemas.priors import (
+    Prior,
+    PriorEvidence,
+    PriorList,
+    PriorRequest,
+    PriorRevision,
+    Recalled,
+    Task,
+    fault_of_task,
+)
 from prior_sg.services.prior_gateway.core import compose, turns
 from prior_sg.services.prior_gateway.core.claims import Claims
 from prior_sg.services.prior_gateway.core.config import Config
@@ -56,7 +65,7 @@ class State:
 
 def task_of(environment: str, task: str, regions: tuple[str, ...] | list[str]) -> Task:
     """The task that asks this, of no robot."""
-    return Task(robot="", stamp_ns=0, environment=environment, task=task, regions=list(regions))
+    return Task(robot="library", stamp_ns=0, environment=environment, task=task, regions=list(regions))
 
 
 def asked_for(of: Task | PriorRevision) -> Asked:
@@ -75,6 +84,8 @@ def known_prior(state: State, request: PriorRequest, cfg: Config) -> PriorList:
         if prior := state.priors.get(request.digest):
             return PriorList(priors=[prior])
         return PriorList(priors=[], reason=f"No prior with the digest {request.digest} is known here.")
+    if fault := fault_of_task(request.environment, request.task, request.regions):
+        return PriorList(priors=[], reason=f"The task is refused: {fault}.")
     asked = (request.environment, request.task, tuple(request.regions))
     under_way = any(asked_for(making.task) == asked for making in state.making.values())
     if reason := state.refused.get(asked):

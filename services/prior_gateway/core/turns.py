@@ -15,7 +15,9 @@ from typing import Any, TypeVar
 import msgspec
 import numpy as np
 
+from prior_sg.schemas.names import normal
 from prior_sg.schemas.priors import MOST_REGIONS, Prior, Task
+from prior_sg.services.prior_gateway.core.answers import CUT_OFF, parse
 from prior_sg.services.prior_gateway.core.faults import (
     LARGEST_CM,
     Described,
@@ -29,7 +31,6 @@ from prior_sg.services.prior_gateway.core.faults import (
     faults_of_places,
     faults_of_size,
     faults_of_spans,
-    parse,
     unknown,
 )
 
@@ -51,6 +52,8 @@ LONGEST_ECHO = 8000  # characters of a faulty answer that go back to the model
 ASYMMETRY = 15.0  # percent by which two statements about one pair may differ; their mean counts
 OBJECTS_PER_REGION = 8  # asked for
 LEAST, MOST = 0.01, 0.99  # no estimate of a model is certain
+
+RAISE = "raise prior_gateway.synthesis.max_tokens"
 
 Schema = dict[str, Any]
 A = TypeVar("A")
@@ -161,7 +164,8 @@ class Talk:
             told = "\n".join(f"- {fault}" for fault in faults[:MOST_FAULTS])
             messages += [("assistant", text[:LONGEST_ECHO] or "-"), ("user", self.prompts("faults", faults=told))]
         times = f"{self.cfg.repairs} repair{'s' if self.cfg.repairs != 1 else ''}"
-        raise Unusable(f"its answer about {name.replace('_', ' ')} was still faulty after {times}: {faults[0]}")
+        why = f"it is cut off at {self.cfg.max_tokens} tokens, {RAISE}" if faults[0] == CUT_OFF else faults[0]
+        raise Unusable(f"its answer about {name.replace('_', ' ')} was still faulty after {times}: {why}")
 
 
 def synthesise(task: Task, prompts: Prompts, cfg: SynthesisConfig) -> Dialogue[Draft]:
@@ -189,7 +193,7 @@ def synthesise(task: Task, prompts: Prompts, cfg: SynthesisConfig) -> Dialogue[D
     one_by_one = [described[region] for region in regions]
     return Draft(
         regions=regions,
-        parents=[placed[region].parent.strip() for region in regions],
+        parents=[normal(placed[region].parent) for region in regions],
         existence=shares / shares.sum(),
         phrases=[entry.phrases for entry in one_by_one],
         inclination_deg=np.array([(entry.inclination_deg, entry.inclination_spread_deg) for entry in one_by_one]),
@@ -212,11 +216,12 @@ def choose_regions(talk: Talk) -> Dialogue[tuple[list[str], dict[str, Placed]]]:
     schema = _object({"regions": {"type": "array", "items": item, "minItems": 3, "maxItems": talk.cfg.most_regions}})
 
     def read(text: str) -> tuple[dict[str, Placed], list[str]]:
-        answer, faults = parse(text, NamedList)
+        answer, faults = parse(text, NamedList, ["regions"])
         if answer is None:
             return {}, faults
         for region in answer.regions:
-            region.name = " ".join(region.name.split()).casefold()
+            region.name = normal(region.name.lower())
+            region.parent = normal(region.parent)
         names = [region.name for region in answer.regions]
         found: dict[str, Placed] = {region.name: region for region in answer.regions}
         faults = [f"the region {name!r} is named more than once" for name in sorted({*names}) if names.count(name) > 1]
@@ -233,7 +238,7 @@ def place_regions(talk: Talk, regions: list[str]) -> Dialogue[dict[str, Placed]]
     schema = _object(dict.fromkeys(regions, _object({"parent": TEXT, "share": talk.cfg.percent})))
 
     def read(text: str) -> tuple[dict[str, Placed], list[str]]:
-        found, faults = parse(text, dict[str, Placed])
+        found, faults = parse(text, dict[str, Placed], regions)
         if found is None:
             return {}, faults
         return found, faults_of_keys("region", found, regions) or faults_of_places(found)
@@ -254,14 +259,14 @@ def describe(talk: Talk, batch: list[str]) -> Dialogue[dict[str, Described]]:
     )
 
     def read(text: str) -> tuple[dict[str, Described], list[str]]:
-        found, faults = parse(text, dict[str, Described])
+        found, faults = parse(text, dict[str, Described], batch)
         if found is None:
             return {}, faults
         if faults := faults_of_keys("region", found, batch):
             return {}, faults
         for entry in found.values():
             entry.phrases = _tidy(entry.phrases)
-            entry.objects = _tidy(name.casefold() for name in entry.objects)
+            entry.objects = _tidy(name.lower() for name in entry.objects)
         return found, [fault for name, entry in found.items() for fault in faults_of_description(name, entry)]
 
     return (yield from talk.ask("describe", _object(dict.fromkeys(batch, form)), read, batch=", ".join(batch)))
@@ -273,7 +278,7 @@ def sizes(talk: Talk, batch: list[str]) -> Dialogue[dict[str, Sized]]:
     form = _object({"longest_cm": side, "shortest_cm": side, "height_cm": side, "bottom_cm": lower})
 
     def read(text: str) -> tuple[dict[str, Sized], list[str]]:
-        found, faults = parse(text, dict[str, Sized])
+        found, faults = parse(text, dict[str, Sized], batch)
         if found is None:
             return {}, faults
         faults = faults_of_keys("object", found, batch)
@@ -303,7 +308,7 @@ def adjacency(talk: Talk, regions: list[str]) -> Dialogue[np.ndarray]:
     schema = _object({region: _object(dict.fromkeys(others, talk.cfg.percent)) for region, others in form.items()})
 
     def read(text: str) -> tuple[np.ndarray, list[str]]:
-        found, faults = parse(text, dict[str, dict[str, float]])
+        found, faults = parse(text, dict[str, dict[str, float]], regions, regions)
         return (np.eye(len(regions)), faults) if found is None else read_adjacency(found, regions)
 
     if len(regions) == 1:
@@ -315,7 +320,8 @@ def read_matrix(
     text: str, form: dict[str, list[str]], kinds: tuple[str, str]
 ) -> tuple[dict[str, dict[str, float]], list[str]]:
     """A matrix of percentages in the form {row: {column: percent}}, with everything that is wrong about it."""
-    found, faults = parse(text, dict[str, dict[str, float]])
+    columns_asked = [*dict.fromkeys(name for columns in form.values() for name in columns)]
+    found, faults = parse(text, dict[str, dict[str, float]], list(form), columns_asked)
     if found is None:
         return {}, faults
     faults = faults_of_keys(kinds[0], found, list(form))
@@ -357,9 +363,10 @@ def revise(prior: Prior, told: str, form: dict[str, dict[str, dict[str, tuple[fl
     )
     talk.fields |= {"environment": prior.environment, "task": prior.task}
     talk.fields["regions"] = ", ".join(region.name for region in prior.regions)
+    names = [*(region.name for region in prior.regions), *(item.name for item in prior.objects)]
 
     def read(text: str) -> tuple[dict[str, dict[str, dict[str, float]]], list[str]]:
-        found, faults = parse(text, dict[str, dict[str, dict[str, float]]])
+        found, faults = parse(text, dict[str, dict[str, dict[str, float]]], list(form), names, names)
         if found is None:
             return {}, faults
         faults = faults_of_keys("matrix", found, list(form))
@@ -393,4 +400,4 @@ def _probability(percent: Any) -> np.ndarray:
 
 def _tidy(texts: Iterable[str]) -> list[str]:
     """Each text once, with single spaces; one without letter or digit says nothing and is left out."""
-    return [text for text in dict.fromkeys(" ".join(text.split()) for text in texts) if any(c.isalnum() for c in text)]
+    return [text for text in dict.fromkeys(map(normal, texts)) if any(c.isalnum() for c in text)]

@@ -25,6 +25,7 @@ from prior_sg.schemas.priors import (
     Recall,
     Recalled,
     Task,
+    fault_of_task,
 )
 from prior_sg.schemas.status import Tick
 from prior_sg.services.prior_gateway.core import compose, ensemble, learning, turns
@@ -42,6 +43,7 @@ from prior_sg.services.prior_gateway.core.state import (
     remember,
     task_of,
 )
+from prior_sg.services.refusals import InputRefused
 
 TICK_S = 0.5  # between two ticks
 
@@ -49,11 +51,15 @@ Told = Prior | PriorClaim | Keep | ModelRequest | Recall  # to the fleet, or for
 
 
 def update(state: State, message: Message, cfg: Config) -> Iterator[Told]:
-    """One input. The same task gives the same prior again, for robots that come late."""
+    """One input. The same task gives the same prior again, for robots that come late. Raises InputRefused."""
     match message:
         case Task():
+            if fault := message.fault():
+                raise InputRefused(fault)
             yield from _begin(state, Making(message, compose.question_of(message, cfg, state.prompts.version)))
         case PriorRevision():
+            if fault := fault_of_task(message.environment, message.task, message.regions):
+                raise InputRefused(fault)
             yield from _begin_revision(state, message)
         case Recalled():
             yield from _recalled(state, message, cfg)

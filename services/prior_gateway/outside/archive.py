@@ -4,6 +4,7 @@ import asyncio
 import hashlib
 import logging
 import os
+import re
 import time
 from collections.abc import Awaitable, Callable, Iterator
 from pathlib import Path
@@ -36,6 +37,13 @@ def task_digest(environment: str, task: str, regions: list[str]) -> str:
     return hashlib.blake2b(msgspec.msgpack.encode((environment, task, regions)), digest_size=12).hexdigest()
 
 
+def file_name(question: str) -> str:
+    """Name of the file that answers a question; whatever a question holds, it is a plain one, and never `PREFERRED`."""
+    if re.fullmatch(r"[0-9a-f]{32}", question):
+        return question
+    return hashlib.blake2b(question.encode(), digest_size=16).hexdigest()
+
+
 class PriorShelf:
     """The archive's folder. Without a path nothing is kept or found; damaged files are told in the log and skipped."""
 
@@ -65,7 +73,7 @@ class PriorShelf:
         """Everything known of a task."""
         folder = self.folder(request.environment, request.task, request.regions)
         entries = {path.stem: entry for path, entry in self._entries(folder)}
-        exact, preferred = entries.pop(request.question, None), entries.pop(PREFERRED, None)
+        exact, preferred = entries.pop(file_name(request.question), None), entries.pop(PREFERRED, None)
         newest = max(entries.values(), key=lambda entry: entry.stamp_ns, default=None)
         return Recalled(
             question=request.question,
@@ -147,7 +155,7 @@ def open_keep(cfg: Config, identity: Identity) -> Callable[[Keep], Awaitable[Kep
         if cfg.require_signature and not (trusted or request.own):
             log.warning("a prior from elsewhere is not trusted: left out", extra={"why": verdict})
             return Kept(question=request.question, verdict=verdict)
-        shelf.put(prior, PREFERRED if request.preferred else request.question, request.root, verdict)
+        shelf.put(prior, PREFERRED if request.preferred else file_name(request.question), request.root, verdict)
         return Kept(prior=prior, question=request.question, verdict=verdict)
 
     async def keep(request: Keep) -> Kept:

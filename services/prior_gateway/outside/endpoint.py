@@ -1,140 +1,62 @@
 """Language models over HTTP: one turn in, its text or the reason for none out.
 
-Two dialects behind one small interface: any OpenAI-compatible chat endpoint (structured output by response_format) and
-Anthropic's Messages API (structured output by a forced tool). Around them time-outs, retries with back-off and jitter,
-a pace, a budget and a circuit breaker. The key is read from the environment or a file, sent in a header, and taken out
-of whatever the server says.
+Around the dialects time-outs, retries with back-off and jitter, a pace, a budget and a circuit breaker. The key is read
+from the environment or a file, sent in a header to the configured host alone, and taken out of what the server says.
 """
 
 import asyncio
 import email.utils
+import ipaddress
 import logging
 import os
 import random
 import re
 import time
 from collections.abc import Awaitable, Callable
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 from urllib.parse import urlsplit
 
 import httpx
-import msgspec
 
 from prior_sg.schemas.priors import ModelReply, ModelRequest
-from prior_sg.services.prior_gateway.core.config import DEFAULT_ENDPOINTS, Config
+from prior_sg.services.prior_gateway.core.config import Config
+from prior_sg.services.prior_gateway.outside.dialects import (
+    DIALECTS,
+    RETRIED,
+    Dialect,
+    Failed,
+    Said,
+    excerpt,
+    read_said,
+)
 from prior_sg.services.runtime.service import Identity, ServiceError
 
 log = logging.getLogger(__name__)
-RETRIED = frozenset({408, 409, 425, 429, 500, 502, 503, 504, 529})
-LOOPBACK = ("localhost", "127.0.0.1", "::1")
-VERSION_HEADER = {"anthropic-version": "2023-06-01"}
-EXCERPT = 200  # characters of a server's error that are told
+NEAR = (".local", ".lan", ".internal", ".home.arpa")  # ends of names that no public network has
+MOST_REDIRECTS = 3
 
 
-class Failed(Exception):
-    """One attempt failed; `wait_s` is what the server asks for."""
-
-    def __init__(self, kind: str, reason: str, again: bool, wait_s: float = 0.0) -> None:
-        super().__init__(reason)
-        self.kind, self.again, self.wait_s = kind, again, wait_s
+def is_here(host: str) -> bool:
+    """Whether a host is this machine."""
+    address = _address(host)
+    return host == "localhost" or host.endswith(".localhost") or (address is not None and address.is_loopback)
 
 
-@dataclass(frozen=True)
-class Said:
-    """What a server's answer holds."""
-
-    text: str
-    tokens_in: int = 0
-    tokens_out: int = 0
-
-
-class Dialect(Protocol):
-    """How one kind of endpoint is spoken to."""
-
-    path: str
-
-    def headers(self, key: str) -> dict[str, str]:
-        """Headers with the key, if there is one."""
-
-    def body(self, request: ModelRequest) -> dict[str, Any]:
-        """The request as JSON."""
-
-    def said(self, answer: Any) -> Said:
-        """The text of an answer. Raises KeyError, IndexError or TypeError when it has another form."""
+def is_near(host: str) -> bool:
+    """Whether a host is this machine or one of this network, which no proxy has to be asked for."""
+    address = _address(host)
+    if address is not None:
+        return address.is_private or address.is_link_local
+    return is_here(host) or "." not in host or host.endswith(NEAR)
 
 
-@dataclass(frozen=True)
-class OpenAi:
-    """Chat completions as OpenAI, vLLM, Ollama, llama.cpp and many others serve them."""
-
-    cfg: Config
-    path: str = "/chat/completions"
-
-    def headers(self, key: str) -> dict[str, str]:
-        return {"authorization": f"Bearer {key}"} if key else {}
-
-    def body(self, request: ModelRequest) -> dict[str, Any]:
-        limit = "max_completion_tokens" if self.cfg.base_url == DEFAULT_ENDPOINTS["openai"] else "max_tokens"
-        body: dict[str, Any] = {
-            "model": self.cfg.model,
-            "messages": [{"role": role, "content": text} for role, text in request.messages],
-            limit: request.max_tokens,
-        }
-        if self.cfg.temperature is not None:
-            body["temperature"] = self.cfg.temperature
-        if request.schema and self.cfg.structured != "none":
-            schema = msgspec.json.decode(request.schema)
-            named = {"name": request.schema_name, "strict": True, "schema": schema}
-            body["response_format"] = (
-                {"type": "json_schema", "json_schema": named}
-                if self.cfg.structured == "json_schema"
-                else {"type": "json_object", "schema": schema}
-            )
-        return body
-
-    def said(self, answer: Any) -> Said:
-        message, usage = answer["choices"][0]["message"], answer.get("usage") or {}
-        text = message.get("content") or message.get("refusal") or ""
-        return Said(str(text), int(usage.get("prompt_tokens") or 0), int(usage.get("completion_tokens") or 0))
-
-
-@dataclass(frozen=True)
-class Anthropic:
-    """The Messages API."""
-
-    cfg: Config
-    path: str = "/v1/messages"
-
-    def headers(self, key: str) -> dict[str, str]:
-        return VERSION_HEADER | ({"x-api-key": key} if key else {})
-
-    def body(self, request: ModelRequest) -> dict[str, Any]:
-        body: dict[str, Any] = {
-            "model": self.cfg.model,
-            "max_tokens": request.max_tokens,
-            "system": "\n\n".join(text for role, text in request.messages if role == "system"),
-            "messages": [{"role": role, "content": text} for role, text in request.messages if role != "system"],
-        }
-        if self.cfg.temperature is not None:
-            body["temperature"] = self.cfg.temperature
-        if request.schema and self.cfg.structured != "none":
-            schema = msgspec.json.decode(request.schema)
-            body["tools"] = [{"name": request.schema_name, "description": "Give the answer.", "input_schema": schema}]
-            body["tool_choice"] = {"type": "tool", "name": request.schema_name}
-        return body
-
-    def said(self, answer: Any) -> Said:
-        blocks, usage = answer["content"], answer.get("usage") or {}
-        tools = [msgspec.json.encode(block["input"]).decode() for block in blocks if block["type"] == "tool_use"]
-        texts = [block["text"] for block in blocks if block["type"] == "text"]
-        text = tools[0] if tools else "\n".join(texts)
-        return Said(text, int(usage.get("input_tokens") or 0), int(usage.get("output_tokens") or 0))
-
-
-DIALECTS: dict[str, type] = {"openai": OpenAi, "anthropic": Anthropic}
+def _address(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
+    try:
+        return ipaddress.ip_address(host.split("%", maxsplit=1)[0])
+    except ValueError:
+        return None
 
 
 class Endpoint:
@@ -225,29 +147,43 @@ class Endpoint:
                 status, headers, content = await self._post(request)
         except (TimeoutError, httpx.TimeoutException) as error:
             raise Failed("timeout", f"no complete answer within {timeout_s:g} s", again=True) from error
-        except httpx.TransportError as error:
+        except (httpx.HTTPError, httpx.InvalidURL, httpx.StreamError, OSError, ValueError) as error:
             reason = self._clean(f"{urlsplit(self.cfg.base_url).netloc} cannot be reached ({type(error).__name__})")
-            raise Failed("unreachable", reason, again=True) from error
+            raise Failed("unreachable", reason, again=isinstance(error, httpx.TransportError)) from error
         if status != 200:
             raise self._refused(status, headers, content)
         try:
-            return self._dialect.said(msgspec.json.decode(content))
-        except (msgspec.DecodeError, KeyError, IndexError, TypeError, AttributeError, ValueError) as error:
-            raise Failed("garbled", "the server's answer is cut off or of another form", again=True) from error
+            return read_said(self._dialect, content, request.max_tokens)
+        except Failed as error:
+            raise Failed(error.kind, self._clean(str(error)), error.again) from error
 
     async def _post(self, request: ModelRequest) -> tuple[int, httpx.Headers, bytes]:
-        """Status, headers and at most the allowed number of bytes of the answer."""
+        """Status, headers and at most the allowed number of bytes of the answer. A redirect is followed where it leads
+        to the same scheme, host and port only: nobody else is sent the key or the question."""
+        url = httpx.URL(self.cfg.base_url.rstrip("/") + self._dialect.path)
+        async with self._client(url) as client:
+            for _ in range(MOST_REDIRECTS + 1):
+                status, headers, content = await self._post_to(client, url, request)
+                if status not in (307, 308):
+                    break
+                further = url.join(headers.get("location", ""))
+                if (further.scheme, further.host, further.port) != (url.scheme, url.host, url.port):
+                    break
+                url = further
+        return status, headers, content
+
+    def _client(self, url: httpx.URL) -> httpx.AsyncClient:
+        """Variables that name a proxy count for far hosts only; the ones for certificates always do."""
         timeout = httpx.Timeout(self._calls.timeout_s, connect=self._calls.connect_s)
+        transport = httpx.AsyncHTTPTransport() if is_near(url.host) else None
+        return httpx.AsyncClient(timeout=timeout, transport=transport, follow_redirects=False)
+
+    async def _post_to(
+        self, client: httpx.AsyncClient, url: httpx.URL, request: ModelRequest
+    ) -> tuple[int, httpx.Headers, bytes]:
         most = self._calls.most_answer_bytes
-        async with (
-            httpx.AsyncClient(timeout=timeout) as client,
-            client.stream(
-                "POST",
-                self.cfg.base_url.rstrip("/") + self._dialect.path,
-                headers=self._dialect.headers(self._key),
-                json=self._dialect.body(request),
-            ) as response,
-        ):
+        headers, body = self._dialect.headers(self._key), self._dialect.body(request)
+        async with client.stream("POST", url, headers=headers, json=body) as response:
             content = b""
             async for piece in response.aiter_bytes():
                 content += piece
@@ -256,8 +192,11 @@ class Endpoint:
             return response.status_code, response.headers, content
 
     def _refused(self, status: int, headers: httpx.Headers, content: bytes) -> Failed:
-        said = self._clean(" ".join(content.decode(errors="replace").split()))[:EXCERPT]
+        said = excerpt(self._clean(content.decode(errors="replace")))
         reason = f"the server answered {status}" + (f": {said}" if said else "")
+        if 300 <= status < 400:
+            where = excerpt(self._clean(headers.get("location", "")))
+            reason = f"the server answered {status} and sends to {where!r}; set prior_gateway.endpoint to where it is"
         wait_s = retry_after_s(headers.get("retry-after", ""), datetime.now(UTC))
         if wait_s > self._calls.most_backoff_s:
             return Failed("busy", f"the server asks to wait {wait_s:.0f} s ({status})", again=False)
@@ -297,7 +236,7 @@ def read_key(cfg: Config) -> str:
     if not key.isascii() or any(c.isspace() for c in key):
         raise ServiceError(f"{where} holds something that is no key: it must be one word of ASCII characters")
     parts = urlsplit(cfg.base_url)
-    if parts.scheme != "https" and parts.hostname not in LOOPBACK:
+    if parts.scheme != "https" and not is_here(parts.hostname or ""):
         raise ServiceError("prior_gateway.endpoint: a key is sent over https only, or to this machine")
     return key
 

@@ -20,6 +20,7 @@ import psutil
 from prior_sg.schemas.codec import DecodeError, Message, decode, encode, versions
 from prior_sg.schemas.status import Consumed, JobDone, ServiceStatus, Started, StatusRequest, Tick, TopicCount
 from prior_sg.schemas.topics import JOURNAL, Query, Topic, alive_key, status_key, worker_keys
+from prior_sg.services.refusals import InputRefused
 from prior_sg.services.runtime.bus import Bus, Request, Sample
 from prior_sg.services.runtime.host.asks import Asks, Reply
 from prior_sg.services.runtime.host.flow import Progress
@@ -181,7 +182,7 @@ class Host:
             return
         counts = self.inbox.of(sample.topic.name)
         counts.last_age_ms = (time.time_ns() - sample.sent_ns) / 1e6 if sample.sent_ns else -1.0
-        self._step(message)
+        self._take(message, sample.topic.name, sample.key, sample.writer)
         counts.consumed += 1
         known = bool(sample.writer)
         self._outbox.journal(
@@ -200,7 +201,7 @@ class Host:
             self._asks.ask_later(reply.ask)
             return
         self._asks.answered(reply.ask)
-        self._step(message)
+        self._take(message, query.name, query.key, "")
         self._outbox.journal(query.name, inline=reply.payload)
 
     def _handle_question(self, question: Question) -> None:
@@ -267,6 +268,14 @@ class Host:
                 extra={"topic": name, "key": key, "writer": writer, "why": str(error)[:200]},
             )
             return None
+
+    def _take(self, message: Message, name: str, key: str, writer: str) -> None:
+        """Step with an input from outside: an absurd one is counted and logged, and the service goes on."""
+        try:
+            self._step(message)
+        except InputRefused as error:
+            self.inbox.of(name).malformed += 1
+            log.warning("message refused", extra={"topic": name, "key": key, "writer": writer, "why": str(error)[:200]})
 
     def _step(self, message: Message) -> None:
         started_s = time.monotonic()

@@ -425,7 +425,7 @@ def test_what_the_mask_covers_has_no_depth(worker):
     ("changes", "reason"),
     [
         ({"mask": b"no"}, "the mask image cannot be decoded"),
-        ({"intrinsics": Intrinsics(640, 480, 500.0, 400.0, 160.0, 240.0)}, "intrinsics belong to another image size"),
+        ({"intrinsics": Intrinsics(640, 480, 500.0, 400.0, 10.0, 240.0)}, "intrinsics belong to another image size"),
     ],
 )
 def test_a_keyframe_that_the_map_refuses_is_not_encoded_and_the_next_one_is(worker, caplog, changes, reason):

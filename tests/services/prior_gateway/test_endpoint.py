@@ -12,7 +12,14 @@ from prior_sg.schemas.priors import ModelReply, ModelRequest, Prior, PriorReques
 from prior_sg.services.prior_gateway import service
 from prior_sg.services.prior_gateway.core.config import CallConfig, Config
 from prior_sg.services.prior_gateway.core.turns import SynthesisConfig
-from prior_sg.services.prior_gateway.outside.endpoint import Endpoint, open_endpoint, read_key, retry_after_s
+from prior_sg.services.prior_gateway.outside.endpoint import (
+    Endpoint,
+    is_here,
+    is_near,
+    open_endpoint,
+    read_key,
+    retry_after_s,
+)
 from prior_sg.services.runtime.service import Identity, ServiceError
 from tests.help.gateway import Gateway
 from tests.help.model import changed, cut_body, drip, good, huge, saying, serving, slow, status
@@ -366,3 +373,135 @@ def test_without_model_and_library_there_is_a_reason():
     assert (pending.pending, told.pending, told.priors) == (True, False, [])
     assert told.reason.startswith("fake gave no prior (the server answered 500")
     assert "no environment like 'coral reef'" in told.reason
+
+
+# What servers make of an answer, and who is sent the key
+
+
+def sending(answer: object) -> object:
+    content = answer if isinstance(answer, bytes) else json.dumps(answer).encode()
+    return lambda handler, body: handler.send(200, content)
+
+
+def message(finish: str = "stop", **fields: object) -> dict:
+    return {"choices": [{"message": {"role": "assistant"} | fields, "finish_reason": finish}]}
+
+
+CALL = {"function": {"name": "answer", "arguments": '{"a": 1}'}}
+PIECES = [{"choices": [{"delta": {"content": text}}]} for text in ('{"a"', ": 1}")]
+STREAM = b"".join(b"data: " + json.dumps(piece).encode() + b"\n\n" for piece in PIECES) + b"data: [DONE]\n\n"
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [
+        message(content='{"a": 1}'),
+        message(content='{"a": 1}', reasoning_content="hm {x}"),
+        message(content=[{"type": "thinking", "thinking": "hm"}, {"type": "text", "text": '{"a": 1}'}]),
+        message(content=[{"type": "text", "text": '{"a"'}, {"type": "text", "text": ": 1}"}]),
+        message(content={"a": 1}),
+        message(content=None, tool_calls=[CALL]),
+        message(content=None, reasoning_content='{"a": 1}'),
+        {"choices": [{"text": '{"a": 1}'}], "usage": {"prompt_tokens": "many", "completion_tokens": -1}},
+        STREAM,
+        b": ping\n\n" + STREAM,
+        b"\xef\xbb\xbf" + json.dumps(message(content='{"a": 1}')).encode(),
+    ],
+)
+def test_an_answer_in_any_of_the_usual_forms_is_understood(answer):
+    with serving(default=sending(answer)) as model:
+        reply = ask(Endpoint(config(model.url), ""))
+    assert reply.failure == "" and json.loads(reply.text) == {"a": 1}
+
+
+@pytest.mark.parametrize(
+    ("answer", "kind", "says"),
+    [
+        (message("length", content=None, reasoning_content="long " * 50), "length", "raise .*synthesis.max_tokens"),
+        ({"error": {"message": "model 'x' not found"}}, "server", "answered with an error: model 'x' not found"),
+        ({"error": f"bad \x1b[31mkey {KEY}"}, "server", r"bad \?\[31mkey \*\*\*"),
+        ({"error": {"code": 429}, "choices": []}, "server", '{"code":429}'),
+        (b'data: {"error": {"message": "overloaded"}}\n\n', "server", "overloaded"),
+        (b"data: [DONE]\n\n", "garbled", "streams its answer"),
+        (b"[" * 100_000, "garbled", "of another form"),
+        (b'{"choices": [{"message": "text"}]}', "garbled", "of another form"),
+        (b'"\\ud83d"', "garbled", "of another form"),
+        (b"\xff\xfe", "garbled", "of another form"),
+        (b"", "garbled", "of another form"),
+    ],
+)
+def test_what_is_no_answer_is_a_sentence_that_quotes_the_server(answer, kind, says):
+    with serving(default=sending(answer)) as model:
+        reply = ask(Endpoint(config(model.url), KEY))
+    assert (reply.failure, reply.text) == (kind, "")
+    assert re.search(says, reply.reason) and KEY not in reply.reason and reply.reason.isprintable()
+
+
+def test_an_answer_that_is_not_what_its_header_says_ends_nothing():
+    def not_gzip(handler, body):
+        handler.send(200, b"plain", {"content-encoding": "gzip"})
+
+    with serving(default=not_gzip) as model:
+        assert ask(Endpoint(config(model.url), KEY)).failure == "unreachable"
+
+
+def test_no_proxy_is_asked_for_this_machine(monkeypatch):
+    with serving() as proxy, serving() as model:
+        for name in ("HTTP_PROXY", "http_proxy", "ALL_PROXY", "all_proxy"):
+            monkeypatch.setenv(name, proxy.url.removesuffix("/v1"))
+        for name in ("NO_PROXY", "no_proxy"):
+            monkeypatch.delenv(name, raising=False)
+        reply = ask(Endpoint(config(model.url), KEY))
+        assert (reply.failure, proxy.calls, model.calls) == ("", 0, 1)
+
+
+@pytest.mark.parametrize(
+    ("host", "here", "near"),
+    [
+        ("localhost", True, True),
+        ("a.localhost", True, True),
+        ("127.0.0.1", True, True),
+        ("127.8.9.1", True, True),
+        ("::1", True, True),
+        ("192.168.1.7", False, True),
+        ("10.0.0.1", False, True),
+        ("fe80::1%eth0", False, True),
+        ("gpu", False, True),
+        ("gpu.local", False, True),
+        ("8.8.8.8", False, False),
+        ("api.openai.com", False, False),
+        ("localhost.example.com", False, False),
+        ("127.0.0.1.example.com", False, False),
+    ],
+)
+def test_hosts_here_and_near(host, here, near):
+    assert (is_here(host), is_near(host)) == (here, near)
+
+
+def test_a_proxy_that_cannot_be_used_is_a_sentence(monkeypatch):
+    monkeypatch.setenv("HTTPS_PROXY", "gopher://x")
+    reply = ask(Endpoint(config("https://model.example.invalid/v1"), KEY))
+    assert reply.failure == "unreachable" and "cannot be reached" in reply.reason
+
+
+def test_a_redirect_is_followed_at_home_only():
+    def away(handler, body):
+        handler.send(307, b"", {"location": f"{elsewhere.url}/chat/completions"})
+
+    def at_home(handler, body):
+        handler.send(308, b"", {"location": "/v2/chat/completions"})
+
+    with serving() as elsewhere, serving(at_home, good, default=away) as model:
+        endpoint = Endpoint(config(model.url), KEY)
+        assert ask(endpoint).failure == ""
+        path, headers, _ = model.requests[-1]
+        assert (path, headers["authorization"]) == ("/v2/chat/completions", f"Bearer {KEY}")
+        reply = ask(endpoint)
+        assert reply.failure == "rejected" and elsewhere.calls == 0
+        assert "answered 307 and sends to" in reply.reason and "set prior_gateway.endpoint" in reply.reason
+
+
+def test_a_redirect_in_a_circle_ends():
+    with serving(default=lambda handler, body: handler.send(307, b"", {"location": "/v1/chat/completions"})) as model:
+        assert ask(Endpoint(config(model.url), KEY)).failure == "rejected"
+        assert model.calls == 4

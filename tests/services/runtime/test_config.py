@@ -1,5 +1,7 @@
 """Layers of configuration: later ones win, faults are one sentence that names the setting."""
 
+from typing import Literal
+
 import msgspec
 import pytest
 
@@ -111,3 +113,32 @@ def test_settings_that_came_or_went_since_a_config_was_recorded_are_reported():
 def test_a_recorded_value_that_no_longer_fits_is_named(data, why):
     with pytest.raises(ConfigError, match=f"the recorded config of segmenter {why}"):
         recorded(Grouped, "segmenter", data)
+
+
+class Sourced(msgspec.Struct, frozen=True, kw_only=True):
+    source: str = ""
+    kind: Literal["a", "b"] = "a"
+    maybe: str | None = None
+    names: list[str] = []
+
+
+@pytest.mark.parametrize("text", ["[2024] flat", "{a}=b", "[1]", "{}", "[]", '{"a": 1}', "[", "-1", "null", "true"])
+def test_a_text_is_text_whatever_it_begins_with(text):
+    assert resolve(Sourced, "ingest", from_arguments([f"ingest.source={text}"])).source == text
+    assert resolve(Sourced, "ingest", from_environment({"PSG_INGEST__SOURCE": text})).source == text
+    if text != "null":
+        assert resolve(Sourced, "ingest", from_arguments([f"ingest.maybe={text}"])).maybe == text
+    with pytest.raises(ConfigError, match="ingest"):
+        resolve(Sourced, "ingest", from_arguments([f"ingest.kind={text}"]))
+
+
+def test_what_is_no_text_is_named(tmp_path):
+    for text in ("a\x00b", "caf\udce9"):
+        with pytest.raises(ConfigError, match=r"ingest\.source: .* is not valid text") as raised:
+            resolve(Sourced, "ingest", from_arguments([f"ingest.source={text}"]))
+        assert str(raised.value).isprintable()
+    (tmp_path / "latin.toml").write_bytes(b'[ingest]\nsource = "caf\xe9"\n')
+    with pytest.raises(ConfigError, match="cannot read the configuration"):
+        read_file(tmp_path / "latin.toml")
+    (tmp_path / "bom.toml").write_bytes("\ufeff[ingest]\nsource = 'é'\n".encode())
+    assert read_file(tmp_path / "bom.toml") == {"ingest": {"source": "é"}}

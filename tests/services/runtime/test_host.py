@@ -15,6 +15,7 @@ from prior_sg.schemas.places import MapRequest, SnapshotRequest, VoxelMap
 from prior_sg.schemas.priors import Task
 from prior_sg.schemas.status import Consumed, JobDone, Tick
 from prior_sg.schemas.topics import ENCODE, JOURNAL, KEYFRAME, PLACE_SNAPSHOT, TASK, VOXEL_MAP
+from prior_sg.services.refusals import InputRefused
 from prior_sg.services.runtime.bus import Hub, LocalBus, pack_header
 from prior_sg.services.runtime.client import BusClient
 from prior_sg.services.runtime.host.host import Host
@@ -174,6 +175,39 @@ def test_bad_input_is_counted_and_stops_nothing(new_bus):
             await asyncio.to_thread(bus.close)
 
     asyncio.run(main())
+
+
+def refusing_step(state, message, cfg):
+    if message.frame_id < 3:
+        raise InputRefused(f"frame {message.frame_id} cannot be")
+    if message.frame_id == 9:
+        raise ValueError("a fault of the program")
+    state.append(message.frame_id)
+    yield from ()
+
+
+REFUSING = Service("reader", "", "robot", Config, lambda cfg, me: [], refusing_step, reads=(KEYFRAME,))
+
+
+def test_a_refused_input_is_counted_logged_and_stops_nothing_but_a_fault_does(new_bus, caplog):
+    async def main():
+        with pytest.raises(ValueError, match="a fault of the program"):
+            async with running(new_bus, (REFUSING, Config(), "a")) as (reader,):
+                bus = await asyncio.to_thread(new_bus)
+                for frame_id in (1, 2, 3, 4):
+                    header = pack_header("w", frame_id, 0)
+                    bus.put(KEYFRAME, KEYFRAME.key_of(keyframe(1)), encode(keyframe(frame_id)), header)
+                await until(lambda: reader._state == [3, 4])
+                counts = {count.topic: count for count in reader.status().topics}["KEYFRAME"]
+                assert (counts.malformed, counts.consumed) == (2, 4)
+                bus.put(KEYFRAME, KEYFRAME.key_of(keyframe(1)), encode(keyframe(9)), pack_header("w", 5, 0))
+                await asyncio.sleep(0.3)
+                await asyncio.to_thread(bus.close)
+
+    with caplog.at_level("WARNING"):
+        asyncio.run(main())
+    told = [record.why for record in caplog.records if record.getMessage() == "message refused"]
+    assert told == ["frame 1 cannot be", "frame 2 cannot be"]
 
 
 def test_the_journal_tells_what_was_consumed_and_in_which_order(new_bus):

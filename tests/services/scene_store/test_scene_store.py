@@ -584,3 +584,19 @@ def test_a_failed_commit_leaves_the_file_as_it_was(tmp_path):
         store.feed(place_delta(1, [(2, 0, 0, 0, 1)], [(1, 2, 0.5)]))
     database = Database(store.cfg)
     assert encode(core.scene(database.graphs()[ROBOT])) == before
+
+
+def test_a_stored_robot_whose_name_cannot_be_used_is_left_out(tmp_path, caplog):
+    """Files of earlier versions may hold some; the others go on."""
+    path = str(tmp_path / "scene.sqlite")
+    database = Database(core.Config(path=path))
+    with database._transaction("x//y"), caplog.at_level("WARNING"):
+        pass
+    database.put_task(Task(robot="good", stamp_ns=1, environment="e", task="'; DROP TABLE robots;--"))
+    database.close()
+    database = Database(core.Config(path=path))
+    with caplog.at_level("WARNING"):
+        graphs = database.graphs()
+    database.close()
+    assert list(graphs) == ["good"] and graphs["good"].task.task == "'; DROP TABLE robots;--"
+    assert "left out" in caplog.text

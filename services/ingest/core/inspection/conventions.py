@@ -11,7 +11,7 @@ from prior_sg.services.geometry import inverse, pose_from_quaternion
 from prior_sg.services.ingest.core.agreement import NOTHING, Agreement, DepthView, agreement, grid_points, with_poses
 from prior_sg.services.ingest.core.inspection.findings import Finding, note, ok, problem
 from prior_sg.services.ingest.core.inspection.sample import Shot, pairs_of
-from prior_sg.services.ingest.sources.poses import FROM_CAMERA as MOTIONS
+from prior_sg.services.ingest.core.poses import FROM_CAMERA as MOTIONS
 
 FORWARD, BACKWARD = "world_from_camera", "camera_from_world"
 OTHER = {FORWARD: BACKWARD, BACKWARD: FORWARD, "xyzw": "wxyz", "wxyz": "xyzw"}

@@ -5,7 +5,7 @@ import io
 import cv2
 import numpy as np
 
-from prior_sg.services.ingest.sources.images import ImageError, image_size, is_sized, trimmed
+from prior_sg.services.ingest.core.headers import ImageError, image_size, is_sized, trimmed
 
 NPY_MAGIC, EXR_MAGIC = b"\x93NUMPY", b"\x76\x2f\x31\x01"
 BITS = {"uint8": 8, "int8": 8, "bool": 8}
@@ -41,7 +41,7 @@ def stored(data: bytes) -> np.ndarray:
 
 def _array(data: bytes) -> np.ndarray:
     try:
-        array = np.load(io.BytesIO(data), allow_pickle=False)
+        array = np.lib.format.read_array(io.BytesIO(data), allow_pickle=False)
     except (ValueError, EOFError, OSError) as error:
         raise ImageError(f"it is not a saved array: {error}") from error
     array = array[..., 0] if array.ndim == 3 and array.shape[2] == 1 else array

@@ -9,7 +9,7 @@ import numpy as np
 from prior_sg.schemas.frames import Intrinsics
 from prior_sg.services.geometry import inverse, rotation_angle_rad
 from prior_sg.services.ingest.core.agreement import DepthView, agreement
-from prior_sg.services.ingest.sources.poses import Convention
+from prior_sg.services.ingest.core.poses import Convention
 
 UNITS_M = (1e-3, 1 / 5000, 1 / 6553.5, 1 / 4000, 1e-4, 1 / 256, 1e-2)  # metres per unit that tools write
 USUAL_UNIT_M = 1e-3

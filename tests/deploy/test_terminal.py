@@ -1,0 +1,114 @@
+"""Outside text reaches the terminal as text, in every way that leads there."""
+
+import ast
+import io
+import re
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rich.table import Table
+
+from prior_sg.deploy.terminal import Description, Terminal, line
+from prior_sg.schemas.names import DIRECTIONS, shown
+from tests.help.paths import ROOT
+
+HOSTILE = [
+    "tv corner [/den]",
+    "lounge [east]",
+    "sort [/x] bins",
+    "[bold]x[/bold]",
+    ":smile:",
+    "[link=file:///]a[/link]",
+]
+COMMANDS = ["\x1b[31mred", "a\x9b2Jb", "\x00", "\x07", "\r over", "\u202etxt", "half \ud83d", "\u2028"]
+
+
+def terminal(width: int = 120, **options) -> tuple[Terminal, io.StringIO]:
+    file = io.StringIO()
+    return Terminal(file=file, width=width, **options), file
+
+
+def everywhere(text: str) -> str:
+    """The text by every way to the terminal."""
+    console, file = terminal(force_terminal=True, color_system=None)
+    console.print(text)
+    console.print(line("a ", (text, "bold")))
+    table = Table(text, "b", title=text)
+    table.add_row(text, "c")
+    console.print(table)
+    with console.status(text) as status:
+        status.update(text)
+        console.print(status.renderable)
+    return file.getvalue()
+
+
+@pytest.mark.parametrize("text", HOSTILE)
+def test_markup_is_printed_literally(text):
+    console, file = terminal()
+    table = Table(text, title=text)
+    table.add_row(text)
+    console.print(text, line((text, "bold")), table)
+    with console.status(text) as status:
+        status.update(text)
+        console.print(status.renderable)
+    assert file.getvalue().count(text) == 6
+
+
+@pytest.mark.parametrize("text", COMMANDS)
+def test_what_a_terminal_would_obey_does_not_reach_it(text):
+    console, file = terminal()
+    table = Table(text, title=text)
+    table.add_row(text)
+    console.print(text, line(text), table)
+    with console.status(text) as status:
+        console.print(status.renderable)
+    assert "?" in file.getvalue()
+    assert not set(file.getvalue()) & (set(DIRECTIONS) | set(map(chr, {*range(32), *range(127, 160)} - {10})))
+    file.getvalue().encode()
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.text(st.characters(), max_size=30))
+def test_any_text_can_be_printed(text):
+    everywhere(text).encode()
+
+
+def test_progress_takes_no_markup():
+    class Row:
+        description = "asking [/x] \x1b[2J"
+
+    assert Description().render(Row()).plain == "asking [/x] ?[2J"
+
+
+def test_what_the_encoding_lacks_is_a_question_mark():
+    raw = io.BytesIO()
+    console = Terminal(file=io.TextIOWrapper(raw, encoding="ascii", errors="replace", write_through=True))
+    table = Table("Großküche")
+    table.add_row("salon 🛋")
+    console.print("30 m² ± 2", table)
+    assert b"Gro?k?che" in raw.getvalue() and b"salon ?" in raw.getvalue()
+
+
+def test_ordinary_text_of_any_language_stays():
+    for text in ("Großküche", "café", "居間", "غرفة", "👩‍🍳 kitchen", "a\nb\tc"):
+        assert shown(text) == text
+
+
+def test_house_rule_nothing_else_makes_a_console_or_writes_markup():
+    """A new print cannot bring the fault back: strings hold no tags, and there is one kind of console."""
+    tag = re.compile(r"\[/?(?:bold|dim|italic|red|green|yellow|blue|magenta|cyan|white|/|link)\b[^\]]*\]|\[/\]")
+    found = []
+    for path in sorted((ROOT / "deploy").rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if path.name == "terminal.py":
+                continue
+            if isinstance(node, ast.Constant) and isinstance(node.value, str) and tag.search(node.value):
+                found.append(f"{path.name}:{node.lineno}: markup in a string")
+            if isinstance(node, ast.ImportFrom) and node.module in ("rich.console", "rich.markup", "rich.status"):
+                found.append(f"{path.name}:{node.lineno}: imports {node.module}; use prior_sg.deploy.terminal")
+            if isinstance(node, ast.Name) and node.id == "TextColumn":
+                found.append(f"{path.name}:{node.lineno}: use Description")
+            if isinstance(node, ast.Attribute) and node.attr in ("from_markup", "from_ansi"):
+                found.append(f"{path.name}:{node.lineno}: {node.attr}")
+    assert not found
