@@ -219,3 +219,15 @@ def test_the_expert_of_the_documentation_works():
     np.testing.assert_allclose(np.exp(log_probabilities[0]), (0.5, 0.5))
     assert log_probabilities[1, 1] - log_probabilities[1, 0] == pytest.approx(0.5 * (1.4 / 0.3) ** 2)
     np.testing.assert_allclose(confidence, (1 / 3, 1.0))
+
+
+def test_the_test_of_the_documentation_works(monkeypatch):
+    page = (ROOT / "docs" / "extending.md").read_text()
+    expert = re.search(r"```python\n(# services/segmenter/core/experts/ceiling.py.*?)```", page, re.DOTALL).group(1)
+    test = re.search(r"```python\n(def test_ceiling_by_hand.*?)```", page, re.DOTALL).group(1)
+    names: dict = {}
+    exec(expert, names)  # the page's own code
+    monkeypatch.setitem(REGISTRY, "ceiling", names["ceiling"])
+    here = dict(globals())
+    exec(test, here)
+    here["test_ceiling_by_hand"]()
