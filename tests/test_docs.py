@@ -1,6 +1,6 @@
 """What the documents name exists: files, functions in them, commands with their options, settings, links.
 
-A function is named as `file.py::function` or `file.py::Class.method`.
+A function is named as `file.py::function` or `file.py::Class.method`, the file from the root or from its room.
 """
 
 import argparse
@@ -38,26 +38,25 @@ def is_path(span):
     return (span.split("/")[0] in OURS and "/" in span) or bool(re.fullmatch(r"[\w/<>-]+\.py", span))
 
 
-def exists(path):
-    pattern = PLACEHOLDER.sub("*", path.rstrip("/"))
-    if any(ROOT.glob(pattern)):
-        return True
-    return path.endswith(".py") and any(str(file).endswith("/" + path) for file in SOURCES)
+def files_of(path):
+    """The files or folders that a path means: from the root, else, of code, from any room."""
+    found = list(ROOT.glob(PLACEHOLDER.sub("*", path.rstrip("/"))))
+    return found or [file for file in SOURCES if path.endswith(".py") and str(file).endswith("/" + path)]
 
 
 def lacking(document):
     """Paths and functions that a document names and nobody finds."""
     for span in spans(document.read_text(encoding="utf-8")):
         path, _, name = span.partition("::")
-        if is_path(path) and (not exists(path) or (name and name not in names_in(path))):
+        if is_path(path) and not any(not name or name in names_in(file) for file in files_of(path)):
             yield span
 
 
 @cache
-def names_in(path):
+def names_in(file):
     """Functions, classes and methods of a file, as `name` or `Class.method`."""
     found = set()
-    for node in ast.parse((ROOT / path).read_text(encoding="utf-8")).body:
+    for node in ast.parse(file.read_text(encoding="utf-8")).body:
         found |= {node.name} if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef) else set()
         if isinstance(node, ast.ClassDef):
             found |= {f"{node.name}.{inner.name}" for inner in node.body if hasattr(inner, "name")}
