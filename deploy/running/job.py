@@ -29,7 +29,8 @@ from prior_sg.schemas.topics import INGEST_STATE, KEYFRAME, PLACE_DELTA, PYRAMID
 from prior_sg.services.registry import SERVICES
 from prior_sg.services.runtime.bus import Bus, LocalBus, Sample
 from prior_sg.services.runtime.client import BusClient, NoPriorError
-from prior_sg.services.runtime.zenoh_bus import ZenohBus, free_endpoint, open_router
+from prior_sg.services.runtime.endpoints import free_endpoint
+from prior_sg.services.runtime.zenoh_bus import ZenohBus, open_router
 
 QUIET_S = 1.5
 START_TIMEOUT_S = 180.0
