@@ -1,4 +1,4 @@
-"""The command line: `prior-sg`."""
+"""The command line: `prior-sg`. Imports are within `main`, where an interrupt of them is told as one line."""
 
 import argparse
 import os
@@ -6,15 +6,12 @@ import signal
 import sys
 import threading
 
-from prior_sg.deploy.cli import check, jobs, live, packing, priors, tools
-from prior_sg.deploy.cli.shared import Commands, with_example
-from prior_sg.deploy.errors import UserError
-from prior_sg.deploy.running.serve import HOPELESS
-from prior_sg.services.runtime import extras
-
 
 def build_parser() -> argparse.ArgumentParser:
     """All commands with their options."""
+    from prior_sg.deploy.cli import check, jobs, live, packing, priors, tools
+    from prior_sg.deploy.cli.shared import Commands, with_example
+
     parser = argparse.ArgumentParser(
         prog="prior-sg",
         description="Task-driven hierarchical scene graphs from posed RGB-D streams.",
@@ -29,25 +26,37 @@ def build_parser() -> argparse.ArgumentParser:
 def main(argv: list[str] | None = None) -> int:
     """Exit status of the command; faults of the user or the system are one sentence on standard error."""
     try:
-        arguments = build_parser().parse_args(argv)
-        extras.require(arguments.needs, f"prior-sg {arguments.command}")
-        if threading.current_thread() is threading.main_thread() and arguments.command != "serve":
-            signal.signal(signal.SIGTERM, signal.default_int_handler)  # ended by a supervisor: as tidy as Ctrl-C
-        return arguments.run(arguments)
+        return _told(argv)
     except BrokenPipeError:  # the reader of a pipe has left
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 1
-    except (UserError, *HOPELESS) as error:
-        print(f"prior-sg: {error}", file=sys.stderr)
-        return 1
-    except ModuleNotFoundError as error:
-        if (advice := extras.advice(error)) is None:
-            raise
-        print(f"prior-sg: {advice}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         print("prior-sg: interrupted", file=sys.stderr)
         return 130
+
+
+def _told(argv: list[str] | None) -> int:
+    from prior_sg.deploy.cli.faults import sentence_of
+
+    try:
+        return _run(argv)
+    except (BrokenPipeError, KeyboardInterrupt):
+        raise
+    except Exception as error:
+        if (sentence := sentence_of(error)) is None:
+            raise
+        print(f"prior-sg: {sentence}", file=sys.stderr)
+        return 1
+
+
+def _run(argv: list[str] | None) -> int:
+    from prior_sg.services.runtime import extras
+
+    arguments = build_parser().parse_args(argv)
+    extras.require(arguments.needs, f"prior-sg {arguments.command}")
+    if threading.current_thread() is threading.main_thread() and arguments.command != "serve":
+        signal.signal(signal.SIGTERM, signal.default_int_handler)  # ended by a supervisor: as tidy as Ctrl-C
+    return arguments.run(arguments)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,9 @@
 """The main job: start everything, stream a source, wait until all is settled, write the results."""
 
 import contextlib
+import fcntl
+import logging
+import os
 import signal
 import threading
 import time
@@ -29,9 +32,10 @@ from prior_sg.schemas.topics import INGEST_STATE, KEYFRAME, PLACE_DELTA, PYRAMID
 from prior_sg.services.registry import SERVICES
 from prior_sg.services.runtime.bus import Bus, LocalBus, Sample
 from prior_sg.services.runtime.client import BusClient, NoPriorError
-from prior_sg.services.runtime.endpoints import free_endpoint
+from prior_sg.services.runtime.endpoints import free_endpoint, parse_endpoint
 from prior_sg.services.runtime.zenoh_bus import ZenohBus, open_router
 
+log = logging.getLogger(__name__)
 QUIET_S = 1.5
 START_TIMEOUT_S = 180.0
 PRIOR_TIMEOUT_S = 900.0  # a model may need minutes
@@ -115,9 +119,31 @@ def make_folder(path: Path) -> None:
         raise RunError(f"cannot write to {path} ({error.strerror}); choose another folder with --out") from error
 
 
+@contextmanager
+def claimed_folder(path: Path) -> Iterator[None]:
+    """The output folder, created and nobody else's until the end. Raises RunError."""
+    make_folder(path)
+    folder = os.open(path, os.O_RDONLY)
+    try:
+        fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        os.close(folder)
+        raise RunError(f"another run is writing to {path}; wait for it, or choose another folder with --out") from error
+    except OSError:  # a file system without locks
+        log.debug("%s cannot be locked", path)
+    try:
+        yield
+    finally:
+        os.close(folder)
+
+
 def run(job: Job, console: Console) -> Result:
     """Run one source to its end. Raises RunError, BusError, ChildFailed; KeyboardInterrupt ends it early, cleanly."""
-    make_folder(job.out)
+    with claimed_folder(job.out):
+        return _run_in_folder(job, console)
+
+
+def _run_in_folder(job: Job, console: Console) -> Result:
     database = job.out / "scene.sqlite"
     for leftover in job.out.glob("scene.sqlite*"):
         leftover.unlink()
@@ -134,7 +160,8 @@ def run(job: Job, console: Console) -> Result:
         return _run_on(LocalBus(services.hub), services, job, console)
     endpoint = free_endpoint(job.connect)
     if endpoint != job.connect:
-        console.print(f"{job.connect} is in use; this run's router listens on {endpoint} (--connect {endpoint})")
+        taken = "" if parse_endpoint(job.connect).port == 0 else f"{job.connect} is in use; "
+        console.print(f"{taken}this run's router listens on {endpoint} (--connect {endpoint})")
     stop_router = open_router(endpoint)
     try:
         supervisor = Supervisor(endpoint, job.robot, logs, settings, job.config)
@@ -147,11 +174,10 @@ def _run_on(bus: Bus, supervisor: "Supervisor | InProcess", job: Job, console: C
     started_s = time.monotonic()
     with BusClient(bus) as client:
         recorder = Recorder(client, job.out / "log.mcap")
-        try:
+        with contextlib.ExitStack() as ending:  # all of it, whatever fails or is interrupted on the way
+            ending.callback(recorder.close)
+            ending.callback(supervisor.stop)
             return Run(job, console, client, recorder, supervisor).stream(started_s)
-        finally:
-            supervisor.stop()
-            recorder.close()
 
 
 class Run:
@@ -183,7 +209,7 @@ class Run:
             names = [service.name for service in SERVICES if service.name != "ingest"]
             self._start(names)
             progress.update(bar, description="asking for the prior")
-            prior = self._task(lambda reason: progress.update(bar, description=reason or "asking for the prior"))
+            prior = self._task(lambda reason: self._waiting(progress, bar, reason))
             progress.console.print(f"prior: {prior.provenance.source}, {prior.provenance.note}")
             self._start(["ingest"])  # last: the stream must not begin before its readers stand
             self.job.on_started(self.supervisor.connect, self.supervisor.pids())
@@ -213,6 +239,12 @@ class Run:
                 where = self.supervisor.log_folder
                 raise RunError(f"not started within {START_TIMEOUT_S:.0f} s: {', '.join(missing)}; see {where}")
             time.sleep(POLL_S)
+
+    def _waiting(self, progress: Progress, bar: TaskID, reason: str) -> None:
+        """Show why there is no prior yet. Raises KeyboardInterrupt."""
+        if self.interrupted.is_set():
+            raise KeyboardInterrupt
+        progress.update(bar, description=reason or "asking for the prior")
 
     def _task(self, say: Callable[[str], None]) -> Prior:
         """Give the task; returns the prior it gets. Raises RunError with the gateway's reason when there is none."""
