@@ -21,7 +21,7 @@ def sentence_of(error: Exception) -> str | None:
     if isinstance(error, MemoryError):
         return f"there is not enough memory{_limit(resource.RLIMIT_AS, 'ulimit -v', 2**10)}; give it more"
     if isinstance(error, RuntimeError) and THREADS in str(error):
-        return f"no more threads can be started{_limit(resource.RLIMIT_NPROC, 'ulimit -u')}; raise that limit"
+        return f"no more threads can be started{_of_threads()}; raise that limit"
     return _of_system(error) if isinstance(error, OSError) else None
 
 
@@ -42,6 +42,11 @@ def _of_system(error: OSError) -> str | None:
     if isinstance(error, FileNotFoundError) and "temporary directory" in str(error):
         return "no temporary folder can be written; set TMPDIR to one that can be"
     return None
+
+
+def _of_threads() -> str:
+    """The limit that is met: each thread takes much of what addresses there are."""
+    return _limit(resource.RLIMIT_AS, "ulimit -v", 2**10) or _limit(resource.RLIMIT_NPROC, "ulimit -u")
 
 
 def _limit(which: int, name: str, unit: int = 1) -> str:

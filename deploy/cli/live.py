@@ -73,11 +73,13 @@ def cmd_up(arguments: argparse.Namespace) -> int:
 
 
 def _stay_up(arguments: argparse.Namespace, names: list[str]) -> int:
+    from prior_sg.deploy.running.job import require_files
     from prior_sg.deploy.running.supervisor import Supervisor
     from prior_sg.deploy.settings import check_settings
     from prior_sg.services.registry import BY_NAME
     from prior_sg.services.runtime.zenoh_bus import open_router
 
+    require_files()
     settings = [f"scene_store.path={arguments.out / 'scene.sqlite'}", f"ingest.speed={arguments.speed}"]
     if arguments.source:
         before_start(arguments.source, read_options(arguments), console)

@@ -50,9 +50,12 @@ def _told(argv: list[str] | None) -> int:
 
 
 def _run(argv: list[str] | None) -> int:
+    from prior_sg.deploy.cli.shared import check_memory, check_texts
     from prior_sg.services.runtime import extras
 
+    check_texts(sys.argv[1:] if argv is None else argv)
     arguments = build_parser().parse_args(argv)
+    check_memory(arguments.needs)
     extras.require(arguments.needs, f"prior-sg {arguments.command}")
     if threading.current_thread() is threading.main_thread() and arguments.command != "serve":
         signal.signal(signal.SIGTERM, signal.default_int_handler)  # ended by a supervisor: as tidy as Ctrl-C

@@ -1,16 +1,20 @@
 """What the commands of `prior-sg` share: the terminal, options and the way onto the bus."""
 
 import argparse
-from collections.abc import Callable
+import os
+import resource
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 from rich.console import Console
 
+from prior_sg.deploy.errors import UserError
 from prior_sg.deploy.settings import DEFAULT_ROBOT, connect_in_force
 
 if TYPE_CHECKING:
     from prior_sg.services.runtime.client import BusClient
 
+MEMORY_NEEDED_B = 2_000_000 * 1024  # addresses, not memory in use
 console = Console(highlight=False)
 
 Run = Callable[[argparse.Namespace], int]  # does what a command was told; its exit status
@@ -35,6 +39,23 @@ class Commands:
 def with_example(text: str) -> dict:
     """Arguments of a parser whose help ends in an example."""
     return {"epilog": f"example: {text}", "formatter_class": argparse.RawDescriptionHelpFormatter}
+
+
+def check_texts(arguments: Sequence[str]) -> None:
+    """That all arguments are text: files and messages name paths in UTF-8. Raises UserError."""
+    for text in arguments:
+        try:
+            text.encode()
+        except UnicodeEncodeError as error:
+            shown = os.fsencode(text).decode(errors="backslashreplace")
+            raise UserError(f"{shown!r} is not UTF-8; type it anew, or rename the file or folder") from error
+
+
+def check_memory(extra: str) -> None:
+    """That numeric packages may take what they need: some of them end the process without a word. Raises UserError."""
+    limit_b, _ = resource.getrlimit(resource.RLIMIT_AS)
+    if extra and limit_b != resource.RLIM_INFINITY and limit_b < MEMORY_NEEDED_B:
+        raise UserError(f"`ulimit -v` is {limit_b // 1024}; raise that limit to {MEMORY_NEEDED_B // 1024}")
 
 
 def add_bus(parser: argparse.ArgumentParser, robot: bool = True) -> None:

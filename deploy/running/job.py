@@ -4,6 +4,7 @@ import contextlib
 import fcntl
 import logging
 import os
+import resource
 import signal
 import threading
 import time
@@ -41,6 +42,7 @@ START_TIMEOUT_S = 180.0
 PRIOR_TIMEOUT_S = 900.0  # a model may need minutes
 POLL_S = 0.1
 STALL_AFTER_S = 120.0
+FILES_WANTED, FILES_NEEDED = 1024, 48  # open at once
 
 
 class RunError(UserError):
@@ -119,6 +121,16 @@ def make_folder(path: Path) -> None:
         raise RunError(f"cannot write to {path} ({error.strerror}); choose another folder with --out") from error
 
 
+def require_files() -> None:
+    """Raise the limit of open files as far as this user may. Raises RunError where that is too few for a router."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    wanted = FILES_WANTED if hard == resource.RLIM_INFINITY else min(FILES_WANTED, hard)
+    if soft < wanted and soft != resource.RLIM_INFINITY:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
+    if wanted < FILES_NEEDED:
+        raise RunError(f"only {wanted} files may be open at once (`ulimit -n`); raise that limit to {FILES_WANTED}")
+
+
 @contextmanager
 def claimed_folder(path: Path) -> Iterator[None]:
     """The output folder, created and nobody else's until the end. Raises RunError."""
@@ -158,6 +170,7 @@ def _run_in_folder(job: Job, console: Console) -> Result:
     if job.in_process:
         services = InProcess(job.robot, logs, settings, job.config)
         return _run_on(LocalBus(services.hub), services, job, console)
+    require_files()
     endpoint = free_endpoint(job.connect)
     if endpoint != job.connect:
         taken = "" if parse_endpoint(job.connect).port == 0 else f"{job.connect} is in use; "
