@@ -112,7 +112,8 @@ def _check_plain(value: msgspec.Struct) -> None:
     """Whole numbers fit 64 bits, as arrays and databases hold them; all others are finite."""
     whole, real = _numbers(type(value))
     for field in whole:
-        if not -(2**63) <= getattr(value, field) < 2**63:
+        number = getattr(value, field)
+        if isinstance(number, int) and not -(2**63) <= number < 2**63:
             raise ValueError(f"{field}: does not fit 64 bits")
     for field in real:
         numbers = getattr(value, field)

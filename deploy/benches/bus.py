@@ -20,7 +20,8 @@ from prior_sg.schemas.codec import decode, encode
 from prior_sg.schemas.frames import Keyframe
 from prior_sg.schemas.topics import KEYFRAME
 from prior_sg.services.runtime.bus import Sample, pack_header
-from prior_sg.services.runtime.zenoh_bus import ZenohBus, client_config, free_endpoint, open_router
+from prior_sg.services.runtime.endpoints import free_endpoint
+from prior_sg.services.runtime.zenoh_bus import ZenohBus, client_config, open_router
 
 SIZES = {"150kB": (150_000, 1500), "1.5MB": (1_500_000, 200)}  # bytes, messages of one turn
 TURNS = 5

@@ -21,7 +21,8 @@ from prior_sg.schemas.topics import INGEST_STATE, KEYFRAME, PLACE_DELTA, PYRAMID
 from prior_sg.services.registry import SERVICES
 from prior_sg.services.runtime.bus import Sample
 from prior_sg.services.runtime.client import BusClient
-from prior_sg.services.runtime.zenoh_bus import ZenohBus, free_endpoint, open_router
+from prior_sg.services.runtime.endpoints import free_endpoint
+from prior_sg.services.runtime.zenoh_bus import ZenohBus, open_router
 
 ROBOT = "bench"
 OLD, NEW = (f"conse/efficientnet-lite{size}/minilm-l6-v2" for size in (2, 1))

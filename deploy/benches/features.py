@@ -31,9 +31,10 @@ from prior_sg.services.feature_pyramid.encoders.conse import classifier_file, re
 from prior_sg.services.feature_pyramid.encoders.onnx_session import Session
 from prior_sg.services.images import color_of, depth_of
 from prior_sg.services.runtime.bus import Sample
+from prior_sg.services.runtime.endpoints import free_endpoint
 from prior_sg.services.runtime.jobs.board import Ended
 from prior_sg.services.runtime.jobs.pool import JobPool
-from prior_sg.services.runtime.zenoh_bus import ZenohBus, free_endpoint, open_router
+from prior_sg.services.runtime.zenoh_bus import ZenohBus, open_router
 
 BATCHES = (1, 4, 16)
 ROUNDS = 3

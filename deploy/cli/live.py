@@ -62,17 +62,25 @@ def add_commands(commands: Commands) -> None:
 
 def cmd_up(arguments: argparse.Namespace) -> int:
     """Services and a router until Ctrl-C."""
-    from prior_sg.deploy.running.job import make_folder
-    from prior_sg.deploy.running.supervisor import Supervisor
-    from prior_sg.deploy.settings import check_settings
+    from prior_sg.deploy.running.job import claimed_folder
     from prior_sg.services.registry import BY_NAME, SERVICES
-    from prior_sg.services.runtime.zenoh_bus import open_router
 
     names = arguments.services or [service.name for service in SERVICES]
     for name in names:
         if name not in BY_NAME:
             raise UserError(f"there is no service {name!r}; known: {', '.join(BY_NAME)}")
-    make_folder(arguments.out)
+    with claimed_folder(arguments.out):
+        return _stay_up(arguments, names)
+
+
+def _stay_up(arguments: argparse.Namespace, names: list[str]) -> int:
+    from prior_sg.deploy.running.job import require_files
+    from prior_sg.deploy.running.supervisor import Supervisor
+    from prior_sg.deploy.settings import check_settings
+    from prior_sg.services.registry import BY_NAME
+    from prior_sg.services.runtime.zenoh_bus import open_router
+
+    require_files()
     settings = [f"scene_store.path={arguments.out / 'scene.sqlite'}", f"ingest.speed={arguments.speed}"]
     if arguments.source:
         before_start(arguments.source, read_options(arguments), console)

@@ -1,18 +1,31 @@
 """What the commands of `prior-sg` share: the terminal, options and the way onto the bus."""
 
 import argparse
+import resource
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
+from prior_sg.deploy.errors import UserError
 from prior_sg.deploy.settings import DEFAULT_ROBOT, connect_in_force
 from prior_sg.deploy.terminal import Terminal
+from prior_sg.schemas.names import shown
 
 if TYPE_CHECKING:
+    from _typeshed import SupportsWrite
+
     from prior_sg.services.runtime.client import BusClient
 
+MEMORY_NEEDED_B = 2_000_000 * 1024  # addresses, not memory in use
 console = Terminal()
 
 Run = Callable[[argparse.Namespace], int]  # does what a command was told; its exit status
+
+
+class Parser(argparse.ArgumentParser):
+    """What it says of an argument is fit for a terminal."""
+
+    def _print_message(self, message: str, file: "SupportsWrite[str] | None" = None) -> None:
+        super()._print_message(shown(message), file)
 
 
 class Commands:
@@ -34,6 +47,13 @@ class Commands:
 def with_example(text: str) -> dict:
     """Arguments of a parser whose help ends in an example."""
     return {"epilog": f"example: {text}", "formatter_class": argparse.RawDescriptionHelpFormatter}
+
+
+def check_memory(extra: str) -> None:
+    """That numeric packages may take what they need: some of them end the process without a word. Raises UserError."""
+    limit_b, _ = resource.getrlimit(resource.RLIMIT_AS)
+    if extra and limit_b != resource.RLIM_INFINITY and limit_b < MEMORY_NEEDED_B:
+        raise UserError(f"`ulimit -v` is {limit_b // 1024}; raise that limit to {MEMORY_NEEDED_B // 1024}")
 
 
 def add_bus(parser: argparse.ArgumentParser, robot: bool = True) -> None:

@@ -1,6 +1,10 @@
 """The main job: start everything, stream a source, wait until all is settled, write the results."""
 
 import contextlib
+import fcntl
+import logging
+import os
+import resource
 import signal
 import threading
 import time
@@ -30,13 +34,16 @@ from prior_sg.schemas.topics import INGEST_STATE, KEYFRAME, PLACE_DELTA, PYRAMID
 from prior_sg.services.registry import SERVICES
 from prior_sg.services.runtime.bus import Bus, LocalBus, Sample
 from prior_sg.services.runtime.client import BusClient, NoPriorError
-from prior_sg.services.runtime.zenoh_bus import ZenohBus, free_endpoint, open_router
+from prior_sg.services.runtime.endpoints import free_endpoint, parse_endpoint
+from prior_sg.services.runtime.zenoh_bus import ZenohBus, open_router
 
+log = logging.getLogger(__name__)
 QUIET_S = 1.5
 START_TIMEOUT_S = 180.0
 PRIOR_TIMEOUT_S = 900.0  # a model may need minutes
 POLL_S = 0.1
 STALL_AFTER_S = 120.0
+FILES_WANTED, FILES_NEEDED = 1024, 48  # open at once
 
 
 class RunError(UserError):
@@ -120,9 +127,41 @@ def make_folder(path: Path) -> None:
         raise RunError(f"cannot write to {path} ({error.strerror}); choose another folder with --out") from error
 
 
+def require_files() -> None:
+    """Raise the limit of open files as far as this user may. Raises RunError where that is too few for a router."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    wanted = FILES_WANTED if hard == resource.RLIM_INFINITY else min(FILES_WANTED, hard)
+    if soft < wanted and soft != resource.RLIM_INFINITY:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
+    if wanted < FILES_NEEDED:
+        raise RunError(f"only {wanted} files may be open at once (`ulimit -n`); raise that limit to {FILES_WANTED}")
+
+
+@contextmanager
+def claimed_folder(path: Path) -> Iterator[None]:
+    """The output folder, created and nobody else's until the end. Raises RunError."""
+    make_folder(path)
+    folder = os.open(path, os.O_RDONLY)
+    try:
+        fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        os.close(folder)
+        raise RunError(f"another run is writing to {path}; wait for it, or choose another folder with --out") from error
+    except OSError:  # a file system without locks
+        log.debug("%s cannot be locked", path)
+    try:
+        yield
+    finally:
+        os.close(folder)
+
+
 def run(job: Job, console: Terminal) -> Result:
     """Run one source to its end. Raises RunError, BusError, ChildFailed; KeyboardInterrupt ends it early, cleanly."""
-    make_folder(job.out)
+    with claimed_folder(job.out):
+        return _run_in_folder(job, console)
+
+
+def _run_in_folder(job: Job, console: Terminal) -> Result:
     database = job.out / "scene.sqlite"
     for leftover in job.out.glob("scene.sqlite*"):
         leftover.unlink()
@@ -137,9 +176,11 @@ def run(job: Job, console: Terminal) -> Result:
     if job.in_process:
         services = InProcess(job.robot, logs, settings, job.config)
         return _run_on(LocalBus(services.hub), services, job, console)
+    require_files()
     endpoint = free_endpoint(job.connect)
     if endpoint != job.connect:
-        console.print(f"{job.connect} is in use; this run's router listens on {endpoint} (--connect {endpoint})")
+        taken = "" if parse_endpoint(job.connect).port == 0 else f"{job.connect} is in use; "
+        console.print(f"{taken}this run's router listens on {endpoint} (--connect {endpoint})")
     stop_router = open_router(endpoint)
     try:
         supervisor = Supervisor(endpoint, job.robot, logs, settings, job.config)
@@ -152,11 +193,10 @@ def _run_on(bus: Bus, supervisor: "Supervisor | InProcess", job: Job, console: T
     started_s = time.monotonic()
     with BusClient(bus) as client:
         recorder = Recorder(client, job.out / "log.mcap")
-        try:
+        with contextlib.ExitStack() as ending:  # all of it, whatever fails or is interrupted on the way
+            ending.callback(recorder.close)
+            ending.callback(supervisor.stop)
             return Run(job, console, client, recorder, supervisor).stream(started_s)
-        finally:
-            supervisor.stop()
-            recorder.close()
 
 
 class Run:
@@ -188,7 +228,7 @@ class Run:
             names = [service.name for service in SERVICES if service.name != "ingest"]
             self._start(names)
             progress.update(bar, description="asking for the prior")
-            prior = self._task(lambda reason: progress.update(bar, description=reason or "asking for the prior"))
+            prior = self._task(lambda reason: self._waiting(progress, bar, reason))
             progress.console.print(f"prior: {prior.provenance.source}, {prior.provenance.note}")
             self._start(["ingest"])  # last: the stream must not begin before its readers stand
             self.job.on_started(self.supervisor.connect, self.supervisor.pids())
@@ -218,6 +258,12 @@ class Run:
                 where = self.supervisor.log_folder
                 raise RunError(f"not started within {START_TIMEOUT_S:.0f} s: {', '.join(missing)}; see {where}")
             time.sleep(POLL_S)
+
+    def _waiting(self, progress: Progress, bar: TaskID, reason: str) -> None:
+        """Show why there is no prior yet. Raises KeyboardInterrupt."""
+        if self.interrupted.is_set():
+            raise KeyboardInterrupt
+        progress.update(bar, description=reason or "asking for the prior")
 
     def _task(self, say: Callable[[str], None]) -> Prior:
         """Give the task; returns the prior it gets. Raises RunError with the gateway's reason when there is none."""

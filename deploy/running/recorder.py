@@ -34,7 +34,7 @@ class Recorder:
         self.attachments: dict[str, tuple[str, bytes]] = {}  # name: media type and content, written at the end
         self.error: LogError | None = None
         self._queue: queue.SimpleQueue[Sample | None] = queue.SimpleQueue()
-        self._thread = threading.Thread(target=self._write, name="recorder")
+        self._thread = threading.Thread(target=self._write, name="recorder", daemon=True)
         self._thread.start()
         for topic in TOPICS:
             if topic.recorded:

@@ -69,12 +69,14 @@ class Child:
 
     def last_words(self) -> str:
         """The end of its log, for an error message."""
-        lines = self.log_path.read_text(errors="replace").strip().splitlines() or ["(empty log)"]
         try:
+            lines = self.log_path.read_text(errors="replace").strip().splitlines() or ["(empty log)"]
             entry = json.loads(lines[-1])
-        except ValueError:
+            return str(entry.get("error", entry["event"])).splitlines()[-1]
+        except OSError as error:
+            return f"(no log: {error.strerror})"
+        except (ValueError, LookupError, AttributeError):  # not a line of ours
             return lines[-1][-400:]
-        return entry.get("error", entry["event"]).splitlines()[-1]
 
 
 @dataclass
@@ -126,7 +128,8 @@ class Supervisor:
             elif (code := child.process.poll()) is not None:
                 child.deaths = 1 if now_s - child.started_s > STABLE_AFTER_S else child.deaths + 1
                 if code == EXIT_HOPELESS or child.deaths >= GIVE_UP_AFTER:
-                    raise ChildFailed(f"{child.instance} does not run: {child.last_words()} (log: {child.log_path})")
+                    died = child.last_words() if code >= 0 else f"it was ended by {_reason(code)}"
+                    raise ChildFailed(f"{child.instance} does not run: {died} (log: {child.log_path})")
                 delay_s = min(RESTART_DELAY_S * 2 ** (child.deaths - 1), MAX_RESTART_DELAY_S)
                 child.process, child.restart_at_s = None, now_s + delay_s
                 why = f": {child.last_words()}" if code > 0 else ""
@@ -149,4 +152,7 @@ class Supervisor:
 
 
 def _reason(code: int) -> str:
-    return f"signal {signal.Signals(-code).name}" if code < 0 else f"exit status {code}"
+    if code >= 0:
+        return f"exit status {code}"
+    known = {member.value: member.name for member in signal.Signals}
+    return f"signal {known.get(-code, -code)}" + ("; too little memory?" if -code == signal.SIGKILL else "")

@@ -8,8 +8,6 @@ deltas. The encoding of everything sent names its schema; what comes in another 
 import contextlib
 import json
 import logging
-import re
-import socket
 import threading
 import time
 from collections.abc import Callable
@@ -33,12 +31,16 @@ from prior_sg.services.runtime.bus import (
     Sample,
     unpack_header,
 )
+from prior_sg.services.runtime.endpoints import cannot_listen, check_endpoint, check_host, number_in, without_places
 
 log = logging.getLogger(__name__)
 HEARTBEAT_S = 0.3
 CLOSE_TIMEOUT_S = 3.0
 LEASE_MS = 2000
-ENDPOINT = re.compile(r"(\w+)/(.+):(\d+)")
+TRANSPORT = {
+    "link": {"tx": {"lease": LEASE_MS, "keep_alive": 4}, "rx": {"buffer_size": 4194304}},
+    "shared_memory": {"enabled": False},  # asks for a /dev/shm that can be written, which containers may lack
+}
 
 
 def client_config(endpoint: str) -> zenoh.Config:
@@ -54,10 +56,7 @@ def client_config(endpoint: str) -> zenoh.Config:
                 },
                 "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
                 "timestamping": {"enabled": True},
-                "transport": {
-                    "link": {"tx": {"lease": LEASE_MS, "keep_alive": 4}, "rx": {"buffer_size": 4194304}},
-                    "shared_memory": {"enabled": False},
-                },
+                "transport": TRANSPORT,
             }
         )
     )
@@ -72,7 +71,7 @@ def router_config(endpoint: str) -> zenoh.Config:
                 "listen": {"endpoints": [endpoint]},
                 "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
                 "timestamping": {"enabled": True},
-                "transport": {"link": {"tx": {"lease": LEASE_MS, "keep_alive": 4}, "rx": {"buffer_size": 4194304}}},
+                "transport": TRANSPORT,
             }
         )
     )
@@ -80,32 +79,14 @@ def router_config(endpoint: str) -> zenoh.Config:
 
 def open_router(endpoint: str) -> Callable[[], None]:
     """Start a router in this process; returns the function that stops it. Raises BusError."""
+    check_endpoint(endpoint)
     zenoh.init_log_from_env_or("error")
     try:
         session = zenoh.open(router_config(endpoint))
     except zenoh.ZError as error:
-        raise BusError(
-            f"no router can listen on {endpoint} (is another `prior-sg up` or `run` running?); "
-            "choose another with --connect"
-        ) from error
+        said = str(error)
+        raise BusError(cannot_listen(endpoint, number_in(said), without_places(said))) from error
     return lambda: _close_within(session, CLOSE_TIMEOUT_S)
-
-
-def free_endpoint(wanted: str) -> str:
-    """The endpoint wanted, or one on a free port of the same host when its port is 0 or taken."""
-    match = ENDPOINT.fullmatch(wanted)
-    if match is None:
-        raise BusError(f"--connect takes PROTOCOL/HOST:PORT, for example tcp/127.0.0.1:7447; got {wanted!r}")
-    protocol, host, port = match.groups()
-    for candidate in (int(port), 0):
-        with socket.socket() as probe:
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            try:
-                probe.bind((host, candidate))
-            except OSError:
-                continue
-            return f"{protocol}/{host}:{probe.getsockname()[1]}"
-    raise BusError(f"no port is free on {host}")
 
 
 def _close_within(session: zenoh.Session, timeout_s: float) -> None:
@@ -152,12 +133,14 @@ class ZenohBus:
 
     @staticmethod
     def _open(endpoint: str, wait_s: float) -> zenoh.Session:
+        check_endpoint(endpoint)
         deadline = time.monotonic() + wait_s
         while True:
             try:
                 return zenoh.open(client_config(endpoint))
             except zenoh.ZError as error:
                 if time.monotonic() > deadline:
+                    check_host(endpoint)
                     raise BusError(
                         f"no router answers on {endpoint}; start one with `prior-sg up`, or name another with --connect"
                     ) from error

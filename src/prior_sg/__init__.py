@@ -10,9 +10,7 @@
 what comes out. Whatever goes wrong for a user is an `Error`. Nothing is imported before it is used.
 """
 
-from importlib import import_module, metadata
-from typing import TYPE_CHECKING
-
+TYPE_CHECKING = False  # `typing` takes long to import, and nothing is before it is used
 if TYPE_CHECKING:
     from prior_sg.deploy.api.client import Client as Client
     from prior_sg.deploy.api.errors import NotInSceneError as NotInSceneError
@@ -67,6 +65,8 @@ __all__ = [
 
 
 def __getattr__(name: str) -> object:
+    from importlib import import_module, metadata
+
     if name == "__version__":
         return metadata.version("prior-sg")
     if name not in _HOMES:

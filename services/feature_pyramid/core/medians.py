@@ -1,12 +1,13 @@
 """Medians of depth patches by counting, compiled: exact, and many times faster than sorting (pure)."""
 
 import numpy as np
-from numba import njit
+
+from prior_sg.services.compiled import compiled
 
 HALF = 1 << 16
 
 
-@njit(cache=True, nogil=True)
+@compiled()
 def patch_medians(depth_m: np.ndarray, boxes: np.ndarray) -> np.ndarray:
     """Median of the positive values in each square patch, 0 where there is none: float32 (patch,).
 
@@ -31,7 +32,7 @@ def patch_medians(depth_m: np.ndarray, boxes: np.ndarray) -> np.ndarray:
     return medians
 
 
-@njit(cache=True, nogil=True)
+@compiled()
 def _ranked(bits: np.ndarray, depth_m: np.ndarray, box: np.ndarray, counts: np.ndarray, rank: int) -> np.float32:
     """The value of a rank, given the counts of the upper halves."""
     upper = 0

@@ -14,6 +14,7 @@ from tokenizers import Tokenizer
 from prior_sg.services.feature_pyramid.encoders.base import EncoderUnavailable, Options, key_chunk
 from prior_sg.services.feature_pyramid.encoders.onnx_session import Session
 from prior_sg.services.feature_pyramid.encoders.two_towers import ClipEncoder
+from prior_sg.services.folders import expanded
 
 MANIFEST = "manifest.json"
 TEXT_BATCH = 64
@@ -108,7 +109,7 @@ class Towers:
 
 
 def _folder(choice: str) -> Path:
-    folder = Path(choice.removeprefix("onnx:")).expanduser()
+    folder = expanded(choice.removeprefix("onnx:"))
     if not (folder / MANIFEST).is_file():
         raise EncoderUnavailable(f"{folder} has no {MANIFEST}; docs/encoders.md shows what belongs into the folder.")
     return folder

@@ -1,6 +1,7 @@
 """ONNX Runtime: sessions, and a folder in the user's cache where exported networks are kept."""
 
 import hashlib
+import logging
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -9,6 +10,9 @@ from typing import Any
 import numpy as np
 
 from prior_sg.services.feature_pyramid.encoders.base import EncoderUnavailable
+from prior_sg.services.folders import temporary_cache, user_cache
+
+log = logging.getLogger(__name__)
 
 
 class Session:
@@ -43,26 +47,36 @@ def cached(name: str, made_of: list[str], export: Callable[[Path], None], suffix
     processes may export at once; a half-written file is never seen.
     """
     digest = hashlib.blake2b("\n".join(made_of).encode(), digest_size=8).hexdigest()
-    path = cache_folder() / f"{name}-{digest}{suffix}"
-    if not path.exists():
-        partial = path.with_name(f".{path.name}.{os.getpid()}")
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            export(partial)
-            partial.replace(path)
-        except OSError as error:
-            raise EncoderUnavailable(
-                f"cannot write to {path.parent} ({error.strerror}); set XDG_CACHE_HOME to a folder that can be "
-                "written, or feature_pyramid.runtime=torch"
-            ) from error
-        finally:
-            partial.unlink(missing_ok=True)
+    file = f"{name}-{digest}{suffix}"
+    try:
+        return _made(cache_folder() / file, export)
+    except OSError as error:
+        log.warning("exports are kept in the temporary folder: %s cannot be written (%s)", cache_folder(), error)
+    try:
+        return _made(temporary_cache("onnx") / file, export)
+    except OSError as error:
+        raise EncoderUnavailable(
+            f"neither {cache_folder()} nor the temporary folder can be written ({error.strerror}); set XDG_CACHE_HOME "
+            "to a folder that can be, or feature_pyramid.runtime=torch"
+        ) from error
+
+
+def _made(path: Path, export: Callable[[Path], None]) -> Path:
+    if path.exists():
+        return path
+    partial = path.with_name(f".{path.name}.{os.getpid()}")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        export(partial)
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
     return path
 
 
 def cache_folder() -> Path:
-    """Where exports are kept: below XDG_CACHE_HOME, or the user's .cache."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "prior-sg" / "onnx"
+    """Where exports are kept when it can be written."""
+    return user_cache() / "onnx"
 
 
 def _runtime() -> Any:

@@ -1,9 +1,9 @@
 """Depth images from an organised lidar scan (pure)."""
 
 import numpy as np
-from numba import njit
 
 from prior_sg.schemas.frames import Intrinsics
+from prior_sg.services.compiled import compiled
 from prior_sg.services.geometry import project
 
 NEAR_M = 0.2  # nothing nearer to the camera is drawn
@@ -32,7 +32,7 @@ def depth_image(points_camera: np.ndarray, camera: Intrinsics) -> np.ndarray:
     return np.divide(1.0, inverse_image, out=np.zeros_like(inverse_image), where=inverse_image > 0)
 
 
-@njit(cache=True, nogil=True)
+@compiled()
 def _draw(u, v, z, image, near_m, max_step):  # noqa: ANN001, ANN202, PLR0917
     """Two triangles for each four neighbours of the scan."""
     rows, columns = z.shape
@@ -43,7 +43,7 @@ def _draw(u, v, z, image, near_m, max_step):  # noqa: ANN001, ANN202, PLR0917
             _triangle(u, v, z, i + 1, k, i, k, i + 1, j, image, near_m, max_step)
 
 
-@njit(cache=True, nogil=True)
+@compiled()
 def _triangle(u, v, z, i0, j0, i1, j1, i2, j2, image, near_m, max_step):  # noqa: ANN001, ANN202, PLR0917
     """Raise the image's inverse depth to that of a triangle, on the pixels whose centres it holds."""
     z0, z1, z2 = z[i0, j0], z[i1, j1], z[i2, j2]

@@ -14,8 +14,8 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numba import njit
 
+from prior_sg.services.compiled import compiled
 from prior_sg.services.place_graph.core.columns import GroundColumns
 from prior_sg.services.place_graph.core.skeleton.graph import Changes, GraphRules, Place, PlaceGraph, Voxel
 from prior_sg.services.place_graph.core.volume.grid import FREE, OCCUPIED, Box, VoxelGrid
@@ -233,7 +233,7 @@ def _observed(grid: VoxelGrid, voxel: Voxel) -> bool:
     return bool(grid.gather("label", Box(at, at + 1)).any())
 
 
-@njit(cache=True, nogil=True)
+@compiled()
 def ground_voxels(label, clearance, step, slope):  # noqa: ANN001, ANN201
     """Which voxels of a window are ground: obstacles under free height, level enough with those around them."""
     nx, ny, nz = label.shape
@@ -258,7 +258,7 @@ def ground_voxels(label, clearance, step, slope):  # noqa: ANN001, ANN201
     return ground
 
 
-@njit(cache=True, nogil=True)
+@compiled()
 def _rise(standing, i, j, k, dx, dy, step):  # noqa: ANN001, ANN202, PLR0917
     """Rise over run along an axis: over two voxels to either side, as far as small steps lead."""
     ends = np.zeros(2, np.int64)
@@ -282,7 +282,7 @@ def _rise(standing, i, j, k, dx, dy, step):  # noqa: ANN001, ANN202, PLR0917
     return abs(ends[1] - ends[0]) / run if run else 0.0
 
 
-@njit(cache=True, nogil=True)
+@compiled()
 def connected(ground, step):  # noqa: ANN001, ANN201
     """Number of the connected part of each ground voxel (-1 elsewhere), by steps to the four sides; how many parts."""
     nx, ny, nz = ground.shape
@@ -314,7 +314,7 @@ def connected(ground, step):  # noqa: ANN001, ANN201
     return parts, count
 
 
-@njit(cache=True, nogil=True)
+@compiled()
 def _neighbours(owner, step):  # noqa: ANN001, ANN202
     """Pairs of owners with voxels side by side, with repeats."""
     nx, ny, nz = owner.shape
@@ -339,7 +339,7 @@ def _neighbours(owner, step):  # noqa: ANN001, ANN202
     return pairs[:count]
 
 
-@njit(cache=True, nogil=True)
+@compiled()
 def _over_ground(owner, start, stop, step):  # noqa: ANN001, ANN202
     """Whether all of a line lies over ground, or beside it by a voxel, at about its height."""
     nx, ny, nz = owner.shape

@@ -9,8 +9,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 import numpy as np
-from numba import njit
 
+from prior_sg.services.compiled import compiled
 from prior_sg.services.place_graph.core.columns import OpeningColumns
 from prior_sg.services.place_graph.core.skeleton.graph import PlaceGraph
 from prior_sg.services.place_graph.core.volume.grid import FREE, UNOBSERVED, Box, VoxelGrid
@@ -67,7 +67,7 @@ class Openings:
         return _columns(dict(sorted(self.told.items())), voxel_m)
 
 
-@njit(cache=True, nogil=True)
+@compiled()
 def summed_normals(label, voxels, reaches):  # noqa: ANN001, ANN201
     """Sum (place, 3) of the outward normals of the open faces nearest to each place (n, 3), within its reach."""
     nx, ny, nz = label.shape

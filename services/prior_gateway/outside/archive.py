@@ -14,6 +14,7 @@ import msgspec
 
 from prior_sg.schemas.codec import DecodeError, Message, decode, encode
 from prior_sg.schemas.priors import Keep, Kept, Prior, PriorEvidence, Recall, Recalled
+from prior_sg.services.folders import expanded
 from prior_sg.services.prior_gateway.core.config import Config
 from prior_sg.services.prior_gateway.outside.signing import Signer
 from prior_sg.services.runtime.service import Identity
@@ -48,7 +49,10 @@ class PriorShelf:
     """The archive's folder. Without a path nothing is kept or found; damaged files are told in the log and skipped."""
 
     def __init__(self, path: str, kept_maps: int = 256) -> None:
-        self.root = Path(path).expanduser() if path else None
+        self.root = expanded(path) if path else None
+        if self.root is not None and self.root.parts[:1] == ("~",):
+            log.warning("this user has no home: priors are not kept; set prior_gateway.archive to a folder")
+            self.root = None
         self._kept_maps = kept_maps
 
     def folder(self, environment: str, task: str, regions: list[str]) -> Path | None:

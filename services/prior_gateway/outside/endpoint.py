@@ -14,13 +14,13 @@ import re
 import time
 from collections.abc import Awaitable, Callable
 from datetime import UTC, datetime
-from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
 import httpx
 
 from prior_sg.schemas.priors import ModelReply, ModelRequest
+from prior_sg.services.folders import expanded
 from prior_sg.services.prior_gateway.core.config import Config
 from prior_sg.services.prior_gateway.outside.dialects import (
     DIALECTS,
@@ -217,7 +217,7 @@ def retry_after_s(header: str, now: datetime) -> float:
 def read_key(cfg: Config) -> str:
     """The key, from the file or the variable that the config names. Raises ServiceError, which never shows a key."""
     if cfg.key_file:
-        path = Path(cfg.key_file).expanduser()
+        path = expanded(cfg.key_file)
         try:
             key = path.read_text(encoding="utf-8").strip()
         except (OSError, UnicodeDecodeError) as error:

@@ -5,13 +5,14 @@ from importlib.resources import files
 from pathlib import Path
 from string import Template
 
+from prior_sg.services.folders import expanded
 from prior_sg.services.prior_gateway.core.turns import PROMPT_FIELDS, Prompts
 from prior_sg.services.runtime.service import ServiceError
 
 
 def load(version: str) -> Prompts:
     """The prompts of a shipped version, or of a folder of the user's. Raises ServiceError that names the file."""
-    own = Path(version).expanduser()
+    own = expanded(version)
     shipped = files(__package__) / "prompts" / version
     folder = own if own.is_dir() else shipped
     texts: dict[str, Template] = {}

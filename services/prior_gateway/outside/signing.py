@@ -11,6 +11,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey,
 from cryptography.hazmat.primitives.serialization import load_pem_private_key, load_pem_public_key
 
 from prior_sg.schemas.priors import Prior
+from prior_sg.services.folders import expanded
 from prior_sg.services.runtime.service import ServiceError
 
 PURPOSE = b"prior-sg prior "  # a signature of a prior is one of nothing else
@@ -22,11 +23,11 @@ class Signer:
     def __init__(self, key_file: str, trusted_folder: str) -> None:
         self.name, self._key = "", None
         if key_file:
-            path = Path(key_file).expanduser()
+            path = expanded(key_file)
             self.name, self._key = path.stem, _private(path)
         self._trusted: dict[str, Ed25519PublicKey] = {}
         if trusted_folder:
-            folder = Path(trusted_folder).expanduser()
+            folder = expanded(trusted_folder)
             if not folder.is_dir():
                 raise ServiceError(f"prior_gateway.trusted_keys: {folder} is no folder")
             self._trusted = {path.stem: _public(path) for path in sorted(folder.glob("*.pub"))}

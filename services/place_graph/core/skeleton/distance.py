@@ -13,8 +13,8 @@ replaced is looked at again.
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from prior_sg.services.compiled import compiled
 from prior_sg.services.place_graph.core.volume.grid import FAR_D2, FREE, OCCUPIED, UNKNOWN_D2, Box, VoxelGrid
 
 RIM = 2  # voxels around the recomputed box: one for the GVD of its neighbours, one more for theirs
@@ -110,7 +110,7 @@ NEW, KNOWN, QUEUED = 0, 1, 2
 TOUCHED, LEFT, LEVEL = 0, 1, 2
 
 
-@njit(cache=True, nogil=True)
+@compiled()
 def _touch(wave, voxel):  # noqa: ANN001, ANN202
     if wave.listed[voxel] == NEW:
         wave.listed[voxel] = KNOWN
@@ -118,7 +118,7 @@ def _touch(wave, voxel):  # noqa: ANN001, ANN202
         wave.counts[TOUCHED] += 1
 
 
-@njit(cache=True, nogil=True)
+@compiled()
 def _unqueue(wave, voxel):  # noqa: ANN001, ANN202
     """Take a voxel out of the list of its distance; call it before the distance changes."""
     if wave.listed[voxel] == QUEUED:
@@ -132,7 +132,7 @@ def _unqueue(wave, voxel):  # noqa: ANN001, ANN202
             wave.before[after] = before
 
 
-@njit(cache=True, nogil=True)
+@compiled()
 def _queue(wave, voxel):  # noqa: ANN001, ANN202
     """Put a touched voxel into the list of its distance."""
     level = wave.d2[voxel]
@@ -144,14 +144,14 @@ def _queue(wave, voxel):  # noqa: ANN001, ANN202
     wave.counts[LEVEL] = min(wave.counts[LEVEL], level)
 
 
-@njit(cache=True, nogil=True)
+@compiled()
 def _in_rim(wave, voxel, rim):  # noqa: ANN001, ANN202
     nx, ny, nz = wave.shape
     i, j, k = voxel // (ny * nz), (voxel // nz) % ny, voxel % nz
     return i < rim or j < rim or k < rim or i >= nx - rim or j >= ny - rim or k >= nz - rim
 
 
-@njit(cache=True, nogil=True)
+@compiled()
 def _handed_on(wave, voxel, max_d2):  # noqa: ANN001, ANN202
     """The nearest obstacle that the neighbours of a free voxel hand on to it: squared distance and offset."""
     stride_x, stride_y = wave.shape[1] * wave.shape[2], wave.shape[2]
@@ -176,7 +176,7 @@ def _handed_on(wave, voxel, max_d2):  # noqa: ANN001, ANN202
     return best, bx, by, bz
 
 
-@njit(cache=True, nogil=True)
+@compiled()
 def _resting(wave, voxel, known, ox, oy, oz, stack, depth):  # noqa: ANN001, ANN202, PLR0917
     """Push the neighbours that have the obstacle which `voxel`, of former distance and offset, may have handed on."""
     if known < 0 or known == FAR_D2:
@@ -197,7 +197,7 @@ def _resting(wave, voxel, known, ox, oy, oz, stack, depth):  # noqa: ANN001, ANN
     return stack, depth
 
 
-@njit(cache=True, nogil=True)
+@compiled()
 def _raise(wave, changed, rim):  # noqa: ANN001, ANN202
     """Withdraw the values of changed voxels, and all that rested on them."""
     stack = np.empty(4096, np.int64)
@@ -224,7 +224,7 @@ def _raise(wave, changed, rim):  # noqa: ANN001, ANN202
             stack, depth = _resting(wave, voxel, known, ox, oy, oz, stack, depth)
 
 
-@njit(cache=True, nogil=True)
+@compiled()
 def _settle(wave, max_d2):  # noqa: ANN001, ANN202
     """Obstacles are at distance zero; what was withdrawn takes what its neighbours hand on."""
     count = wave.counts[TOUCHED]
@@ -244,7 +244,7 @@ def _settle(wave, max_d2):  # noqa: ANN001, ANN202
                 _queue(wave, voxel)
 
 
-@njit(cache=True, nogil=True)
+@compiled()
 def _lower(wave, rim, max_d2):  # noqa: ANN001, ANN202
     """In order of distance, each voxel hands its obstacle on."""
     stride_x, stride_y = wave.shape[1] * wave.shape[2], wave.shape[2]
@@ -271,7 +271,7 @@ def _lower(wave, rim, max_d2):  # noqa: ANN001, ANN202
                     stack = _look_again(wave, other, rim, max_d2, stack)
 
 
-@njit(cache=True, nogil=True)
+@compiled()
 def _look_again(wave, start, rim, max_d2, stack):  # noqa: ANN001, ANN202
     """Give a voxel what its neighbours hand on; where that is news, look again at what rested on its former value."""
     stack[0] = start
@@ -297,7 +297,7 @@ def _look_again(wave, start, rim, max_d2, stack):  # noqa: ANN001, ANN202
     return stack
 
 
-@njit(cache=True, nogil=True)
+@compiled()
 def distinct(px, py, pz, qx, qy, qz, l1, cosine):  # noqa: ANN001, ANN201, PLR0917
     """Whether two obstacles, given by their offsets from one voxel, count as different basis points (L1 or angle)."""
     if abs(px - qx) + abs(py - qy) + abs(pz - qz) > l1:
@@ -306,7 +306,7 @@ def distinct(px, py, pz, qx, qy, qz, l1, cosine):  # noqa: ANN001, ANN201, PLR09
     return dot < cosine * np.sqrt(float((px * px + py * py + pz * pz) * (qx * qx + qy * qy + qz * qz)))
 
 
-@njit(cache=True, nogil=True)
+@compiled()
 def _on_gvd(label, d2, offset, i, j, k, min_d2, l1, cosine):  # noqa: ANN001, ANN202, PLR0917
     """Whether a wave front stops here: a face neighbour has a distinct obstacle that is about as near to this voxel."""
     ox, oy, oz = np.int64(offset[i, j, k, 0]), np.int64(offset[i, j, k, 1]), np.int64(offset[i, j, k, 2])
@@ -329,7 +329,7 @@ def _on_gvd(label, d2, offset, i, j, k, min_d2, l1, cosine):  # noqa: ANN001, AN
     return False
 
 
-@njit(cache=True, nogil=True)
+@compiled()
 def _basis_points(label, d2, offset, i, j, k, l1, cosine):  # noqa: ANN001, ANN202, PLR0917
     """One plus the number of mutually distinct further obstacles of the 26 neighbours."""
     found = np.empty((MAX_BASIS_POINTS, 3), np.int64)
@@ -354,7 +354,7 @@ def _basis_points(label, d2, offset, i, j, k, l1, cosine):  # noqa: ANN001, ANN2
     return count
 
 
-@njit(cache=True, nogil=True)
+@compiled()
 def renew_voronoi(label, d2, offset, basis, touched, min_d2, l1, cosine):  # noqa: ANN001, ANN201, PLR0917
     """Recompute `basis` of the voxels (n, 3) and their neighbours in place: 0 off the GVD, else its basis points."""
     done = np.zeros(label.shape, np.bool_)

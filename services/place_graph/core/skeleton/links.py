@@ -7,12 +7,12 @@ on its surroundings only, and it joins whatever the clear lines join (it contain
 """
 
 import numpy as np
-from numba import njit
 
+from prior_sg.services.compiled import compiled
 from prior_sg.services.place_graph.core.volume.grid import FAR_D2
 
 
-@njit(cache=True, nogil=True)
+@compiled()
 def line_d2(d2, start, stop):  # noqa: ANN001, ANN201
     """Smallest squared distance (voxels) along the straight line between two voxels of a window, both ends included.
 
@@ -35,7 +35,7 @@ def line_d2(d2, start, stop):  # noqa: ANN001, ANN201
     return lowest
 
 
-@njit(cache=True, nogil=True)
+@compiled()
 def clear_lines(d2, voxels, touching, edge_d2, reach_d2, free_d2):  # noqa: ANN001, ANN201, PLR0917
     """Squared clearance (n, n) of the admissible lines between places (n, 3) of a window; 0 = no line.
 
@@ -55,7 +55,7 @@ def clear_lines(d2, voxels, touching, edge_d2, reach_d2, free_d2):  # noqa: ANN0
     return clear
 
 
-@njit(cache=True, nogil=True)
+@compiled()
 def thinned(clear, voxels, touching, edge_d2):  # noqa: ANN001, ANN201
     """Which clear lines (n, n) stay as edges: of touching places, or with no third place nearer to both."""
     count = len(voxels)
@@ -98,7 +98,7 @@ def nearest(mask: np.ndarray, voxels: np.ndarray, limit: int) -> np.ndarray:
     return near | near.T
 
 
-@njit(cache=True, nogil=True)
+@compiled()
 def lenses(d2, voxels, radii, smallest, reach):  # noqa: ANN001, ANN201
     """Squared radius (n, n) of the lens that two spheres share, or of the smaller one if it lies in the other.
 

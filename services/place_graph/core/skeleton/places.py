@@ -4,8 +4,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from prior_sg.services.compiled import compiled
 from prior_sg.services.place_graph.core.skeleton.distance import STEPS
 from prior_sg.services.place_graph.core.volume.grid import Box, VoxelGrid
 
@@ -78,7 +78,7 @@ def _unique_pairs(pairs: np.ndarray) -> np.ndarray:
     return np.unique(ordered, axis=0).reshape(-1, 2)
 
 
-@njit(cache=True, nogil=True)
+@compiled()
 def _grow_groups(members, labels, low, cell_voxels):  # noqa: ANN001, ANN202
     """Label each 26-connected set of members inside one cell (-2: not reached yet); return the number of sets."""
     for n in range(len(members)):
@@ -122,7 +122,7 @@ def _representatives(
     return members[first], member_d2[first], member_basis[first]
 
 
-@njit(cache=True, nogil=True)
+@compiled()
 def _touching(members, labels):  # noqa: ANN001, ANN202
     """Pairs of group labels with neighbouring voxels (26-neighbourhood), with repeats."""
     pairs = np.empty((len(members) * 4 + 16, 2), np.int64)
@@ -145,7 +145,7 @@ def _touching(members, labels):  # noqa: ANN001, ANN202
     return pairs[:count]
 
 
-@njit(cache=True, nogil=True)
+@compiled()
 def _merge(voxels, first, second, pairs, merge_d2):  # noqa: ANN001, ANN202
     """Root of each group: a group that touches a better one nearby is absorbed by the best such, and so on upwards.
 

@@ -13,10 +13,10 @@ pose turns out wrong leaves nothing behind. (Unless a voxel's weight reached `ma
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from scipy import ndimage
 
 from prior_sg.schemas.frames import Intrinsics
+from prior_sg.services.compiled import compiled
 from prior_sg.services.geometry import back_project, inverse, transform
 from prior_sg.services.place_graph.core.volume.grid import (
     BLOCK,
@@ -118,7 +118,7 @@ def visible_blocks(
     return [(int(x), int(y), int(z)) for x, y, z in keys[inside]]
 
 
-@njit(cache=True, nogil=True)
+@compiled()
 def _integrate_block(sdf, weight, label, corner, depth_m, camera_from_world, lens, limits, sign, changed):  # noqa: ANN001, ANN202, PLR0917
     """Update one block in place; list voxels with a new label in `changed`; return how many were seen and listed."""
     voxel_m, truncation_m, surface_m, min_range_m, max_range_m, unit, heaviest, constant = limits

@@ -11,8 +11,8 @@ places depends on others up to twice as far away.
 
 import msgspec
 import numpy as np
-from numba import njit
 
+from prior_sg.services.compiled import compiled
 from prior_sg.services.segmenter.core.map.arcs import Arcs, ball
 
 
@@ -46,7 +46,7 @@ def reached(near: Arcs, mask: np.ndarray, steps: int) -> np.ndarray:
     return ball(np.flatnonzero(mask), steps, near.starts, near.neighbours, np.zeros(len(mask), bool))
 
 
-@njit(cache=True, nogil=True)
+@compiled()
 def _shared(own, masses, starts, neighbours, weights, rows, steps, share):  # noqa: ANN001, ANN202, PLR0917
     """Sums of mass times value and sums of mass travel alike; their ratio is the average.
 

@@ -7,8 +7,8 @@ pictures, and the energy, which counts each of them, believes too firmly.
 """
 
 import numpy as np
-from numba import njit
 
+from prior_sg.services.compiled import compiled
 from prior_sg.services.segmenter.core.energy.mrf import Field
 from prior_sg.services.segmenter.core.energy.swap_moves import conditional
 from prior_sg.services.segmenter.core.map.arcs import Arcs
@@ -27,7 +27,7 @@ def posteriors(costs: np.ndarray, temperature: float) -> np.ndarray:
     return likelihoods / likelihoods.sum(axis=1, keepdims=True)
 
 
-@njit(cache=True, nogil=True)
+@compiled()
 def _conditional_costs(unary, starts, neighbours, weights, pairwise, labels, rows):  # noqa: ANN001, ANN202, PLR0917
     costs = np.empty((len(rows), unary.shape[1]))
     for index in range(len(rows)):

@@ -26,8 +26,8 @@ from collections.abc import Callable
 
 import msgspec
 import numpy as np
-from numba import njit
 
+from prior_sg.services.compiled import compiled
 from prior_sg.services.segmenter.core.energy import swap_moves
 from prior_sg.services.segmenter.core.energy.maxflow import CUTS, MinCut, min_cut_in_use
 from prior_sg.services.segmenter.core.energy.mrf import Field, least_gain
@@ -215,7 +215,7 @@ def minimise(field: Field, labels: np.ndarray, settings: Settings | None = None)
     return solver.drain()
 
 
-@njit(cache=True, nogil=True)
+@compiled()
 def round_trip(rows, labels, graph, unary, pairwise, messages, mark, least_gain):  # noqa: PLR0917, ANN001, ANN201
     """Pass messages there and back over `rows`; fuse the labels of both passes into `labels`."""
     for forward in (True, False):
@@ -223,7 +223,7 @@ def round_trip(rows, labels, graph, unary, pairwise, messages, mark, least_gain)
         fuse(rows, messages.proposed, labels, graph, unary, pairwise, mark, least_gain)
 
 
-@njit(cache=True, nogil=True)
+@compiled()
 def changed_rows(graph_before, unary_before, graph, unary, origin):  # noqa: ANN001, ANN201
     """Rows (dirty,) of `graph` that are new, or whose costs, neighbours or weights differ; origin[row] = row before."""
     places, labels = unary.shape
@@ -250,7 +250,7 @@ def changed_rows(graph_before, unary_before, graph, unary, origin):  # noqa: ANN
     return dirty[:count].copy()
 
 
-@njit(cache=True, nogil=True)
+@compiled()
 def _has_arc(graph, row, neighbour, weight):  # noqa: ANN001, ANN202
     for arc in range(graph.starts[row], graph.starts[row + 1]):
         if graph.neighbours[arc] == neighbour and graph.weights[arc] == weight:
@@ -258,7 +258,7 @@ def _has_arc(graph, row, neighbour, weight):  # noqa: ANN001, ANN202
     return False
 
 
-@njit(cache=True, nogil=True)
+@compiled()
 def label_new(labels, graph, unary, pairwise):  # noqa: ANN001, ANN201
     """Give each place without a label the cheapest one, its labelled neighbours considered."""
     costs = np.empty(unary.shape[1])
@@ -273,7 +273,7 @@ def label_new(labels, graph, unary, pairwise):  # noqa: ANN001, ANN201
         labels[place] = np.argmin(costs)
 
 
-@njit(cache=True, nogil=True)
+@compiled()
 def fuse(rows, proposed, labels, graph, unary, pairwise, mark, least_gain):  # noqa: PLR0917, ANN001, ANN201
     """Take each connected set of places that `proposed` labels otherwise if that alone gains more than `least_gain`.
 

@@ -20,8 +20,8 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from prior_sg.services.compiled import compiled
 from prior_sg.services.segmenter.core.map.arcs import Arcs
 
 UNSEEN, LISTED, FREE, TAKES_ALPHA, TAKES_BETA = 0, 1, 2, 3, 4
@@ -105,14 +105,14 @@ def waiting(work: Work, depth: int) -> int:
     return int(work.rings[:depth, COUNT].sum())
 
 
-@njit(cache=True, nogil=True)
+@compiled()
 def flag(place, depth, work):  # noqa: ANN001, ANN201
     """All swaps of this place's label are to be tried."""
     work.pending[place, :] = depth
     enqueue(place, depth - 1, work.queues, work.queued, work.rings)
 
 
-@njit(cache=True, nogil=True)
+@compiled()
 def enqueue(place, ring, queues, queued, rings):  # noqa: ANN001, ANN201
     """Put the place at the end of the ring unless it is there."""
     if queued[ring, place] == 0:
@@ -122,14 +122,14 @@ def enqueue(place, ring, queues, queued, rings):  # noqa: ANN001, ANN201
         rings[ring, COUNT] += 1
 
 
-@njit(cache=True, nogil=True)
+@compiled()
 def flag_all(places, depth, work):  # noqa: ANN001, ANN201
     """`flag` for each of `places`."""
     for place in places:
         flag(place, depth, work)
 
 
-@njit(cache=True, nogil=True)
+@compiled()
 def flag_around(places, depth, graph, work):  # noqa: ANN001, ANN201
     """`flag` for each of `places` and its neighbours: what to do after its label was changed from outside."""
     for place in places:
@@ -138,7 +138,7 @@ def flag_around(places, depth, graph, work):  # noqa: ANN001, ANN201
             flag(graph.neighbours[arc], depth, work)
 
 
-@njit(cache=True, nogil=True)
+@compiled()
 def requeue(work):  # noqa: ANN001, ANN201
     """Fill the queues from the flags, in order of the rows."""
     for place in range(len(work.pending)):
@@ -147,7 +147,7 @@ def requeue(work):  # noqa: ANN001, ANN201
                 enqueue(place, work.pending[place, label] - 1, work.queues, work.queued, work.rings)
 
 
-@njit(cache=True, nogil=True)
+@compiled()
 def settle(graph, unary, pairwise, labels, work, limits):  # noqa: PLR0917, ANN001, ANN201
     """Take places from the queues and try their pending swaps, as `run_swaps` says."""
     core, rings, queues, queued = work.core, work.rings, work.queues, work.queued
@@ -176,7 +176,7 @@ def settle(graph, unary, pairwise, labels, work, limits):  # noqa: PLR0917, ANN0
     return SPENT
 
 
-@njit(cache=True, nogil=True)
+@compiled()
 def next_pending(place, depth, graph, unary, pairwise, labels, pending, costs):  # noqa: PLR0917, ANN001, ANN201
     """A label to try at `place`, -1 if none; clears the flags of labels that its neighbours force it not to take."""
     alpha = labels[place]
@@ -192,7 +192,7 @@ def next_pending(place, depth, graph, unary, pairwise, labels, pending, costs): 
     return found
 
 
-@njit(cache=True, nogil=True)
+@compiled()
 def conditional(place, starts, neighbours, weights, unary, pairwise, labels, costs):  # noqa: PLR0917, ANN001, ANN201
     """Fill in `costs` (label,) of each label while the neighbours keep theirs; return the like neighbours' weight."""
     like, own, count = 0.0, labels[place], len(costs)
@@ -207,7 +207,7 @@ def conditional(place, starts, neighbours, weights, unary, pairwise, labels, cos
     return like
 
 
-@njit(cache=True, nogil=True)
+@compiled()
 def explore(graph, unary, pairwise, labels, work, limit):  # noqa: PLR0917, ANN001, ANN201
     """Find the core around the place in hand: its free places, and the forced ones around them, into `seen`.
 
@@ -255,7 +255,7 @@ def explore(graph, unary, pairwise, labels, work, limit):  # noqa: PLR0917, ANN0
         close_off(alpha, beta, cost, graph, labels, work)
 
 
-@njit(cache=True, nogil=True)
+@compiled()
 def weigh(place, alpha, beta, starts, neighbours, weights, unary, pairwise, labels, mark, lean, hold):  # noqa: PLR0917, ANN001, ANN201
     """D and S of a place, the forced neighbours counted as fixed."""
     cost, total, held = pairwise[alpha, beta], unary[place, beta] - unary[place, alpha], 0.0
@@ -273,7 +273,7 @@ def weigh(place, alpha, beta, starts, neighbours, weights, unary, pairwise, labe
     lean[place], hold[place] = total, held
 
 
-@njit(cache=True, nogil=True)
+@compiled()
 def is_forced(place, alpha, labels, mark, lean, hold):  # noqa: PLR0917, ANN001, ANN201
     """Mark a free place that one label suits whatever its free neighbours take; of two equal ones, its own."""
     for_alpha, for_beta = lean[place] >= hold[place], lean[place] <= -hold[place]
@@ -284,7 +284,7 @@ def is_forced(place, alpha, labels, mark, lean, hold):  # noqa: PLR0917, ANN001,
     return for_alpha or for_beta
 
 
-@njit(cache=True, nogil=True)
+@compiled()
 def close_off(alpha, beta, cost, graph, labels, work):  # noqa: PLR0917, ANN001, ANN201
     """In a core that was ended, neighbours beyond the end keep their labels."""
     for index in range(work.core[SEEN]):
@@ -300,7 +300,7 @@ def close_off(alpha, beta, cost, graph, labels, work):  # noqa: PLR0917, ANN001,
                     work.lean[place] -= cost * graph.weights[arc]
 
 
-@njit(cache=True, nogil=True)
+@compiled()
 def commit(graph, unary, pairwise, labels, work, limits):  # noqa: PLR0917, ANN001, ANN201
     """Relabel the core in hand as marked if that gains more than the least, then update flags and clear marks."""
     core, seen, stack, mark, pending = work.core, work.seen, work.stack, work.mark, work.pending
@@ -331,7 +331,7 @@ def commit(graph, unary, pairwise, labels, work, limits):  # noqa: PLR0917, ANN0
             flag_after(neighbours[arc], alpha, beta, labels, work)
 
 
-@njit(cache=True, nogil=True)
+@compiled()
 def flag_after(place, alpha, beta, labels, work):  # noqa: ANN001, ANN201
     """Flag a place after a swap of alpha and beta nearby; that swap need not be tried again, unless it was ended."""
     kept_alpha, kept_beta = work.pending[place, alpha], work.pending[place, beta]
@@ -341,7 +341,7 @@ def flag_after(place, alpha, beta, labels, work):  # noqa: ANN001, ANN201
         work.pending[place, alpha], work.pending[place, beta] = kept_alpha, kept_beta
 
 
-@njit(cache=True, nogil=True)
+@compiled()
 def tried(place, label, capped, work):  # noqa: ANN001, ANN201
     """Note that the swap with `label` was tried at `place`: it is done with, or still to be tried DEEP."""
     if capped == 0:
@@ -351,7 +351,7 @@ def tried(place, label, capped, work):  # noqa: ANN001, ANN201
         enqueue(place, DEEP - 1, work.queues, work.queued, work.rings)
 
 
-@njit(cache=True, nogil=True)
+@compiled()
 def cut_core(graph, cost, work):  # noqa: ANN001, ANN201
     """Decide the free places by a maximum flow (Dinic, 1970) on the arcs of the graph itself; nothing is copied.
 
@@ -377,7 +377,7 @@ def cut_core(graph, cost, work):  # noqa: ANN001, ANN201
             mark[place] = TAKES_BETA if level[place] >= 0 else TAKES_ALPHA
 
 
-@njit(cache=True, nogil=True)
+@compiled()
 def rank(seen, starts, neighbours, twins, mark, lean, level, stack, capacity):  # noqa: PLR0917, ANN001, ANN201
     """Distance of each free place to the sink over arcs with capacity left, -1 = none; True if a fed place has one."""
     count, fed = 0, False
@@ -401,7 +401,7 @@ def rank(seen, starts, neighbours, twins, mark, lean, level, stack, capacity):  
     return fed
 
 
-@njit(cache=True, nogil=True)
+@compiled()
 def push(source, starts, neighbours, twins, mark, lean, level, path, next_arc, capacity):  # noqa: PLR0917, ANN001, ANN201
     """Send what feeds `source` down the levels to drained places, until it is used up or nothing gets through.
 
@@ -452,7 +452,7 @@ def core_in_hand(
     return free, np.zeros(len(free)), work.lean[free], edges, weights
 
 
-@njit(cache=True, nogil=True)
+@compiled()
 def _core_edges(graph, free, mark, local, cost):  # noqa: ANN001, ANN202
     count = 0
     for index, place in enumerate(free):

@@ -11,7 +11,8 @@ operations.
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
+
+from prior_sg.services.compiled import compiled
 
 VECTOR = 8
 UNROLLED = 4  # labels that one step of the inner loop takes
@@ -44,7 +45,7 @@ def empty_messages(places: int, arcs: int, pairwise: np.ndarray, number: type) -
     )
 
 
-@njit(cache=True, nogil=True)
+@compiled()
 def take_up(rows, graph, unary, labels, messages):  # noqa: ANN001, ANN201
     """Put the places `rows` in hand, without messages; all others keep `labels`."""
     count, pairwise = unary.shape[1], messages.pairwise
@@ -65,14 +66,14 @@ def take_up(rows, graph, unary, labels, messages):  # noqa: ANN001, ANN201
                     costs[place, label] += weights[arc] * pairwise[labels[neighbour], label]
 
 
-@njit(cache=True, nogil=True)
+@compiled()
 def lay_down(rows, messages):  # noqa: ANN001, ANN201
     """No place is in hand any more."""
     for place in rows:
         messages.inside[place] = False
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, inline="always")
+@compiled(fastmath=FAST, inline="always")
 def _tell(told, weight, pairwise, incoming, arc):  # noqa: ANN001, ANN202
     """The message to `arc`, min_i told[i] + weight V[i, j] less its least value, which is returned."""
     count, padded = pairwise.shape
@@ -92,7 +93,7 @@ def _tell(told, weight, pairwise, incoming, arc):  # noqa: ANN001, ANN202
     return least
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@compiled(fastmath=FAST)
 def run_pass(rows, forward, graph, messages):  # noqa: ANN001, ANN201
     """One pass over `rows` (ascending) in order or back; fills in `proposed`, returns the bound."""
     starts, neighbours, weights, twins = graph.starts, graph.neighbours, graph.weights, graph.twins
@@ -143,7 +144,7 @@ def run_pass(rows, forward, graph, messages):  # noqa: ANN001, ANN201
     return bound
 
 
-@njit(cache=True, nogil=True)
+@compiled()
 def energy_of(rows, labels, graph, messages):  # noqa: ANN001, ANN201
     """Energy of the places in hand with `labels`, the costs against the others included."""
     total = 0.0

@@ -4,11 +4,11 @@ from typing import NamedTuple
 
 import msgspec
 import numpy as np
-from numba import njit
 from scipy import ndimage
 
 from prior_sg.schemas.features import Pyramid
 from prior_sg.schemas.frames import Intrinsics
+from prior_sg.services.compiled import compiled
 from prior_sg.services.geometry import inverse
 
 ROWS_PER_BLOCK = 128  # places multiplied at once: their sums stay in the processor's cache
@@ -108,7 +108,7 @@ def kernel(frame: Frame, positions_m: np.ndarray, query_radius_m: float, gamma: 
     return weigh(query_states, crop_states, frame.layer_starts, float(gamma))
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@compiled(fastmath=True)
 def weigh(
     query_states: np.ndarray, crop_states: np.ndarray, layer_starts: np.ndarray, gamma: float
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -209,7 +209,7 @@ class Evidence:
         self.frames = np.concatenate((self.frames, np.zeros(size - have, dtype=np.int64)))
 
 
-@njit(cache=True, nogil=True)
+@compiled()
 def accumulate(
     sums: np.ndarray, slots: np.ndarray, weights: np.ndarray, trust: np.ndarray, embeddings: np.ndarray
 ) -> None:

@@ -3,7 +3,8 @@
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
+
+from prior_sg.services.compiled import compiled
 
 
 class Arcs(NamedTuple):
@@ -22,7 +23,7 @@ def arcs_of(places: int, edges: np.ndarray, weights: np.ndarray) -> Arcs:
     return Arcs(*_build(places, edges, np.ascontiguousarray(weights, dtype=np.float64)))
 
 
-@njit(cache=True, nogil=True)
+@compiled()
 def _build(places, edges, weights):  # noqa: ANN001, ANN202
     """Counting sort; an edge from a place to itself costs nothing (the diagonal is zero) and is left out."""
     starts = np.zeros(places + 1, np.int64)
@@ -51,7 +52,7 @@ def _build(places, edges, weights):  # noqa: ANN001, ANN202
     return starts, neighbours, arc_weights, twins, numbers
 
 
-@njit(cache=True, nogil=True)
+@compiled()
 def ball(centers, reach, starts, neighbours, inside):  # noqa: ANN001, ANN201
     """Rows, ascending, within `reach` steps of `centers`; `inside` is scratch, all False before and after."""
     found = np.empty(len(inside), np.int64)

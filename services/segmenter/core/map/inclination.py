@@ -12,8 +12,8 @@ from typing import NamedTuple
 
 import msgspec
 import numpy as np
-from numba import njit
 
+from prior_sg.services.compiled import compiled
 from prior_sg.services.segmenter.core.map.received import ReceivedGraph, Step
 
 
@@ -76,7 +76,7 @@ def disturbed(before: ReceivedGraph, step: Step, limit_m: float) -> np.ndarray:
     return mask
 
 
-@njit(cache=True, nogil=True)
+@compiled()
 def _moments(starts, neighbours, lengths_m, positions_m, rows, limit_m):  # noqa: ANN001, ANN202, PLR0917
     """Number of places (row,) and covariance of their centres (row, 3, 3) of each neighbourhood."""
     counts = np.zeros(len(rows), np.int64)
@@ -98,13 +98,13 @@ def _moments(starts, neighbours, lengths_m, positions_m, rows, limit_m):  # noqa
     return counts, covariances
 
 
-@njit(cache=True, nogil=True)
+@compiled()
 def _reach(starts, neighbours, lengths_m, rows, limit_m):  # noqa: ANN001, ANN202
     distances_m = np.full(len(starts) - 1, np.inf)
     return np.array(_settle(starts, neighbours, lengths_m, rows, limit_m, distances_m), np.int64)
 
 
-@njit(cache=True, nogil=True)
+@compiled()
 def _settle(starts, neighbours, lengths_m, sources, limit_m, distances_m):  # noqa: ANN001, ANN202, PLR0917
     """Dijkstra from the sources up to the limit; returns each reached row once. `distances_m` starts at infinity and is
     left finite at the reached rows."""

@@ -15,7 +15,6 @@ from dataclasses import dataclass, field
 
 import msgspec
 import numpy as np
-from numba import njit
 from scipy.optimize import linear_sum_assignment
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
@@ -23,6 +22,7 @@ from scipy.spatial import cKDTree
 
 from prior_sg.schemas.codec import copied
 from prior_sg.schemas.objects import Detections
+from prior_sg.services.compiled import compiled
 from prior_sg.services.geometry import inverse, transform
 from prior_sg.services.segmenter.core.evidence import kernel
 
@@ -420,7 +420,7 @@ def shared(cells: np.ndarray, others: np.ndarray) -> float:
     return count_near(cells, others, COLUMNS) / len(cells)
 
 
-@njit(cache=True, nogil=True)
+@compiled()
 def count_near(cells: np.ndarray, others: np.ndarray, steps: np.ndarray) -> int:
     """How many of the cells have, at one of the steps from them, one of the others or its neighbour on the last axis.
 

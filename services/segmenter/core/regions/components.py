@@ -3,12 +3,12 @@
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, cKDTree
 
 from prior_sg.schemas.regions import NO_REGION, RegionEvent, Transition
+from prior_sg.services.compiled import compiled
 from prior_sg.services.segmenter.core.experts.context import ObjectView
 from prior_sg.services.segmenter.core.map.received import ReceivedGraph
 
@@ -25,7 +25,7 @@ def numbered(labels: np.ndarray, edges: np.ndarray) -> np.ndarray:
     return _numbered(labels, edges)
 
 
-@njit(cache=True, nogil=True)
+@compiled()
 def _numbered(labels, edges):  # noqa: ANN001, ANN202
     """Union by the smaller row, which is then the component's first place."""
     parent = np.arange(len(labels))

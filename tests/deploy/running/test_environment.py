@@ -1,0 +1,123 @@
+"""Odd places and times to start: limits, signals, folders and arguments."""
+
+import errno
+import os
+import resource
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+import prior_sg
+from prior_sg.deploy.cli.faults import sentence_of
+from prior_sg.deploy.cli.main import main
+from prior_sg.deploy.running.job import RunError, claimed_folder
+from prior_sg.deploy.running.supervisor import Child, ChildFailed, Supervisor
+from prior_sg.services.runtime.endpoints import free_endpoint
+
+COMMAND = [sys.executable, "-m", "prior_sg.deploy.cli.main"]
+ENVIRONMENT = os.environ | {"PYTHONPATH": str(Path(prior_sg.__file__).parents[1])}
+
+
+def started(*arguments, **options):
+    return subprocess.Popen(
+        [*COMMAND, *arguments], env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, **options
+    )
+
+
+def test_a_folder_is_one_runs_at_a_time(tmp_path):
+    out = tmp_path / "out"
+    with claimed_folder(out), pytest.raises(RunError, match="another run is writing to"), claimed_folder(out):
+        pass
+    with claimed_folder(tmp_path / "out"):
+        assert list((tmp_path / "out").iterdir()) == []
+
+
+@pytest.mark.parametrize("delay_s", [0.3, 0.8, 1.5, 3.0])
+def test_an_interrupt_at_any_moment_is_told_in_a_line(tmp_path, delay_s):
+    process = started("up", "scene_store", "--out", str(tmp_path), "--connect", free_endpoint("tcp/127.0.0.1:0"))
+    time.sleep(delay_s)
+    process.send_signal(signal.SIGINT)
+    said, _ = process.communicate(timeout=60)
+    assert "Traceback" not in said
+    assert process.returncode in (0, 130, -signal.SIGINT)
+
+
+@pytest.mark.parametrize(
+    ("limit", "value", "said"),
+    [(resource.RLIMIT_NOFILE, 24, "ulimit -n"), (resource.RLIMIT_AS, 1_000_000 * 1024, "ulimit -v")],
+)
+def test_a_limit_that_is_too_low_is_named(tmp_path, limit, value, said):
+    process = started(
+        *("up", "scene_store", "--out", str(tmp_path), "--connect", free_endpoint("tcp/127.0.0.1:0")),
+        preexec_fn=lambda: resource.setrlimit(limit, (value, value)),
+    )
+    output, _ = process.communicate(timeout=60)
+    assert process.returncode == 1
+    assert output.startswith("prior-sg: ") and output.count("\n") == 1 and said in output
+
+
+def test_an_argument_that_is_no_text_is_one_sentence(tmp_path, capsys):
+    assert main(["up", "--out", str(tmp_path / "o\udcff")]) == 1
+    assert "\\xff' is not UTF-8" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (OSError(errno.ENOSPC, "No space left on device", "/data/x"), "no space left for /data/x"),
+        (OSError(errno.EROFS, "Read-only file system", "/data/x"), "/data/x"),
+        (OSError(errno.EMFILE, "Too many open files"), "ulimit -n"),
+        (BlockingIOError(errno.EAGAIN, "Resource temporarily unavailable"), "no more processes"),
+        (OSError(errno.ENAMETOOLONG, "File name too long", "x" * 9), "too long"),
+        (FileNotFoundError(errno.ENOENT, "No usable temporary directory found in ['/tmp']"), "TMPDIR"),
+        (MemoryError(), "not enough memory"),
+        (RuntimeError("can't start new thread"), "no more threads"),
+    ],
+)
+def test_faults_of_the_system_are_one_sentence(error, said):
+    assert said in sentence_of(error)
+    assert "\n" not in sentence_of(error)
+
+
+def test_faults_of_the_program_keep_their_traceback():
+    assert sentence_of(RuntimeError("bad")) is None and sentence_of(KeyError("x")) is None
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("", "(empty log)"),
+        ("Fatal Python error", "Fatal Python error"),
+        ('{"level": "error"}', '{"level": "error"}'),
+        ("[1]", "[1]"),
+        ("3", "3"),
+        ('{"event": "no disk"}', "no disk"),
+    ],
+)
+def test_last_words_are_any_line(tmp_path, line, said):
+    log = tmp_path / "x.log"
+    log.write_text(line)
+    assert Child("segmenter", "segmenter-1", [], log, 1).last_words() == said
+    log.unlink()
+    assert "no log" in Child("segmenter", "segmenter-1", [], log, 1).last_words()
+
+
+def test_a_service_ended_by_a_signal_is_told_by_its_name(tmp_path):
+    supervisor = Supervisor("tcp/127.0.0.1:1", "ada", tmp_path)
+    child = Child("segmenter", "segmenter-1", [], tmp_path / "segmenter-1.log", 1)
+    supervisor.children.append(child)
+    for number, said in ((signal.SIGSEGV, "SIGSEGV"), (signal.SIGKILL, "too little memory"), (40, "signal 40")):
+        child.process = subprocess.Popen(["/bin/sh", "-c", f"kill -{int(number)} $$"])
+        child.process.wait()
+        (event,) = supervisor.check()
+        assert said in event
+    child.deaths = 9
+    child.process = subprocess.Popen(["/bin/sh", "-c", "kill -11 $$"])
+    child.process.wait()
+    child.started_s = time.monotonic()
+    with pytest.raises(ChildFailed, match="ended by signal SIGSEGV"):
+        supervisor.check()

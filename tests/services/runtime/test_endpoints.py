@@ -1,0 +1,121 @@
+"""Which endpoints are taken, which are free, and what is said of the others."""
+
+import errno
+import socket
+import time
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from prior_sg.services.runtime.bus import BusError
+from prior_sg.services.runtime.endpoints import cannot_listen, check_endpoint, free_endpoint, parse_endpoint
+from prior_sg.services.runtime.zenoh_bus import ZenohBus, client_config, open_router, router_config
+
+ROUTER_FILE = Path(__file__).parents[3] / "deploy" / "router.json5"
+NONSENSE = (
+    "",
+    "7447",
+    "127.0.0.1:7447",
+    "tcp/127.0.0.1",
+    "tcp/:7447",
+    "tcp/::1:7447",
+    "tcp/[::1:7447",
+    "tcp/127.0.0.1:-1",
+    "tcp/127.0.0.1:99999",
+    "tcp/127.0.0.1:7447/x",
+    "tcp/a b:7447",
+    "http://localhost:7447",
+    "foo/127.0.0.1:7447",
+)
+
+
+def has_ipv6():
+    try:
+        with socket.socket(socket.AF_INET6) as probe:
+            probe.bind(("::1", 0))
+    except OSError:
+        return False
+    return True
+
+
+@pytest.mark.parametrize("text", NONSENSE)
+def test_nonsense_is_refused_at_once_by_router_client_and_search(text):
+    started_s = time.monotonic()
+    for use in (free_endpoint, open_router, ZenohBus):
+        with pytest.raises(BusError, match="--connect takes PROTOCOL/HOST:PORT") as refused:
+            use(text)
+        assert "\n" not in str(refused.value)
+    assert time.monotonic() - started_s < 2
+
+
+def test_port_0_is_for_a_run_only():
+    with pytest.raises(BusError, match="port 0"):
+        check_endpoint("tcp/127.0.0.1:0")
+    assert parse_endpoint(free_endpoint("tcp/127.0.0.1:0")).port > 0
+
+
+@pytest.mark.parametrize(
+    "host",
+    [
+        "127.0.0.1",
+        "127.0.0.2",
+        "localhost",
+        "0.0.0.0",
+        pytest.param("[::1]", marks=pytest.mark.skipif("not has_ipv6()")),
+    ],
+)
+@pytest.mark.parametrize("protocol", ["tcp", "udp"])
+def test_odd_loopbacks_carry_a_bus(protocol, host):
+    endpoint = free_endpoint(f"{protocol}/{host}:0")
+    assert endpoint.startswith(f"{protocol}/{host}:")
+    stop = open_router(endpoint)
+    try:
+        ZenohBus(endpoint, wait_s=2.0).close()
+    finally:
+        stop()
+
+
+def test_what_follows_the_port_is_kept():
+    assert free_endpoint("tcp/127.0.0.1:0#iface=lo").endswith("#iface=lo")
+
+
+def test_a_taken_port_gives_another_and_a_router_there_says_so():
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        wanted = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
+        assert free_endpoint(wanted) != wanted
+        with pytest.raises(BusError, match="in use"):
+            open_router(wanted)
+
+
+def test_an_address_of_another_host_is_told_from_a_taken_port():
+    for use in (free_endpoint, open_router):
+        with pytest.raises(BusError, match="no address of this host"):
+            use("tcp/192.0.2.1:7447")
+    with pytest.raises(BusError, match="not known here"):
+        free_endpoint("tcp/nosuchhost.invalid:7447")
+
+
+@pytest.mark.parametrize(
+    ("number", "said"),
+    [
+        (errno.EACCES, "above 1023"),
+        (errno.EADDRINUSE, "in use"),
+        (errno.EAFNOSUPPORT, "IPv6"),
+        (errno.EMFILE, "ulimit -n"),
+        (0, "Missing TLS private key"),
+    ],
+)
+def test_causes_are_told_apart(number, said):
+    assert said in cannot_listen("tcp/127.0.0.1:80", number, "Missing TLS private key")
+
+
+def test_no_zenoh_of_ours_asks_for_shared_memory():
+    for config in (
+        client_config("tcp/127.0.0.1:1"),
+        router_config("tcp/127.0.0.1:1"),
+        zenoh.Config.from_file(str(ROUTER_FILE)),
+    ):
+        assert config.get_json("transport/shared_memory/enabled") == "false"

@@ -1,0 +1,68 @@
+"""Compiled code where little or nothing can be written."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from prior_sg.services import compiled
+
+ONE_LOOP = """
+from prior_sg.services.compiled import compiled
+
+@compiled()
+def twice(x):
+    return 2 * x
+
+print(twice(21))
+"""
+
+
+@pytest.fixture
+def program(tmp_path):
+    """A module whose folder cannot be written, for root neither: a file stands where its cache would be."""
+    folder = tmp_path / "code"
+    folder.mkdir()
+    (folder / "loop.py").write_text(ONE_LOOP)
+    (folder / "__pycache__").write_text("")
+    return folder / "loop.py"
+
+
+def run(program, **variables):
+    environment = {name: value for name, value in os.environ.items() if name != "NUMBA_CACHE_DIR"}
+    source = str(Path(compiled.__file__).parents[2])
+    environment |= {
+        "PYTHONPATH": source,
+        "PYTHONDONTWRITEBYTECODE": "1",
+        "HOME": "/proc/1",
+        "XDG_CACHE_HOME": "/proc/1",
+    }
+    return subprocess.run(
+        [sys.executable, str(program)],
+        check=False,
+        env=environment | variables,
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+
+
+def test_without_any_cache_it_is_kept_in_a_temporary_folder_and_said_once(program, tmp_path):
+    done = run(program, TMPDIR=str(tmp_path))
+    assert done.stdout == "42\n"
+    folder = tmp_path / f"prior-sg-{os.getuid()}" / "compiled"
+    assert list(folder.rglob("*.nbi")), "nothing was kept"
+    assert done.stderr.count("\n") == 1 and str(folder) in done.stderr and "NUMBA_CACHE_DIR" in done.stderr
+
+
+def test_a_folder_of_the_users_choice_is_taken_in_silence(program, tmp_path):
+    done = run(program, NUMBA_CACHE_DIR=str(tmp_path / "mine"))
+    assert (done.stdout, done.stderr) == ("42\n", "")
+    assert list((tmp_path / "mine").rglob("*.nbi"))
+
+
+def test_where_nothing_can_be_written_it_is_compiled_all_the_same(program):
+    done = run(program, NUMBA_CACHE_DIR="/dev/null")
+    assert (done.returncode, done.stdout) == (0, "42\n")
