@@ -78,7 +78,7 @@ def look(
     """Read a source: every stamp and pose, and some images; what the time does not suffice for is left out."""
     end_s = time.monotonic() + (BRIEF_LIMIT_S if brief else LIMIT_S)
     recording = Recording(source.total)
-    state = selection.State(robot="")
+    state = selection.State(robot="sample")  # nobody reads what it would publish
     frames = min(source.total, BRIEF_FRAMES) if brief else source.total
     wants = Picker(frames, BRIEF_PAIRS if brief else PAIRS).wants
     color_every = max(1, min(frames, 2 * PAIRS) // COLORS)
