@@ -62,7 +62,7 @@ def test_a_limit_that_is_too_low_is_named(tmp_path, limit, value, said):
 
 def test_an_argument_that_is_no_text_is_one_sentence(tmp_path, capsys):
     assert main(["up", "--out", str(tmp_path / "o\udcff")]) == 1
-    assert "\\xff' is not UTF-8" in capsys.readouterr().err
+    assert "\\udcff' is not valid UTF-8" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
