@@ -47,8 +47,15 @@ def check_texts(arguments: Sequence[str]) -> None:
         try:
             text.encode()
         except UnicodeEncodeError as error:
-            shown = os.fsencode(text).decode(errors="backslashreplace")
-            raise UserError(f"{shown!r} is not UTF-8; type it anew, or rename the file or folder") from error
+            raise UserError(_no_text(os.fsencode(text))) from error
+
+
+def _no_text(argument: bytes) -> str:
+    try:
+        return f"this terminal's locale has no letters for {argument.decode()!r}; set LC_ALL=C.UTF-8"
+    except UnicodeDecodeError:
+        shown = argument.decode(errors="backslashreplace")
+        return f"{shown!r} is not UTF-8; type it anew, or rename the file or folder"
 
 
 def check_memory(extra: str) -> None:
