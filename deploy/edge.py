@@ -1,6 +1,7 @@
 """Names and texts that a user gives are checked here, before anything is started."""
 
 import argparse
+import os
 from collections.abc import Sequence
 
 from prior_sg.deploy.errors import UserError
@@ -29,7 +30,15 @@ def check_encoding(arguments: Sequence[str]) -> None:
     """Raise UserError for an argument whose bytes are not text."""
     for argument in arguments:
         if any("\ud800" <= c <= "\udfff" for c in argument):
-            raise UserError(f"{argument!a} is not valid UTF-8: give every argument in UTF-8")
+            raise UserError(_no_text(argument))
+
+
+def _no_text(argument: str) -> str:
+    try:
+        text = os.fsencode(argument).decode()
+        return f"this terminal's locale has no letters for {text!r}; set LC_ALL=C.UTF-8"
+    except UnicodeError:
+        return f"{argument!a} is not valid UTF-8: type it anew, or rename the file or folder"
 
 
 def check_arguments(arguments: argparse.Namespace) -> None:

@@ -34,8 +34,8 @@ from prior_sg.schemas.topics import INGEST_STATE, KEYFRAME, PLACE_DELTA, PYRAMID
 from prior_sg.services.registry import SERVICES
 from prior_sg.services.runtime.bus import Bus, LocalBus, Sample
 from prior_sg.services.runtime.client import BusClient, NoPriorError
-from prior_sg.services.runtime.endpoints import free_endpoint, parse_endpoint
-from prior_sg.services.runtime.zenoh_bus import ZenohBus, open_router
+from prior_sg.services.runtime.endpoints import parse_endpoint
+from prior_sg.services.runtime.zenoh_bus import ZenohBus, open_free_router
 
 log = logging.getLogger(__name__)
 QUIET_S = 1.5
@@ -177,11 +177,10 @@ def _run_in_folder(job: Job, console: Terminal) -> Result:
         services = InProcess(job.robot, logs, settings, job.config)
         return _run_on(LocalBus(services.hub), services, job, console)
     require_files()
-    endpoint = free_endpoint(job.connect)
+    endpoint, stop_router = open_free_router(job.connect)
     if endpoint != job.connect:
         taken = "" if parse_endpoint(job.connect).port == 0 else f"{job.connect} is in use; "
         console.print(f"{taken}this run's router listens on {endpoint} (--connect {endpoint})")
-    stop_router = open_router(endpoint)
     try:
         supervisor = Supervisor(endpoint, job.robot, logs, settings, job.config)
         return _run_on(ZenohBus(endpoint), supervisor, job, console)

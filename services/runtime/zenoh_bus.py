@@ -6,6 +6,7 @@ deltas. The encoding of everything sent names its schema; what comes in another 
 """
 
 import contextlib
+import errno
 import json
 import logging
 import threading
@@ -31,16 +32,28 @@ from prior_sg.services.runtime.bus import (
     Sample,
     unpack_header,
 )
-from prior_sg.services.runtime.endpoints import cannot_listen, check_endpoint, check_host, number_in, without_places
+from prior_sg.services.runtime.endpoints import (
+    cannot_listen,
+    check_endpoint,
+    check_host,
+    free_endpoint,
+    number_in,
+    without_places,
+)
 
 log = logging.getLogger(__name__)
 HEARTBEAT_S = 0.3
 CLOSE_TIMEOUT_S = 3.0
 LEASE_MS = 2000
+ATTEMPTS = 5
 TRANSPORT = {
     "link": {"tx": {"lease": LEASE_MS, "keep_alive": 4}, "rx": {"buffer_size": 4194304}},
     "shared_memory": {"enabled": False},  # asks for a /dev/shm that can be written, which containers may lack
 }
+
+
+class EndpointTakenError(BusError):
+    """Somebody else listens there."""
 
 
 def client_config(endpoint: str) -> zenoh.Config:
@@ -85,8 +98,21 @@ def open_router(endpoint: str) -> Callable[[], None]:
         session = zenoh.open(router_config(endpoint))
     except zenoh.ZError as error:
         said = str(error)
-        raise BusError(cannot_listen(endpoint, number_in(said), without_places(said))) from error
+        number = number_in(said)
+        kind = EndpointTakenError if number == errno.EADDRINUSE else BusError
+        raise kind(cannot_listen(endpoint, number, without_places(said))) from error
     return lambda: _close_within(session, CLOSE_TIMEOUT_S)
+
+
+def open_free_router(wanted: str) -> tuple[str, Callable[[], None]]:
+    """A router on the endpoint wanted or on a free port of the same host: where it listens, and the function that stops
+    it. Others may take a port between its being found free and being used. Raises BusError."""
+    for _ in range(ATTEMPTS - 1):
+        endpoint = free_endpoint(wanted)
+        with contextlib.suppress(EndpointTakenError):
+            return endpoint, open_router(endpoint)
+    endpoint = free_endpoint(wanted)
+    return endpoint, open_router(endpoint)
 
 
 def _close_within(session: zenoh.Session, timeout_s: float) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import zenoh
 
+from prior_sg.services.runtime import zenoh_bus
 from prior_sg.services.runtime.bus import BusError
 from prior_sg.services.runtime.endpoints import cannot_listen, check_endpoint, free_endpoint, parse_endpoint
 from prior_sg.services.runtime.zenoh_bus import ZenohBus, client_config, open_router, router_config
@@ -119,3 +120,14 @@ def test_no_zenoh_of_ours_asks_for_shared_memory():
         zenoh.Config.from_file(str(ROUTER_FILE)),
     ):
         assert config.get_json("transport/shared_memory/enabled") == "false"
+
+
+def test_a_port_taken_after_it_was_found_free_is_no_end(monkeypatch):
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        found = [f"tcp/127.0.0.1:{taken.getsockname()[1]}", free_endpoint("tcp/127.0.0.1:0")]
+        monkeypatch.setattr(zenoh_bus, "free_endpoint", lambda wanted: found.pop(0))
+        endpoint, stop = zenoh_bus.open_free_router("tcp/127.0.0.1:0")
+        stop()
+    assert found == [] and endpoint.startswith("tcp/127.0.0.1:")
