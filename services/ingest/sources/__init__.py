@@ -21,6 +21,7 @@ from prior_sg.services.ingest.sources import (
     tum,
 )
 from prior_sg.services.ingest.sources.base import Source, SourceError
+from prior_sg.services.ingest.sources.hints import hint
 from prior_sg.services.ingest.sources.normalise import finish
 
 __all__ = ["LAYOUT_NAMES", "ReadOptions", "Source", "SourceError", "open_source"]
@@ -55,8 +56,11 @@ def open_source(
     for layout in LAYOUTS:
         if layout.fits(path):
             return finish(layout.load(path, options), options)
+    said = hint(path, lambda folder: any(layout.fits(folder) for layout in LAYOUTS))
     looks = ", ".join(layout.LOOKS for layout in LAYOUTS)
-    raise SourceError(f"{path} is no known source: looked for {looks}, or a file ending in .mcap (log)")
+    raise SourceError(
+        f"{path} is no known source{f': {said}' if said else ''}; looked for {looks}, or a file ending in .mcap (log)"
+    )
 
 
 def _with(options: ReadOptions, world_up: Sequence[float], floor_m: float, robot: str) -> ReadOptions:

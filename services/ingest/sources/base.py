@@ -149,15 +149,21 @@ def camera_of(path: Path, camera: Any) -> Camera:
 
     `path` is for the reader of an error. Raises SourceError.
     """
+    if not isinstance(camera, dict):
+        raise SourceError(f"{path} is not a camera: it must be an object with {', '.join(CAMERA_KEYS)}")
+    missing = [name for name in CAMERA_KEYS if camera.get(name) is None]
+    if missing:
+        held = ", ".join(str(name)[:20] for name in list(camera)[:12]) or "nothing"
+        raise SourceError(f"{path} is not a camera: it lacks {', '.join(missing)}; it holds {held}")
     try:
-        intrinsics = Intrinsics(
-            int(camera["width"]), int(camera["height"]), *(float(camera[name]) for name in ("fx", "fy", "cx", "cy"))
-        )
-    except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise SourceError(f"{path} is not a camera: {error!r}") from error
+        size, numbers = CAMERA_KEYS[:2], CAMERA_KEYS[2:]
+        intrinsics = Intrinsics(*(int(camera[name]) for name in size), *(float(camera[name]) for name in numbers))
+    except (TypeError, ValueError, OverflowError) as error:
+        raise SourceError(f"{path} is not a camera: {error}") from error
     return Camera(intrinsics, *lens_of(path, camera))
 
 
+CAMERA_KEYS = ("width", "height", "fx", "fy", "cx", "cy")
 LENS_NAMES = {
     "pinhole": ("pinhole", "simple_pinhole", "none", "ideal"),
     "opencv": (
@@ -191,8 +197,12 @@ def lens_of(path: Path, camera: dict[str, Any]) -> tuple[str, tuple[float, ...]]
 
 
 def numbered(folder: Path, pattern: str) -> dict[int, Path]:
-    """Files of a folder by number, the first group of a regular expression that matches the whole name."""
-    matches = ((re.fullmatch(pattern, file.name), file) for file in folder.iterdir()) if folder.is_dir() else ()
+    """Files of a folder by number, the first group of a regular expression that matches the whole name.
+
+    Endings may be in capital letters; hidden files are somebody else's.
+    """
+    files = [file for file in folder.iterdir() if not file.name.startswith(".")] if folder.is_dir() else []
+    matches = ((re.fullmatch(pattern, file.name, re.IGNORECASE), file) for file in files)
     return dict(sorted((int(match[1]), file) for match, file in matches if match))
 
 
@@ -208,15 +218,20 @@ def images_of(colors: dict[int, Path], depths: dict[int, Path], number: int) -> 
     return Images(file_of(colors, number, "colour"), file_of(depths, number, "depth"))
 
 
-def first_size(files: Sequence[Path]) -> tuple[int, int]:
-    """Width and height, pixels, of the first image that can be read. Raises SourceError."""
+def first_size(files: Sequence[Path], where: Path) -> tuple[int, int]:
+    """Width and height, pixels, of the first image, of those looked for in `where`, that can be read.
+
+    Raises SourceError.
+    """
     for file in files:
         try:
             width_px, height_px, _ = measured(read_bytes(file))
             return width_px, height_px
         except (FrameError, ImageError):
             continue
-    raise SourceError(f"no image in {files[0].parent if files else 'the source'} can be read")
+    if not files:
+        raise SourceError(f"{where} holds no images of the layout's names")
+    raise SourceError(f"no image in {files[0].parent} can be read")
 
 
 def levelling(world_up: Sequence[float], floor_m: float) -> np.ndarray | None:

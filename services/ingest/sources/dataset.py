@@ -10,6 +10,8 @@ pose_updates.csv  corrected poses, where they exist: stamp_ns (when the correcti
 regions.json      ground truth, where it exists
 """
 
+import re
+from dataclasses import dataclass
 from functools import partial
 from itertools import groupby
 from pathlib import Path
@@ -28,10 +30,13 @@ from prior_sg.services.ingest.sources.base import (
     Images,
     SourceError,
     camera_of,
+    numbered,
     read_bytes,
     truth_beside,
 )
 from prior_sg.services.ingest.sources.tables import (
+    FEW,
+    NUMBER,
     check_stamps,
     csv_rows,
     order_of,
@@ -45,8 +50,21 @@ TRAJECTORY, POSE_UPDATES = "trajectory.csv", "pose_updates.csv"
 LOOKS = f"{CAMERA} and {TRAJECTORY} (dataset folder)"
 POSED = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
 COLUMNS = ("frame", "stamp_ns", *POSED)
-COLORS, DEPTHS = (".jpg", ".png", ".jpeg", ".bmp", ".webp"), (".png", ".npy", ".tiff", ".tif", ".exr")
+COLORS, DEPTHS = (".jpg", ".png", ".jpeg", ".bmp", ".webp", ".tif", ".tiff"), (".png", ".npy", ".tiff", ".tif", ".exr")
+MASKS, FOLDERS = (".png",), ("color", "depth", "mask")
+IMAGE_NAME = re.compile(r"(?:.*[/\\])?(\d{1,18})(?:" + "|".join(map(re.escape, COLORS)) + ")", re.IGNORECASE)
+SPARSE = 2  # times as many poses as images: the tracker was faster than the camera
 Row = dict[str, str]
+
+
+@dataclass(frozen=True)
+class Files:
+    """Images of a dataset folder by the number of their frame."""
+
+    path: Path
+    colors: dict[int, Path]
+    depths: dict[int, Path]
+    masks: dict[int, Path]
 
 
 def fits(path: Path) -> bool:
@@ -62,8 +80,10 @@ def load(path: Path, options: ReadOptions) -> Found:
     convention = Convention().changed(options)
     try:
         depth_scale_m = float(camera["depth_scale_m"]) if options.depth_scale_m is None else MILLIMETRE
-    except (KeyError, TypeError, ValueError) as error:
-        raise SourceError(f"{path / CAMERA} is not a camera: {error!r}") from error
+    except KeyError as error:
+        raise SourceError(f"{path / CAMERA} lacks depth_scale_m: add it, or give --depth-scale METRES") from error
+    except (TypeError, ValueError) as error:
+        raise SourceError(f"{path / CAMERA} is not a camera: depth_scale_m: {error}") from error
     entries, notes = _entries(path, rows, convention, options)
     corrections = read_corrections(path / POSE_UPDATES, convention) if (path / POSE_UPDATES).exists() else []
     return Found(
@@ -101,7 +121,8 @@ def read_corrections(path: Path, convention: Convention | None = None) -> list[C
 
 def _entries(path: Path, rows: list[Row], convention: Convention, options: ReadOptions) -> tuple[list[Entry], list]:
     """One entry per frame, in the order of recording, and what was done to the rows."""
-    numbers = [_number(row["frame"]) for row in rows]
+    files = _files(path)
+    rows, numbers, left_out = _with_images(rows, [_number(row["frame"]) for row in rows], files)
     if options.rate_hz:
         stamps: list[int | None] = [0 if n is None else round(n * options.frame_ns(1)) for n in numbers]
         note = f"{options.rate_hz:g} frames a second, as told, in place of the stamps"
@@ -118,17 +139,19 @@ def _entries(path: Path, rows: list[Row], convention: Convention, options: ReadO
                 -1 if number is None else number,
                 0 if stamp is None else stamp,
                 partial(_malformed if lacking else _pose, rows[position], convention),
-                partial(_images, path, -1 if number is None else number),
+                partial(_images, files, -1 if number is None else number),
             )
         )
-    return entries, [note, *notes] if note else notes
+    return entries, [text for text in (left_out, note, *notes) if text]
 
 
 def _number(word: str) -> int | None:
+    """A frame's number, also of the name of its image."""
     try:
         return whole_number(word)
     except ValueError:
-        return None
+        image = IMAGE_NAME.fullmatch(word)
+        return int(image[1]) if image else None
 
 
 def _malformed(row: Row, convention: Convention) -> np.ndarray:
@@ -136,23 +159,42 @@ def _malformed(row: Row, convention: Convention) -> np.ndarray:
 
 
 def _pose(row: Row, convention: Convention) -> np.ndarray:
-    try:
-        words = [str(float(row[name])) for name in POSED]
-    except (TypeError, ValueError) as error:
-        raise FrameError(f"its row is malformed: {error}") from error
-    return convention.of_words(words)
+    for name in POSED:
+        if not NUMBER.fullmatch(row[name]):
+            raise FrameError(f"its row of {TRAJECTORY} is malformed: {name} is {row[name][:20]!r}")
+    return convention.of_words([row[name] for name in POSED])
 
 
-def _images(path: Path, number: int) -> Images:
-    mask = path / "mask" / f"{number:06d}.png"
+def _images(files: Files, number: int) -> Images:
+    mask = files.masks.get(number)
     return Images(
-        read_bytes(_existing(path / "color", number, COLORS)),
-        read_bytes(_existing(path / "depth", number, DEPTHS)),
-        read_bytes(mask) if mask.exists() else b"",
+        read_bytes(files.colors.get(number, files.path / "color" / f"{number:06d}{COLORS[0]}")),
+        read_bytes(files.depths.get(number, files.path / "depth" / f"{number:06d}{DEPTHS[0]}")),
+        b"" if mask is None else read_bytes(mask),
     )
 
 
-def _existing(folder: Path, number: int, endings: tuple[str, ...]) -> Path:
-    """The frame's file with one of these endings, or the usual name, for whoever reads it to complain."""
-    files = [folder / f"{number:06d}{ending}" for ending in endings]
-    return next((file for file in files if file.exists()), files[0])
+def _files(path: Path) -> Files:
+    """The images of a dataset folder by number."""
+    return Files(
+        path, *(_by_number(path / name, of) for name, of in zip(FOLDERS, (COLORS, DEPTHS, MASKS), strict=True))
+    )
+
+
+def _by_number(folder: Path, endings: tuple[str, ...]) -> dict[int, Path]:
+    """Of several files with one number the one with six digits is taken, then the one whose ending comes first."""
+    found: dict[int, Path] = {}
+    for ending in reversed(endings):
+        found |= numbered(folder, rf"(\d+){re.escape(ending)}")
+    for ending in reversed(endings):
+        found |= numbered(folder, rf"(\d{{6}}){re.escape(ending)}")
+    return found
+
+
+def _with_images(rows: list[Row], numbers: list[int | None], files: Files) -> tuple[list[Row], list[int | None], str]:
+    """The rows that have an image and their numbers, where there are many more rows than images, and a note on it."""
+    kept = [i for i, number in enumerate(numbers) if number in files.colors or number in files.depths]
+    if not kept or len(rows) < FEW or len(rows) <= SPARSE * len(kept):
+        return rows, numbers, ""
+    said = f"{len(rows) - len(kept)} of {len(rows)} rows of {TRAJECTORY} have no image: they are left out"
+    return [rows[i] for i in kept], [numbers[i] for i in kept], said

@@ -12,6 +12,7 @@ frames are spaced so that the camera walks rather than flies. All of it is noted
 """
 
 import re
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -69,7 +70,7 @@ NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 
 def fits(path: Path) -> bool:
     """Whether a folder has this layout."""
-    return path.is_dir() and all(_folder(path, names) for names in (COLORS, DEPTHS, POSES))
+    return path.is_dir() and all(folder_of(path, names) for names in (COLORS, DEPTHS, POSES))
 
 
 @dataclass(frozen=True)
@@ -83,7 +84,7 @@ class Files:
 
 def load(path: Path, options: ReadOptions) -> Found:
     """A folder in a layout of one's own. Raises SourceError."""
-    folders = [_folder(path, names) for names in (COLORS, DEPTHS, POSES)]
+    folders = [folder_of(path, names) for names in (COLORS, DEPTHS, POSES)]
     if None in folders:
         raise SourceError(f"{path} lacks folders of images, depth and poses: looked for {LOOKS}")
     colors, depths, poses = (
@@ -121,14 +122,15 @@ def load(path: Path, options: ReadOptions) -> Found:
     )
 
 
-def _folder(path: Path, names: Sequence[str]) -> Path | None:
+def folder_of(path: Path, names: Sequence[str]) -> Path | None:
+    """The folder in `path` with the first of these names, in letters of any size."""
     found = {child.name.lower(): child for child in path.iterdir() if child.is_dir()} if path.is_dir() else {}
     return next((found[name] for name in names if name in found), None)
 
 
 def _by_key(folder: Path, endings: Sequence[str]) -> dict[float, Path]:
     """Files by the number in their names: the one that differs from file to file."""
-    files = sorted(file for file in folder.iterdir() if file.suffix.lower() in endings)
+    files = sorted(f for f in folder.iterdir() if f.suffix.lower() in endings and not f.name.startswith("."))
     words = [re.findall(r"\d+\.\d+|\d+", file.stem) for file in files]
     width = min((len(row) for row in words), default=0)
     if not width:
@@ -150,7 +152,8 @@ def _camera(
 ) -> tuple[Camera, float | None, list[str]]:
     """The camera, metres per depth unit where its file says, and notes. Raises SourceError."""
     files = [file for pattern in CAMERAS for file in sorted(path.glob(pattern)) if file.is_file()]
-    color_size, depth_size = first_size(list(colors.values())), first_size(list(depths.values()))
+    color_size = first_size(list(colors.values()), path)
+    depth_size = first_size(list(depths.values()), path)
     if not files:
         if not options.intrinsics:
             raise SourceError(
@@ -158,8 +161,8 @@ def _camera(
                 "(or --layout hm3d for a walk of HOV-SG)"
             )
         return Camera(Intrinsics(*depth_size, *options.intrinsics[:4])), None, []
-    fields = _fields(files[0])
     try:
+        fields = _fields(files[0])
         fx, fy, cx, cy = (float(fields[name]) for name in ("fx", "fy", "cx", "cy"))
         size = (int(fields["width"]), int(fields["height"])) if "width" in fields and "height" in fields else None
         notes = [f"the camera is that of {files[0].name}"]
@@ -168,8 +171,10 @@ def _camera(
             notes[0] += f", taken to be for {size[0]} x {size[1]} pixels" if color_size != depth_size else ""
         scale_m = _scale(fields)
         return Camera(Intrinsics(*size, fx, fy, cx, cy), *lens_of(files[0], fields)), scale_m, notes
-    except (KeyError, TypeError, ValueError) as error:
-        raise SourceError(f"{files[0]} is not a camera: {error!r}") from error
+    except KeyError as error:
+        raise SourceError(f"{files[0]} is not a camera: it does not say {error.args[0]}") from error
+    except (OSError, TypeError, ValueError, AttributeError) as error:
+        raise SourceError(f"{files[0]} is not a camera: {error}") from error
 
 
 def _scale(fields: dict[str, Any]) -> float | None:
@@ -275,7 +280,7 @@ def _verdict(
     path: Path, files: list[Files], camera: Camera, scale_m: float | None, options: ReadOptions
 ) -> tuple[Verdict, list[str]]:
     """What poses and depth mean, and how that is known. Raises SourceError that names the options."""
-    pairs = _pairs(files)
+    pairs = _pairs(path, files)
     depths = [written.depth for pair in pairs for written in pair]
     told = {"poses": options.poses, "axes": options.camera_axes, "quaternion": options.quaternion}
     if not any(written.pose.shape == (7,) for pair in pairs for written in pair):
@@ -314,15 +319,18 @@ def _asked(names: Sequence[str]) -> str:
     return " and ".join(f"{OPTIONS[name]} {'|'.join(CHOICES[name])}" for name in names)
 
 
-def _pairs(files: list[Files]) -> list[tuple[Written, Written]]:
-    """Pairs of frames between which the camera moved, as they are written."""
-    posed = []
+def _pairs(path: Path, files: list[Files]) -> list[tuple[Written, Written]]:
+    """Pairs of frames between which the camera moved, as they are written. Raises SourceError without any pose."""
+    posed, reasons = [], []
     for file in files:
         try:
             numbers = _numbers_of(file)
-            posed.append((file, numbers, Written(np.zeros((1, 1)), numbers).source_from_camera(Convention())))
-        except (FrameError, PoseError, ImageError):
-            continue
+            pose = rigid(Written(np.zeros((1, 1)), numbers).source_from_camera(Convention()))
+            posed.append((file, numbers, pose))
+        except (FrameError, PoseError, ImageError) as error:
+            reasons.append(str(error))
+    if reasons and not posed:
+        raise SourceError(f"none of the poses of {path} can be used: {Counter(reasons).most_common(1)[0][0]}")
     pairs = []
     for i, j in moving_pairs([pose for _, _, pose in posed], PAIRS):
         try:

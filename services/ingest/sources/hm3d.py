@@ -54,7 +54,7 @@ def load(path: Path, options: ReadOptions) -> Found:
     name = FILE if numbered(path / COLORS, FILE + "png") else r"(?:.*[_-])?(\d+)\."
     colors, depths = numbered(path / COLORS, name + "png"), numbered(path / DEPTHS, name + "png")
     poses = numbered(path / POSES, name + "txt")
-    width_px, height_px = first_size(list(colors.values()))
+    width_px, height_px = first_size(list(colors.values()), path / COLORS)
     focal_px = width_px / 2
     intrinsics = Intrinsics(width_px, height_px, focal_px, focal_px, (width_px - 1) / 2, (height_px - 1) / 2)
     convention = Convention(axes="opengl").changed(options)

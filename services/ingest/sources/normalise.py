@@ -196,7 +196,8 @@ def _valid(units: np.ndarray, invalid: Sequence[float]) -> np.ndarray:
     with np.errstate(invalid="ignore"):
         valid = np.isfinite(units) & (units > 0) if units.dtype.kind == "f" else units > 0
     for value in invalid:
-        valid &= units != value
+        if units.dtype != np.float16 or abs(value) <= float(np.finfo(np.float16).max):
+            valid &= units != value
     return valid
 
 

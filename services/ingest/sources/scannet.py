@@ -68,11 +68,11 @@ def load(path: Path, options: ReadOptions) -> Found:
     depth_matrix, color_matrix = _matrix(path / DEPTH_CAMERA), _matrix(path / COLOR_CAMERA)
     (fx, _, cx), (_, fy, cy) = depth_matrix[:2].tolist()
     try:
-        camera = Intrinsics(*first_size(list(depths.values())), fx, fy, cx, cy)
+        camera = Intrinsics(*first_size(list(depths.values()), path / "depth"), fx, fy, cx, cy)
     except ValueError as error:
         raise SourceError(f"{path / DEPTH_CAMERA} is not a camera: {error}") from error
     color_from_depth = color_matrix @ np.linalg.inv(depth_matrix)
-    files = Files(colors, depths, first_size(list(colors.values())), color_from_depth, camera)
+    files = Files(colors, depths, first_size(list(colors.values()), path / "color"), color_from_depth, camera)
     convention = Convention().changed(options)
 
     def entry(number: int) -> Entry:
@@ -136,6 +136,8 @@ def _matrix(path: Path) -> np.ndarray:
         matrix = np.array(rows, float)
     except ValueError as error:
         raise SourceError(f"{path} cannot be read: {error}") from error
-    if matrix.shape not in ((4, 4), (3, 3)) or not (np.diag(matrix)[:2] > 0).all():
+    if matrix.shape not in ((4, 4), (3, 3)) or not (np.diag(matrix)[:2] > 0).all() or not np.isfinite(matrix).all():
         raise SourceError(f"{path} is not a camera matrix of 4 x 4 numbers")
+    if not np.array_equal(matrix[2, :3], (0, 0, 1)):
+        raise SourceError(f"{path} is not a camera matrix: it must be fx 0 cx, 0 fy cy, 0 0 1")
     return matrix[:3, :3]

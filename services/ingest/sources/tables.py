@@ -103,9 +103,12 @@ def csv_rows(path: Path, columns: Sequence[str]) -> list[dict[str, str]]:
     names = [re.sub(r"\s+", "_", name.strip().lstrip("#").strip().lower()) for name in first]
     missing = [name for name in columns if name not in names]
     if missing:
-        raise SourceError(f"{path} lacks the columns {', '.join(missing)}")
+        held = ", ".join(name[:20] for name in names[:12]) or "nothing"
+        raise SourceError(f"{path} lacks the columns {', '.join(missing)}; its first line is {held}")
     swapped = separator == ";"
-    cells = [[cell.strip().replace(",", ".") if swapped else cell.strip() for cell in row] for row in rest]
+    cells = rest  # a million rows take seconds: touched only where something is to be mended
+    if swapped or any(blank in line for line in lines for blank in " \t"):
+        cells = [[cell.strip().replace(",", ".") if swapped else cell.strip() for cell in row] for row in rest]
     return [dict(zip(names, row + [""] * (len(names) - len(row)), strict=False)) for row in cells]
 
 

@@ -51,7 +51,7 @@ def fits(path: Path) -> bool:
 
 def load(path: Path, options: ReadOptions) -> Found:
     """A TartanGround trajectory. Raises SourceError."""
-    width_px, height_px = first_size(sorted((path / COLORS).glob(f"*_{CAMERA}.png")))
+    width_px, height_px = first_size(sorted((path / COLORS).glob(f"*_{CAMERA}.png")), path / COLORS)
     focal_px = width_px / 2
     intrinsics = Intrinsics(width_px, height_px, focal_px, focal_px, (width_px - 1) / 2, (height_px - 1) / 2)
     convention = Convention(axes="ned").changed(options)

@@ -128,8 +128,10 @@ def _partners(colors: Stamped, others: Stamped, offset_s: float | None) -> tuple
             f"the clock of {others.path.name} is another: {best / 1e9:+.3f} s are added to its stamps, with which "
             f"{len(shifted)} of {count} colour images find a line (say otherwise with --stamp-offset)"
         )
+    if not others.stamps_ns:
+        raise SourceError(f"{others.path} holds no lines")
     if len(found) < NEARLY_NONE * count:
-        begin_s = (others.stamps_ns[0] - colors.stamps_ns[0]) / 1e9 if others.stamps_ns else 0.0
+        begin_s = (others.stamps_ns[0] - colors.stamps_ns[0]) / 1e9
         raise SourceError(
             f"{len(found)} of {count} colour images find a line within 20 ms in {others.path}, which begins "
             f"{begin_s:+.3f} s after {COLORS}: give the difference of the clocks with --stamp-offset SECONDS"
