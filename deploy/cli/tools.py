@@ -241,7 +241,9 @@ def cmd_health(arguments: argparse.Namespace) -> int:
 
 
 def _print_health(statuses: list["ServiceStatus"], silent: list[dict]) -> None:
-    """Two lines a process: what it is doing, and what went through each topic."""
+    """A process: what it is doing, what went through each topic, and what it could not use."""
+    from prior_sg.services.losses import line
+
     for status in statuses:
         waits = f", waits for {', '.join(status.waiting_for)}" if status.waiting_for else ""
         console.print(
@@ -250,6 +252,8 @@ def _print_health(statuses: list["ServiceStatus"], silent: list[dict]) -> None:
             f"backlog {status.backlog}{waits}"
         )
         console.print("    " + " · ".join(map(_topic_line, status.topics)))
+        for loss in status.losses:
+            console.print(f"    {line(loss)}", markup=False, highlight=False)
     for entry in silent:
         console.print(f"[red]{entry['error']}[/]")
     if not statuses and not silent:

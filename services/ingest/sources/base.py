@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from prior_sg.schemas.frames import Intrinsics
-from prior_sg.services.ingest.core.selection import BadFrame, Correction, RawFrame
+from prior_sg.services.ingest.core.frames import BadFrame, Correction, RawFrame
 from prior_sg.services.ingest.sources.images import ImageError
 from prior_sg.services.ingest.sources.pixels import eight_bit, measured, stored
 from prior_sg.services.ingest.sources.poses import Convention

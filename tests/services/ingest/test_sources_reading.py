@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from prior_sg.deploy.sample.packed import pack_source
 from prior_sg.schemas.frames import Intrinsics
+from prior_sg.services.ingest.core.frames import BadFrame, RawFrame
 from prior_sg.services.ingest.core.options import ReadOptions
-from prior_sg.services.ingest.core.selection import BadFrame, RawFrame
 from prior_sg.services.ingest.sources import SourceError, open_source
 from prior_sg.services.ingest.sources.images import ImageError, image_size, trimmed
 from prior_sg.services.ingest.sources.poses import PoseError, rigid
