@@ -10,6 +10,7 @@ import msgspec
 import numpy as np
 
 from prior_sg.schemas.codec import Message, Shape
+from prior_sg.schemas.status import Loss
 
 Pose = Annotated[np.ndarray, Shape("float64", 4, 4)]
 ROTATION_TOLERANCE = 1e-3
@@ -122,9 +123,10 @@ class IngestState(Message, frozen=True, kw_only=True):
     frames_total: int  # 0 = unknown (live)
     keyframes: int
     encoded: int
-    rejected: int  # frames refused by the source or the keyframe selection, with the reason in the log
+    rejected: int  # frames refused by the source or the keyframe selection; `losses` says why
     finished: bool
     skipped: int = 0  # keyframes that nobody encoded: a newer one came first, or no worker could
+    losses: list[Loss] = []  # what of the source could not be used, most frequent first
 
 
 class ArchiveRequest(Message, frozen=True, kw_only=True):

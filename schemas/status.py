@@ -74,6 +74,15 @@ class TopicCount(msgspec.Struct, frozen=True, kw_only=True):
     last_age_ms: float = -1.0  # age of the newest consumed sample when it was consumed
 
 
+class Loss(msgspec.Struct, frozen=True, kw_only=True):
+    """What a service could not use, for one reason."""
+
+    what: str  # "frames refused", "keyframes not mapped", …
+    reason: str  # without what differs from one to the next
+    count: int
+    example: str  # the first, in full
+
+
 class StatusRequest(Message, frozen=True, kw_only=True):
     """Ask a process for its health."""
 
@@ -95,3 +104,4 @@ class ServiceStatus(Message, frozen=True, kw_only=True):
     resident_mb: float
     waiting_for: list[str]  # questions without an answer yet
     topics: list[TopicCount]
+    losses: list[Loss] = []  # most frequent first

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from prior_sg.schemas.frames import Intrinsics
+from prior_sg.services.ingest.core.frames import RawFrame
 from prior_sg.services.ingest.core.pixels import encoded, millimetres
-from prior_sg.services.ingest.core.selection import RawFrame
 from prior_sg.services.ingest.sources.base import MILLIMETRE, SourceError
 
 

@@ -14,12 +14,12 @@ from prior_sg.deploy.api.scene import Scene
 from prior_sg.deploy.running.recorder import TICKS_AFTER
 from prior_sg.deploy.settings import DEFAULT_ROBOT
 from prior_sg.schemas.codec import Message
-from prior_sg.schemas.frames import IngestState, Intrinsics
+from prior_sg.schemas.frames import CameraState, IngestState, Intrinsics
 from prior_sg.schemas.places import MapRequest, SnapshotRequest, VoxelMap
 from prior_sg.schemas.priors import Keep, Kept, Prior, PriorList, PriorRequest, Recall, Recalled, Task
 from prior_sg.schemas.regions import PosteriorReply, PosteriorRequest
 from prior_sg.schemas.scene import SceneRequest
-from prior_sg.schemas.status import Tick
+from prior_sg.schemas.status import Loss, Tick
 from prior_sg.schemas.topics import (
     INGEST_STATE,
     KEYFRAME,
@@ -35,8 +35,9 @@ from prior_sg.schemas.topics import (
     TASK,
     VOXEL_MAP,
 )
-from prior_sg.services.ingest.core.selection import BadFrame, Correction, RawFrame
+from prior_sg.services.ingest.core.frames import BadFrame, Correction, RawFrame
 from prior_sg.services.ingest.sources import Source, SourceError, open_source
+from prior_sg.services.losses import line, merged
 from prior_sg.services.registry import SERVICES
 from prior_sg.services.runtime import extras
 from prior_sg.services.runtime.client import NoPriorError
@@ -137,7 +138,8 @@ class Mapper:
                 progress(count, opened.total)
         now = self.progress
         if now.frames_read - before.frames_read == now.rejected - before.rejected:
-            raise SourceError(f"no frame of {opened.path} can be used: their numbers and stamps must rise; see the log")
+            why = "; ".join(line(loss, now.frames_read) for loss in now.losses[:1]) or "it holds none"
+            raise SourceError(f"no frame of {opened.path} can be used: {why}")
 
     @property
     def progress(self) -> IngestState:
@@ -146,6 +148,11 @@ class Mapper:
         ((_, state),) = (output for output in ingest.feed(Tick(stamp_ns=self._stamp_ns)) if output[0] is INGEST_STATE)
         assert isinstance(state, IngestState)
         return state
+
+    @property
+    def losses(self) -> list[Loss]:
+        """What could not be used so far and why, most frequent first."""
+        return merged(loss for runner in self._pipeline.runners for loss in runner.service.losses(runner.state))
 
     @property
     def scene(self) -> Scene:
@@ -211,12 +218,18 @@ class Mapper:
         published = self._pipeline.feed(self._pipeline.of("ingest"), event)
         self._restless = True
         if isinstance(event, RawFrame):
-            self._stamp_ns = max(self._stamp_ns, event.stamp_ns)
             self._next_id = max(self._next_id, event.frame_id + 1)
-            for runner in self._pipeline.runners:
-                last_ns = self._ticked_ns.setdefault(runner.service.name, event.stamp_ns)
-                if runner.service.tick_s is not None and event.stamp_ns - last_ns >= 1e9 * runner.service.tick_s:
-                    published += self._tick(runner)
+        for camera in [message for _, message in published if isinstance(message, CameraState)]:
+            published += self._pass_until(camera.stamp_ns)
+        return published
+
+    def _pass_until(self, stamp_ns: int) -> list[Published]:
+        """The ticks that are due at the time of a frame, as the stream counts it."""
+        published, self._stamp_ns = list[Published](), max(self._stamp_ns, stamp_ns)
+        for runner in self._pipeline.runners:
+            last_ns = self._ticked_ns.setdefault(runner.service.name, stamp_ns)
+            if runner.service.tick_s is not None and stamp_ns - last_ns >= 1e9 * runner.service.tick_s:
+                published += self._tick(runner)
         return published
 
     def _tick(self, runner: Runner) -> list[Published]:

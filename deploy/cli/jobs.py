@@ -109,6 +109,7 @@ def cmd_demo(arguments: argparse.Namespace) -> int:
 def cmd_run(arguments: argparse.Namespace) -> int:
     """The main job on a source of the user's."""
     from prior_sg.deploy.cli import report
+    from prior_sg.deploy.cli.mending import check_mapped
     from prior_sg.deploy.running.job import Job, run
 
     if not Path(arguments.source).exists():
@@ -133,4 +134,5 @@ def cmd_run(arguments: argparse.Namespace) -> int:
     )
     result = run(job, console)
     report.write(result, job.out, beside.regions, console, beside.objects)
+    check_mapped(result, arguments.source)
     return 0

@@ -50,5 +50,5 @@ def cmd_pack(arguments: argparse.Namespace) -> int:
         lines.append(f"{refused.total()} of {source.total} frames refused:")
     lines += [f"  {count}: {reason}" for reason, count in refused.most_common(SHOWN_REASONS)]
     for line in lines:
-        console.print(line, markup=False, soft_wrap=True)
+        console.print(line, soft_wrap=True)
     return 0

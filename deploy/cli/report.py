@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import msgspec
 from rich.table import Table
 
 from prior_sg.deploy.errors import UserError
@@ -26,6 +27,7 @@ from prior_sg.services.runtime.record import attachments
 from prior_sg.services.runtime.runner import Runner
 
 SUFFIXES = {"json": (".json",), "spark-dsg": (".json", ".sparkdsg"), "png": (".png",)}
+Told = list[dict[str, Any]] | None  # losses of a run; none where they are not known
 MAIN_METRICS = ("f1_s", "f1_g", "miou_s", "miou_g", "miou_s_penalised", "accuracy")
 
 
@@ -58,6 +60,7 @@ def write(
 ) -> None:
     """Print the regions and the scores, and write scene.json, dsg.json, map.png, map-3d.png and metrics.json.
 
+    scene.json and metrics.json also hold `losses`, which the store does not keep.
     `truth` and `objects` are the regions and objects of the ground truth, where there are any.
     """
     scene = result.scene
@@ -70,8 +73,11 @@ def write(
         f"{result.counts.encoded_summary()}; "
         f"{result.counts.crops} of {result.counts.crops_total} crops encoded"
     )
+    for text in result.loss_lines:
+        console.print(text)
+    losses = msgspec.to_builtins(result.losses)
     if metrics := compare(result, truth, objects, console):
-        (out / "metrics.json").write_text(json.dumps(metrics, indent=1))
+        (out / "metrics.json").write_text(json.dumps(metrics | {"losses": losses}, indent=1))
     files = {"scene.json": "json", "dsg.json": "spark-dsg", "map.png": "png"}
     try:
         extras.require("dsg", "dsg.json")
@@ -79,7 +85,7 @@ def write(
         console.print(f"without dsg.json: {error}")
         del files["dsg.json"]
     for name, kind in files.items():
-        export(scene, result.voxels, kind, out / name, truth)
+        export(scene, result.voxels, kind, out / name, truth, losses=losses)
     names = ", ".join((*files, "map-3d.png", result.log_path.name))
     console.print(f"written to {out}: {names} ({result.seconds:.0f} s)")
 
@@ -105,20 +111,37 @@ def compare(
     return {name: None if math.isnan(value) else value for name, value in metrics.items()}
 
 
-def export(scene: Scene, voxels: VoxelMap | None, kind: str, path: Path, truth: dict[str, Any] | None = None) -> None:
-    """Write one file: `json`, `spark-dsg` or `png`."""
+def export(
+    scene: Scene,
+    voxels: VoxelMap | None,
+    kind: str,
+    path: Path,
+    truth: dict[str, Any] | None = None,
+    *,
+    losses: Told = None,
+) -> None:
+    """Write one file: `json`, `spark-dsg` or `png`; `losses`, where a run knows them, go into the first."""
     if path.suffix not in SUFFIXES[kind]:
         raise ExportError(f"{kind} is written to a file ending in {' or '.join(SUFFIXES[kind])}; got {path}")
     try:
-        _write(scene, voxels, kind, path, truth)
+        _write(scene, voxels, kind, path, truth, losses=losses)
     except OSError as error:
         raise ExportError(f"cannot write {path} ({error.strerror}); choose another file with --out") from error
 
 
-def _write(scene: Scene, voxels: VoxelMap | None, kind: str, path: Path, truth: dict[str, Any] | None) -> None:
+def _write(
+    scene: Scene,
+    voxels: VoxelMap | None,
+    kind: str,
+    path: Path,
+    truth: dict[str, Any] | None,
+    *,
+    losses: Told,
+) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     if kind == "json":
-        path.write_text(json.dumps(scene_json(scene), indent=1))
+        told = {} if losses is None else {"losses": losses}
+        path.write_text(json.dumps(scene_json(scene) | told, indent=1))
     elif kind == "spark-dsg":
         from prior_sg.deploy.showing.dsg import spark_dsg_graph
 

@@ -252,7 +252,9 @@ def cmd_health(arguments: argparse.Namespace) -> int:
 
 
 def _print_health(statuses: list["ServiceStatus"], silent: list[dict]) -> None:
-    """Two lines a process: what it is doing, and what went through each topic."""
+    """A process: what it is doing, what went through each topic, and what it could not use."""
+    from prior_sg.services.losses import line as loss_line
+
     for status in statuses:
         waits = f", waits for {', '.join(status.waiting_for)}" if status.waiting_for else ""
         figures = (
@@ -263,6 +265,8 @@ def _print_health(statuses: list["ServiceStatus"], silent: list[dict]) -> None:
         console.print(line((status.instance, "bold"), figures))
         parts = [part for count in status.topics for part in (" · ", *_topic_line(count))]
         console.print(line("    ", *parts[1:]))
+        for loss in status.losses:
+            console.print(f"    {loss_line(loss)}")
     for entry in silent:
         console.print(line((entry["error"], "red")))
     if not statuses and not silent:

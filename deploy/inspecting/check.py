@@ -1,7 +1,7 @@
 """Looks at a source before it is mapped: reads a sample of it and says what was found."""
 
-import re
 import time
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -12,10 +12,12 @@ import numpy as np
 from prior_sg.deploy.inspecting.beside import Beside, truth_beside
 from prior_sg.services.ingest.core import selection
 from prior_sg.services.ingest.core.config import Config
+from prior_sg.services.ingest.core.frames import BadFrame, RawFrame
 from prior_sg.services.ingest.core.inspection import Finding, Picker, Reading, Recording, Shot, inspect, problems
 from prior_sg.services.ingest.core.inspection.conventions import FROM_CAMERA
 from prior_sg.services.ingest.core.inspection.findings import note, ok, problem
 from prior_sg.services.ingest.sources import Source
+from prior_sg.services.losses import kind_of
 
 PAIRS, LIMIT_S = 40, 3.5
 BRIEF_PAIRS, BRIEF_FRAMES, BRIEF_LIMIT_S = 6, 60, 0.8
@@ -84,7 +86,7 @@ def look(
     color_every = max(1, min(frames, 2 * PAIRS) // COLORS)
     for frame in source if source.thinned is None else source.thinned(wants):
         recording.read += 1
-        if isinstance(frame, selection.BadFrame):
+        if isinstance(frame, BadFrame):
             recording.unreadable[kind_of(frame.reason)] += 1
         else:
             _remember(recording, frame)
@@ -94,6 +96,8 @@ def look(
         progress(recording.read, frames)
         if time.monotonic() > end_s or (brief and recording.read >= frames):
             break
+    for held in state.continuity.release():
+        recording.refused[kind_of(held.refusal.text)] += 1
     return recording
 
 
@@ -126,30 +130,25 @@ def summary(source: Source, recording: Recording) -> str:
     return f"{source.layout}: {source.total} frames, {camera.width_px} x {camera.height_px} pixels{rate}{depth}"
 
 
-def kind_of(reason: str) -> str:
-    """A reason without the numbers of one frame, so that those of many frames can be counted together."""
-    return re.sub(r"-?\d+(?:\.\d+)?(?:e[-+]?\d+)?", "…", reason)
-
-
-def _remember(recording: Recording, frame: selection.RawFrame) -> None:
+def _remember(recording: Recording, frame: RawFrame) -> None:
     recording.frame_ids.append(frame.frame_id)
     recording.stamps_ns.append(frame.stamp_ns)
     recording.world_from_camera.append(np.array(frame.world_from_camera))
 
 
-def _select(recording: Recording, state: selection.State, frame: selection.RawFrame, cfg: Config) -> None:
+def _select(recording: Recording, state: selection.State, frame: RawFrame, cfg: Config) -> None:
     """Let the selection see the frame, as it will in the run."""
     bare = msgspec.structs.replace(frame, color=b"", depth=b"", mask=b"")
-    reason = selection.refusal(state, bare, cfg)
-    written = selection.accept(state, bare, cfg) if reason is None else selection.refuse(state, bare)
-    for _ in written:
-        pass
-    if reason is not None:
-        recording.refused[kind_of(reason)] += 1
+    verdict = selection.judge(state, bare, cfg)
+    for held in verdict.refused:
+        recording.refused[kind_of(held.refusal.text)] += 1
+        deque(selection.refuse(state, held), 0)
+    for accepted in verdict.accepted:
+        deque(selection.accept(state, accepted, cfg), 0)
     recording.keyframes = state.keyframes
 
 
-def _decode(recording: Recording, frame: selection.RawFrame, *, with_color: bool) -> None:
+def _decode(recording: Recording, frame: RawFrame, *, with_color: bool) -> None:
     """Add the frame's images to the sample."""
     depth = _image(frame.depth, cv2.IMREAD_UNCHANGED)
     if depth is None or depth.ndim != 2:

@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import msgspec
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TaskID, TimeElapsedColumn
 
 from prior_sg.deploy.edge import check_robot, check_task
@@ -30,9 +31,11 @@ from prior_sg.schemas.places import MapRequest, VoxelMap
 from prior_sg.schemas.priors import Prior, Task
 from prior_sg.schemas.regions import RegionDelta
 from prior_sg.schemas.scene import Scene, SceneRequest
+from prior_sg.schemas.status import Loss
 from prior_sg.schemas.topics import INGEST_STATE, KEYFRAME, PLACE_DELTA, PYRAMID, REGION_DELTA, SCENE, VOXEL_MAP
+from prior_sg.services.losses import line, merged
 from prior_sg.services.registry import SERVICES
-from prior_sg.services.runtime.bus import Bus, LocalBus, Sample
+from prior_sg.services.runtime.bus import Bus, BusError, LocalBus, Sample
 from prior_sg.services.runtime.client import BusClient, NoPriorError
 from prior_sg.services.runtime.endpoints import parse_endpoint
 from prior_sg.services.runtime.zenoh_bus import ZenohBus, open_free_router
@@ -84,6 +87,14 @@ class Result:
     counts: "Counts"
     seconds: float
     prior: Prior  # that the task got when it was given
+    losses: list[Loss]  # what could not be used, of all services, most frequent first
+
+    @property
+    def loss_lines(self) -> list[str]:
+        """A sentence about each."""
+        ingest = self.counts.ingest
+        totals = {"frames": 0 if ingest is None else ingest.frames_read, "keyframes": len(self.counts.keyframes)}
+        return [line(loss, totals.get(loss.what.split()[0], 0)) for loss in self.losses]
 
 
 @dataclass
@@ -235,9 +246,33 @@ class Run:
             progress.update(bar, description="reading the scene")
             scene = self.client.ask(SCENE, SceneRequest(robot=self.job.robot), 30.0)
             voxels = self.client.ask(VOXEL_MAP, MapRequest(robot=self.job.robot), 30.0)
+            losses = self._losses()
         self.recorder.attachments["scene.msgpack"] = ("application/msgpack", encode(scene))
         self.recorder.attachments["voxels.msgpack"] = ("application/msgpack", encode(voxels))
-        return Result(scene, voxels, self.job.out / "log.mcap", self.counts, time.monotonic() - started_s, prior)
+        self.recorder.attachments["losses.json"] = ("application/json", msgspec.json.encode(losses))
+        seconds = time.monotonic() - started_s
+        return Result(scene, voxels, self.job.out / "log.mcap", self.counts, seconds, prior, losses)
+
+    def _losses(self) -> list[Loss]:
+        """What the services of this run could not use; one that does not answer says nothing, and that is said."""
+        found: list[Loss] = []
+        for instance, service in sorted(self.client.alive().items()):
+            if instance not in self.supervisor.pids():
+                continue
+            try:
+                status = self.client.status(service, instance)
+            except BusError as error:
+                found.append(
+                    Loss(what="services silent", reason="their losses are unknown", count=1, example=str(error))
+                )
+                continue
+            found += status.losses
+            for topic in status.topics:
+                for count, reason in ((topic.malformed, "cannot be decoded"), (topic.missed, "never arrived")):
+                    if count:
+                        where = f"{topic.topic} at {service}"
+                        found.append(Loss(what=f"{where} messages lost", reason=reason, count=count, example=""))
+        return merged(found)
 
     def _start(self, names: list[str]) -> None:
         """Start services and wait until they are seen."""
@@ -307,7 +342,9 @@ class Run:
 def _description(counts: Counts, finished: bool) -> str:
     encoded = f"{len(counts.pyramids)}/{len(counts.keyframes)} keyframes encoded"
     regions = f", {len(counts.regions.labels)} labels" if counts.regions is not None else ""
-    return ("settling: " if finished else "streaming: ") + encoded + regions
+    refused = 0 if counts.ingest is None else counts.ingest.rejected
+    lost = f", {refused} frames refused" if refused else ""
+    return ("settling: " if finished else "streaming: ") + encoded + regions + lost
 
 
 def _progress(console: Terminal) -> Progress:

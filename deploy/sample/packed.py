@@ -11,7 +11,7 @@ from prior_sg.deploy.truth import GroundTruth
 from prior_sg.schemas.codec import Message, encode
 from prior_sg.schemas.frames import Keyframe, PoseUpdate
 from prior_sg.schemas.topics import KEYFRAME, POSE_UPDATE, Topic
-from prior_sg.services.ingest.core.selection import BadFrame, Correction, RawFrame
+from prior_sg.services.ingest.core.frames import BadFrame, Correction, RawFrame
 from prior_sg.services.ingest.sources import ReadOptions, Source, open_source
 from prior_sg.services.ingest.sources.recording import REGIONS
 from prior_sg.services.runtime.record import LogWriter

@@ -64,5 +64,6 @@ SERVICE = Service(
     prepare=prepare,
     key_fields=lambda cfg: {"space": space_of(cfg.space)},
     close=lambda state: state.reader.shutdown(wait=False, cancel_futures=True),
+    losses=lambda state: state.losses.told,
     replay_tolerance=2e-3,  # of half-precision embeddings
 )

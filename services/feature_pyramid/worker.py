@@ -19,8 +19,10 @@ from prior_sg.services.feature_pyramid.core.upright import quarter_turns, turned
 from prior_sg.services.feature_pyramid.detectors.base import Detector, Found, Shot
 from prior_sg.services.feature_pyramid.encoders.base import Encoder
 from prior_sg.services.intent import Intent
+from prior_sg.services.losses import Losses
 
 log = logging.getLogger(__name__)
+NOT_ENCODED, WITHOUT_CROPS = "keyframes not encoded", "keyframes without crops"
 
 
 class View(NamedTuple):
@@ -37,13 +39,13 @@ class View(NamedTuple):
 
 @dataclass
 class Worker:
-    """Loaded weights, what to look for, the keyframes that are being made ready, and how many could not be read."""
+    """Loaded weights, what to look for, the keyframes that are being made ready, and what could not be encoded."""
 
     instance: str
     encoder: Encoder
     detector: Detector
     vocabulary: Intent = field(default_factory=Intent)
-    broken: int = 0
+    losses: Losses = field(default_factory=Losses)
     reader: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(1, thread_name_prefix="reader"))
     views: dict[tuple[str, int], Future[View]] = field(default_factory=dict)  # by robot and frame
     encoded: dict[tuple[str, int], np.ndarray] = field(default_factory=dict)
@@ -66,8 +68,12 @@ def look_at(state: Worker, frame: Keyframe, cfg: Config) -> tuple[View, np.ndarr
         state.encoded.pop(key, None)
         seen = view(frame, state.detector, sought, cfg)
     if seen.fault:
-        state.broken += 1
+        state.losses.add(NOT_ENCODED, seen.fault, of=f"keyframe {frame.frame_id}")
         log.warning("keyframe not encoded", extra={"frame": frame.frame_id, "reason": seen.fault})
+    elif not seen.selection.crops:
+        reason = "no depth within range" if not seen.surface_m.any() else "no crop sees enough space at its depth"
+        state.losses.add(WITHOUT_CROPS, reason, of=f"keyframe {frame.frame_id}")
+        log.warning("keyframe without crops", extra={"frame": frame.frame_id, "reason": reason})
     return seen, state.encoded.pop(key) if key in state.encoded else encode(state, seen)
 
 

@@ -12,6 +12,8 @@ from prior_sg.schemas.status import JobDone, Tick
 from prior_sg.schemas.topics import ARCHIVE, BACKFILL, CAMERA_STATE, ENCODE, INGEST_STATE, KEYFRAME, POSE_UPDATE
 from prior_sg.services.ingest.core import selection
 from prior_sg.services.ingest.core.config import Config
+from prior_sg.services.ingest.core.continuity import AHEAD_NS, Held
+from prior_sg.services.ingest.core.frames import BadFrame, Correction, EndOfSource, RawFrame
 from prior_sg.services.ingest.sources import Source, SourceError, open_source
 from prior_sg.services.runtime.service import Identity, Output, Service
 
@@ -39,28 +41,42 @@ def init(cfg: Config, identity: Identity) -> selection.State:
 def step(state: selection.State, message: Message, cfg: Config) -> Iterator[Output]:
     """Take one frame, one finished job, corrected poses, or the end of the source."""
     match message:
-        case selection.RawFrame():
-            reason = selection.refusal(state, message, cfg)
-            if reason is None:
-                yield from selection.accept(state, message, cfg)
-            else:
-                log.warning("frame refused", extra={"frame": message.frame_id, "reason": reason})
-                yield from selection.refuse(state, message)
-        case selection.BadFrame():
+        case RawFrame():
+            yield from _take(state, message, cfg)
+        case BadFrame():
             log.warning("frame unreadable", extra={"frame": message.frame_id, "reason": message.reason})
             yield from selection.lose(state, message)
         case JobDone():
             yield from selection.encoded(state, message)
-        case selection.Correction():
+        case Correction():
             yield from selection.announce(state, message)
         case Backfill():
             yield from selection.backfill(state, message)
         case PoseUpdate():
             selection.correct(state, message)
-        case selection.EndOfSource():
+        case EndOfSource():
+            yield from _refuse(state, state.continuity.release())
             yield from selection.end(state)
         case Tick():  # the topic keeps no history: whoever comes late, or missed the last word, hears it again
             yield selection.progress(state)
+
+
+def _take(state: selection.State, frame: RawFrame, cfg: Config) -> Iterator[Output]:
+    verdict = selection.judge(state, frame, cfg)
+    yield from _refuse(state, verdict.refused)
+    if verdict.held is not None:
+        log.info("frame held back", extra={"frame": frame.frame_id, "reason": verdict.held.text})
+        yield selection.progress(state)
+    if verdict.jump:
+        log.warning("believed again", extra={"frame": frame.frame_id, "reason": verdict.jump})
+    for accepted in verdict.accepted:
+        yield from selection.accept(state, accepted, cfg)
+
+
+def _refuse(state: selection.State, refused: list[Held]) -> Iterator[Output]:
+    for held in refused:
+        log.warning("frame refused", extra={"frame": held.frame.frame_id, "reason": held.refusal.text})
+        yield from selection.refuse(state, held)
 
 
 async def drive(port: Port, cfg: Config) -> None:
@@ -81,23 +97,26 @@ async def drive(port: Port, cfg: Config) -> None:
         if slows_down and await _stopped_while(port, port.room(cfg.window)):
             return
         await port.consume(event)
-    await port.consume(selection.EndOfSource())
+    await port.consume(EndOfSource())
 
 
 class Pace:
-    """Real time from stamps: the first frame is due at once, others as far behind it as their stamps say."""
+    """Real time from stamps: the first frame is due at once, others as far behind it as their stamps say. After a stamp
+    that goes back or lies far ahead, time counts from that frame."""
 
     def __init__(self, speed: float) -> None:
         self.speed = speed
         self._origin: tuple[float, int] | None = None  # loop time in seconds, stamp in nanoseconds
+        self._newest_ns = 0
 
-    async def until_due(self, frame: selection.RawFrame | selection.BadFrame | selection.Correction) -> None:
+    async def until_due(self, frame: RawFrame | BadFrame | Correction) -> None:
         """Return when the frame is due; all else, and frames that come late, are due at once."""
-        if not isinstance(frame, selection.RawFrame):
+        if not isinstance(frame, RawFrame):
             return
         now_s = asyncio.get_running_loop().time()
-        if self._origin is None:
+        if self._origin is None or not 0 <= frame.stamp_ns - self._newest_ns <= AHEAD_NS:
             self._origin = (now_s, frame.stamp_ns)
+        self._newest_ns = frame.stamp_ns
         due_s = self._origin[0] + (frame.stamp_ns - self._origin[1]) / 1e9 / self.speed
         await asyncio.sleep(max(0.0, due_s - now_s))
 
@@ -134,6 +153,7 @@ SERVICE = Service(
     writes=(KEYFRAME, POSE_UPDATE, CAMERA_STATE, INGEST_STATE, ENCODE),
     answers={ARCHIVE: selection.archived},
     drive=drive,
+    losses=selection.losses,
     job_limit=lambda cfg: cfg.window if cfg.when_behind == "skip" and cfg.speed > 0 else 0,
     tick_s=PROGRESS_S,
 )

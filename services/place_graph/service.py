@@ -73,5 +73,6 @@ SERVICE = Service(
     reads=(KEYFRAME, POSE_UPDATE),
     writes=(PLACE_DELTA,),
     asks=(ARCHIVE,),
+    losses=State.losses,
     answers={PLACE_SNAPSHOT: _snapshot, VOXEL_MAP: _voxel_map},
 )

@@ -7,6 +7,7 @@ from typing import Any, Generic, Literal, TypeVar
 import msgspec
 
 from prior_sg.schemas.codec import Message
+from prior_sg.schemas.status import Loss
 from prior_sg.schemas.topics import Query, Topic
 from prior_sg.services.errors import PriorSgError
 
@@ -85,6 +86,7 @@ class Service(Generic[State, Config]):
     tick_s: float | None = None
     drive: Callable[[Any, Config], Awaitable[None]] | None = None
     key_fields: Callable[[Config], dict[str, str]] = lambda cfg: {}  # config values that appear in keys of `answers`
+    losses: Callable[[State], list[Loss]] = lambda state: []  # what could not be used; also read during a step
     close: Callable[[State], None] = lambda state: None
     replay_tolerance: float = 1e-6  # by which floats of a replay may differ; networks differ with threads and machine
     replay_config: Callable[[Config], Config] = lambda cfg: cfg  # for a replay, which touches nothing outside

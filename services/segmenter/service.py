@@ -86,5 +86,6 @@ SERVICE = Service(
     writes=(REGION_DELTA, OBJECT_DELTA, BACKFILL, PRIOR_EVIDENCE),
     asks=(PLACE_SNAPSHOT, TEXT, PRIORS, TASK_IN_FORCE),
     answers={REGION_SNAPSHOT: answer_snapshot, OBJECT_SNAPSHOT: answer_objects, POSTERIOR: answer_posterior},
+    losses=lambda state: state.seen.losses.told,
     tick_s=0.5,
 )

@@ -149,6 +149,7 @@ EXAMPLES: list[Message] = [
         rejected=6,
         finished=True,
         skipped=7,
+        losses=[status.Loss(what="w", reason="r", count=1, example="e")],
     ),
     frames.ArchiveRequest(robot="r", first_frame_id=1, end_frame_id=2, limit=3),
     frames.ArchiveReply(robot="r", oldest_frame_id=7, keyframes=[KEYFRAME]),
@@ -383,6 +384,7 @@ EXAMPLES: list[Message] = [
                 last_age_ms=8.5,
             )
         ],
+        losses=[status.Loss(what="w", reason="r", count=1, example="e")],
     ),
 ]
 

@@ -40,6 +40,14 @@ def test_every_version_ever_written_can_be_read(kind):
         assert isinstance(decode(kind, current(kind, golden, f"{kind.__name__}/{version}")), kind)
 
 
+@pytest.mark.parametrize("name", ["IngestState", "ServiceStatus"])
+def test_what_was_written_before_losses_were_counted_has_none(name):
+    message = next(example for example in EXAMPLES if by_name(example) == name)
+    fields = msgpack.unpackb(encode(message), ext_hook=msgpack.ExtType)
+    del fields["losses"]
+    assert decode(type(message), msgpack.packb(fields)) == msgspec.structs.replace(message, losses=[])
+
+
 @pytest.mark.parametrize("name", ["Keyframe", "PlaceDelta", "Scene"])
 def test_what_was_written_before_worlds_had_an_offset_has_none(name):
     message = next(example for example in EXAMPLES if by_name(example) == name)

@@ -1,101 +1,40 @@
 """Which frames of a posed RGB-D stream become keyframes, and which cannot be true (pure).
 
-A frame is refused when it cannot follow its predecessors: its stamp or number does not rise, or its pose jumps faster
-than the camera can move. Of the others a frame becomes a keyframe when the camera has moved or turned enough since the
-last keyframe, or enough time has passed. Keyframes go to the map (KEYFRAME), to the pool of encoders (ENCODE), and into
-an archive from which late readers may ask for them again (ARCHIVE).
+A frame is refused when it cannot follow its predecessors: its stamp or number does not rise (but see continuity.py), or
+its pose jumps faster than the camera can move. Of the others a frame becomes a keyframe when the camera has moved or
+turned enough since the last keyframe, or enough time has passed. Keyframes go to the map (KEYFRAME), to the pool of
+encoders (ENCODE), and into an archive from which late readers may ask for them again (ARCHIVE).
 """
 
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from itertools import islice
-from typing import Annotated
 
 import msgspec
 import numpy as np
 
-from prior_sg.schemas.codec import Message, Shape
+from prior_sg.schemas.codec import Message
 from prior_sg.schemas.features import Backfill
 from prior_sg.schemas.frames import (
     ArchiveReply,
     ArchiveRequest,
     CameraState,
     IngestState,
-    Intrinsics,
     Keyframe,
-    Pose,
     PoseUpdate,
-    check_pose,
 )
-from prior_sg.schemas.status import JobDone
+from prior_sg.schemas.status import JobDone, Loss
 from prior_sg.schemas.topics import CAMERA_STATE, ENCODE, INGEST_STATE, KEYFRAME, POSE_UPDATE, Topic
 from prior_sg.services.geometry import inverse, rotation_angle_rad
 from prior_sg.services.ingest.core.archive import KeyframeArchive
 from prior_sg.services.ingest.core.config import Config
+from prior_sg.services.ingest.core.continuity import BELIEVED_AFTER, POSES_JUMP, Continuity, Held, Refusal, reachable
+from prior_sg.services.ingest.core.frames import BadFrame, Correction, RawFrame, View
+from prior_sg.services.losses import Losses
 
 Written = tuple[Topic, Message]
-
-
-class RawFrame(Message, frozen=True, kw_only=True):
-    """One posed RGB-D image as a source delivers it, before selection; fields as in Keyframe."""
-
-    frame_id: int
-    stamp_ns: int
-    intrinsics: Intrinsics
-    world_from_camera: Pose
-    color: bytes
-    depth: bytes
-    depth_scale_m: float
-    index: int  # position in the source, from 0
-    total: int  # frames in the source, 0 = unknown (live)
-    mask: bytes = b""
-    origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-
-    def check(self) -> None:
-        check_pose(self.world_from_camera)
-        if self.frame_id < 0:
-            raise ValueError("the frame number is negative")
-        if not self.depth_scale_m > 0:
-            raise ValueError("depth_scale_m must be positive")
-
-
-class BadFrame(Message, frozen=True, kw_only=True):
-    """A frame its source could not deliver."""
-
-    frame_id: int  # -1 = not even that is known
-    reason: str
-    index: int
-    total: int
-
-
-class Correction(Message, frozen=True, kw_only=True):
-    """Corrected poses that a source carries; fields as in PoseUpdate."""
-
-    stamp_ns: int
-    frame_ids: Annotated[np.ndarray, Shape("int64", "frame")]
-    world_from_camera: Annotated[np.ndarray, Shape("float64", "frame", 4, 4)]
-
-    def check(self) -> None:
-        check_pose(self.world_from_camera)
-
-
-class EndOfSource(Message, frozen=True, kw_only=True):
-    """Every frame of the source has been handed over."""
-
-
-@dataclass(frozen=True)
-class View:
-    """What is remembered of a frame: its number, stamp and pose."""
-
-    frame_id: int
-    stamp_ns: int
-    world_from_camera: np.ndarray
-
-    @staticmethod
-    def of(frame: RawFrame) -> "View":
-        """A view with a pose of its own."""
-        return View(frame.frame_id, frame.stamp_ns, np.array(frame.world_from_camera))
+REFUSED, UNREADABLE, GIVEN_UP, CLOCK_JUMPS = "frames refused", "frames unreadable", "keyframes given up", "clock jumps"
 
 
 @dataclass
@@ -116,33 +55,51 @@ class State:
     corrections: int = 0  # pose updates published
     encoding: set[int] = field(default_factory=set)  # numbers of keyframes whose job is not done
     ended: bool = False
+    continuity: Continuity = field(default_factory=Continuity)
+    losses: Losses = field(default_factory=Losses)
     archive: KeyframeArchive = field(default_factory=KeyframeArchive)
 
 
-def refusal(state: State, frame: RawFrame, cfg: Config) -> str | None:
-    """Why this frame cannot follow the ones before it; None when it can."""
-    last = state.last
-    if last is None:
-        return None
-    if frame.stamp_ns <= last.stamp_ns:
-        return f"its stamp is {(last.stamp_ns - frame.stamp_ns) / 1e9:.3f} s before the previous frame's"
-    if frame.frame_id <= last.frame_id:
-        return f"its number does not rise: frame {last.frame_id} came before"
-    if _reachable(last, frame, cfg) or (state.jumped is not None and _reachable(state.jumped, frame, cfg)):
-        return None  # a tracker that stays where it jumped to has found its place again
-    distance_m = np.linalg.norm(frame.world_from_camera[:3, 3] - last.world_from_camera[:3, 3])
-    return f"its pose jumps by {distance_m:.2f} m in {(frame.stamp_ns - last.stamp_ns) / 1e9:.3f} s"
+@dataclass(frozen=True)
+class Verdict:
+    """What becomes of a frame, and of those that were held back for it. All but `held` have the stream's numbers."""
+
+    accepted: list[RawFrame] = field(default_factory=list)
+    refused: list[Held] = field(default_factory=list)
+    held: Refusal | None = None  # why the frame is held back
+    jump: str = ""  # how the clock or the count jumped that is believed again
 
 
-def refuse(state: State, frame: RawFrame) -> Iterator[Written]:
-    """Count a frame that `refusal` named."""
-    forward = state.last is not None and frame.stamp_ns > state.last.stamp_ns and frame.frame_id > state.last.frame_id
-    state.jumped = View.of(frame) if forward else state.jumped
-    yield from _lose(state, frame.total)
+def judge(state: State, frame: RawFrame, cfg: Config) -> Verdict:
+    """Whether a frame can follow the ones before it; nobody hears of it before `accept` or `refuse`."""
+    line, last, shifted = state.continuity, state.last, state.continuity.shifted(frame)
+    state.total = frame.total
+    refusal = None if last is None else line.out_of_line(last, shifted)
+    if last is None or refusal is None:
+        waiting = line.release()
+        if last is not None and (jump := _jump(state, last, shifted, cfg)) is not None:
+            return Verdict(refused=[*waiting, Held(shifted, jump)])
+        line.interval_ns = 0 if last is None else shifted.stamp_ns - last.stamp_ns
+        return Verdict([shifted], waiting)
+    dropped = line.hold(frame, refusal, cfg)
+    if len(line.held) < BELIEVED_AFTER:
+        return Verdict(refused=dropped, held=refusal)
+    frames, jump_text = line.believe(last)
+    state.losses.add(CLOCK_JUMPS, jump_text, reason="believed again")
+    return Verdict(frames, dropped, jump=jump_text)
+
+
+def refuse(state: State, held: Held) -> Iterator[Written]:
+    """Count a frame that `judge` refused."""
+    if held.refusal.kind == POSES_JUMP:
+        state.jumped = View.of(held.frame)
+    _count_refused(state.losses, held)
+    yield from _lose(state, held.frame.total)
 
 
 def lose(state: State, bad: BadFrame) -> Iterator[Written]:
     """Count a frame that the source could not deliver."""
+    state.losses.add(UNREADABLE, bad.reason, of=f"frame {bad.frame_id}" if bad.frame_id >= 0 else "")
     yield from _lose(state, bad.total)
 
 
@@ -183,7 +140,9 @@ def encoded(state: State, done: JobDone) -> Iterator[Written]:
     if done.frame_id in state.encoding:
         state.encoding.remove(done.frame_id)
         state.encoded += not done.error
-        state.skipped += bool(done.error)
+        if done.error:
+            state.skipped += 1
+            state.losses.add(GIVEN_UP, done.error, of=f"keyframe {done.frame_id}")
         yield progress(state)
 
 
@@ -202,7 +161,7 @@ def announce(state: State, correction: Correction) -> Iterator[Written]:
             epoch=state.epoch,
             revision=state.corrections,
             stamp_ns=correction.stamp_ns,
-            frame_ids=correction.frame_ids,
+            frame_ids=correction.frame_ids + state.continuity.number_offset,
             world_from_camera=correction.world_from_camera,
         ),
     )
@@ -225,14 +184,23 @@ def progress(state: State) -> Written:
     return INGEST_STATE, IngestState(
         robot=state.robot,
         stamp_ns=0 if state.last is None else state.last.stamp_ns,
-        frames_read=state.read,
+        frames_read=state.read + len(state.continuity.held),
         frames_total=state.total,
         keyframes=state.keyframes,
         encoded=state.encoded,
-        rejected=state.rejected,
+        rejected=state.rejected + len(state.continuity.held),
         skipped=state.skipped,
         finished=state.ended and not state.encoding,
+        losses=losses(state),
     )
+
+
+def losses(state: State) -> list[Loss]:
+    """What could not be used; frames held back are among it until those after them are known."""
+    counted = state.losses.copy()
+    for held in state.continuity.held:
+        _count_refused(counted, held)
+    return counted.told
 
 
 def archived(state: State, request: ArchiveRequest, cfg: Config) -> ArchiveReply:
@@ -246,11 +214,17 @@ def archived(state: State, request: ArchiveRequest, cfg: Config) -> ArchiveReply
     )
 
 
-def _reachable(view: View, frame: RawFrame, cfg: Config) -> bool:
-    if cfg.max_speed_m_s <= 0:
-        return True
-    distance_m = np.linalg.norm(frame.world_from_camera[:3, 3] - view.world_from_camera[:3, 3])
-    return bool(distance_m <= cfg.max_speed_m_s * (frame.stamp_ns - view.stamp_ns) / 1e9)
+def _jump(state: State, last: View, frame: RawFrame, cfg: Config) -> Refusal | None:
+    """Why the pose cannot follow; a tracker that stays where it jumped to has found its place again."""
+    if reachable(last, frame, cfg) or (state.jumped is not None and reachable(state.jumped, frame, cfg)):
+        return None
+    distance_m = np.linalg.norm(frame.world_from_camera[:3, 3] - last.world_from_camera[:3, 3])
+    text = f"its pose jumps by {distance_m:.2f} m in {(frame.stamp_ns - last.stamp_ns) / 1e9:.3f} s"
+    return Refusal(POSES_JUMP, text)
+
+
+def _count_refused(losses: Losses, held: Held) -> None:
+    losses.add(REFUSED, held.refusal.text, reason=held.refusal.kind, of=f"frame {held.frame.frame_id}")
 
 
 def _lose(state: State, total: int) -> Iterator[Written]:

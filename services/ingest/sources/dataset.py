@@ -18,9 +18,9 @@ from pathlib import Path
 
 import numpy as np
 
+from prior_sg.services.ingest.core.frames import Correction
 from prior_sg.services.ingest.core.options import ReadOptions
 from prior_sg.services.ingest.core.poses import Convention
-from prior_sg.services.ingest.core.selection import Correction
 from prior_sg.services.ingest.sources.base import (
     CAMERA,
     MILLIMETRE,

@@ -11,11 +11,11 @@ import msgspec
 import numpy as np
 
 from prior_sg.schemas.frames import Intrinsics
+from prior_sg.services.ingest.core.frames import BadFrame, RawFrame
 from prior_sg.services.ingest.core.headers import JPEG_MAGIC, ImageError, is_sized, trimmed
 from prior_sg.services.ingest.core.options import ORIGIN_AUTO, ReadOptions, check_lens, offset_of
 from prior_sg.services.ingest.core.pixels import encoded, measured, millimetres, stored
 from prior_sg.services.ingest.core.poses import EXACT, PoseError, rigid, stretch
-from prior_sg.services.ingest.core.selection import BadFrame, RawFrame
 from prior_sg.services.ingest.sources.base import (
     MILLIMETRE,
     Camera,

@@ -13,9 +13,9 @@ import numpy as np
 from prior_sg.schemas.codec import DecodeError, decode
 from prior_sg.schemas.frames import Intrinsics, Keyframe, PoseUpdate
 from prior_sg.schemas.topics import KEYFRAME, POSE_UPDATE
+from prior_sg.services.ingest.core.frames import BadFrame, Correction, RawFrame
 from prior_sg.services.ingest.core.options import ReadOptions
 from prior_sg.services.ingest.core.poses import Convention
-from prior_sg.services.ingest.core.selection import BadFrame, Correction, RawFrame
 from prior_sg.services.ingest.sources.base import Camera, Found, Images, Source, SourceError, Wanted
 from prior_sg.services.ingest.sources.normalise import LOOKED_AT, UNUSABLE, Normaliser, prepare, shifted_truth
 from prior_sg.services.runtime.record import Content, LogError, attachments, contents, read_log

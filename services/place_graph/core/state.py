@@ -3,7 +3,9 @@
 from dataclasses import dataclass, field
 
 from prior_sg.schemas.frames import Keyframe
+from prior_sg.schemas.status import Loss
 from prior_sg.services.deltas import PoseCorrections
+from prior_sg.services.losses import Losses
 from prior_sg.services.place_graph.core.archive import DepthArchive
 from prior_sg.services.place_graph.core.config import Config
 from prior_sg.services.place_graph.core.ground import GroundGraph
@@ -29,12 +31,20 @@ class State:
     cameras_m: dict[int, tuple[float, float, float]] = field(default_factory=dict)  # by frame id, of those fused
     seen: set[int] = field(default_factory=set)  # frame ids of all keyframes, also the refused
     corrections: PoseCorrections = field(default_factory=PoseCorrections)
-    rejected: int = 0  # keyframes that could not be used
+    refused: dict[int, str] = field(default_factory=dict)  # why keyframes could not be used, by frame id
     joined_frame_id: int = 0  # first keyframe heard live; earlier ones come from the archive
     revision: int = -1
     stamp_ns: int = 0
     frame_id: int = -1
     origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of the world, as the newest keyframe says
+
+    def losses(self) -> list[Loss]:
+        """Keyframes refused, those left out that were fused later."""
+        losses = Losses()
+        for frame_id, reason in list(self.refused.items()):
+            if frame_id not in self.cameras_m:
+                losses.add("keyframes not mapped", reason, of=f"keyframe {frame_id}")
+        return losses.told
 
     def heard(self, keyframe: Keyframe) -> None:
         """The next delta follows from this keyframe."""

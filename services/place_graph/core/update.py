@@ -75,7 +75,7 @@ def correct(state: State, update: PoseUpdate, cfg: Config) -> PlaceDelta | None:
 
 def reject(state: State, keyframe: Keyframe, reason: str, cfg: Config) -> PlaceDelta:
     """Count a keyframe that cannot be used; the delta says why and changes nothing."""
-    state.rejected += 1
+    state.refused[keyframe.frame_id] = reason
     state.heard(keyframe)
     event = f"keyframe {keyframe.frame_id} refused: {reason}"
     return publish(state, Changes(), cfg, stamp_ns=keyframe.stamp_ns, event=event)

@@ -370,6 +370,7 @@ class Host:
             resident_mb=psutil.Process().memory_info().rss / 1e6,
             waiting_for=self._asks.waiting_for,
             topics=[TopicCount(topic=name, **vars(counts)) for name, counts in sorted(self.inbox.counts.items())],
+            losses=self.service.losses(self._state),
         )
 
     async def _on_thread(self, function: Callable[..., Any], *arguments: Any) -> Any:

@@ -89,11 +89,15 @@ def observe(state: State, pyramid: Pyramid, cfg: Config) -> None:
 
 def detect(state: State, detections: Detections, cfg: Config) -> None:
     """Associate one frame's detections; those of a space that is not in force wait for it, if it may take over."""
+    of = f"keyframe {detections.frame_id}, {detections.space}"
     if detections.space != state.seen.spaces.force and not cfg.spaces.follow:
+        state.seen.losses.add("detections ignored", "their space is not in force", of=of)
         return
     pose = state.corrections.pose(detections.frame_id, detections.world_from_camera)
     if state.objects.observe(msgspec.structs.replace(detections, world_from_camera=pose), cfg.tracking):
         state.heard(detections.stamp_ns)
+    else:
+        state.seen.losses.add("detections ignored", "they repeat some, or do not fit those before", of=of)
 
 
 def correct_poses(state: State, update: PoseUpdate, cfg: Config) -> None:

@@ -21,6 +21,7 @@ from prior_sg.services.feature_pyramid import service
 from prior_sg.services.feature_pyramid.core import crops as core
 from prior_sg.services.feature_pyramid.core.config import Config
 from prior_sg.services.feature_pyramid.encoders.base import EncoderUnavailable, Options, load_encoder
+from prior_sg.services.feature_pyramid.worker import NOT_ENCODED
 from prior_sg.services.runtime.service import Identity
 from tests.help.paths import SHARED_DATA
 
@@ -402,9 +403,9 @@ def test_crops_are_cut_where_the_states_say(worker):
     ],
 )
 def test_broken_images_give_an_empty_pyramid_and_are_counted(worker, color, depth):
-    before = worker.broken
+    before = worker.losses.count(NOT_ENCODED)
     pyramid = only(service.step(worker, keyframe(color, depth), CFG))
-    assert worker.broken == before + 1
+    assert worker.losses.count(NOT_ENCODED) == before + 1
     assert pyramid.embeddings.shape == (0, worker.encoder.dim) and pyramid.crops_total == 28
     assert (pyramid.surface_m == 0.0).all()
     assert decode(Pyramid, encode(pyramid)) == pyramid
@@ -415,10 +416,10 @@ def test_what_the_mask_covers_has_no_depth(worker):
     mask[:, :320] = 255
     frame = keyframe(checkered(), np.full((480, 640), 4000, np.uint16))
     masked = msgspec.structs.replace(frame, mask=cv2.imencode(".png", mask)[1].tobytes())
-    before, pyramid = worker.broken, only(service.step(worker, masked, CFG))
+    before, pyramid = worker.losses.count(NOT_ENCODED), only(service.step(worker, masked, CFG))
     assert (pyramid.surface_m[:, :40] == 0.0).all() and (pyramid.surface_m[:, 40:] == 4.0).all()
     whole = only(service.step(worker, frame, CFG))
-    assert 0 < len(pyramid.depths_m) < len(whole.depths_m) and worker.broken == before
+    assert 0 < len(pyramid.depths_m) < len(whole.depths_m) and worker.losses.count(NOT_ENCODED) == before
 
 
 @pytest.mark.parametrize(
@@ -430,18 +431,18 @@ def test_what_the_mask_covers_has_no_depth(worker):
 )
 def test_a_keyframe_that_the_map_refuses_is_not_encoded_and_the_next_one_is(worker, caplog, changes, reason):
     frame = keyframe(checkered(), np.full((480, 640), 4000, np.uint16))
-    before = worker.broken
+    before = worker.losses.count(NOT_ENCODED)
     pyramid = only(service.step(worker, msgspec.structs.replace(frame, **changes), CFG))
-    assert len(pyramid.depths_m) == 0 and worker.broken == before + 1
+    assert len(pyramid.depths_m) == 0 and worker.losses.count(NOT_ENCODED) == before + 1
     assert reason in caplog.records[-1].reason
-    assert len(only(service.step(worker, frame, CFG)).depths_m) > 0 and worker.broken == before + 1
+    assert len(only(service.step(worker, frame, CFG)).depths_m) > 0 and worker.losses.count(NOT_ENCODED) == before + 1
 
 
 def test_a_wall_close_by_gives_an_empty_pyramid(worker):
-    before = worker.broken
+    before = worker.losses.count(NOT_ENCODED)
     pyramid = only(service.step(worker, keyframe(checkered(), np.full((480, 640), 500, np.uint16)), CFG))
     assert len(pyramid.depths_m) == 0 and pyramid.embeddings.dtype == np.float16
-    assert (pyramid.surface_m == 0.5).all() and worker.broken == before
+    assert (pyramid.surface_m == 0.5).all() and worker.losses.count(NOT_ENCODED) == before
 
 
 def test_same_frame_gives_the_same_bytes(worker):

@@ -16,8 +16,8 @@ from scipy.spatial.transform import Rotation
 
 from prior_sg.schemas.frames import Intrinsics
 from prior_sg.services.geometry import back_project, transform
+from prior_sg.services.ingest.core.frames import BadFrame, RawFrame
 from prior_sg.services.ingest.core.lidar import depth_image
-from prior_sg.services.ingest.core.selection import BadFrame, RawFrame
 from prior_sg.services.ingest.sources import SourceError, open_source
 from prior_sg.services.ingest.sources.scannet import resampled
 from prior_sg.services.ingest.sources.tum import associate

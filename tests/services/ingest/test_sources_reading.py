@@ -14,10 +14,10 @@ from scipy.spatial.transform import Rotation
 
 from prior_sg.deploy.sample.packed import pack_source
 from prior_sg.schemas.frames import Intrinsics
+from prior_sg.services.ingest.core.frames import BadFrame, RawFrame
 from prior_sg.services.ingest.core.headers import ImageError, image_size, trimmed
 from prior_sg.services.ingest.core.options import ReadOptions
 from prior_sg.services.ingest.core.poses import PoseError, rigid
-from prior_sg.services.ingest.core.selection import BadFrame, RawFrame
 from prior_sg.services.ingest.sources import SourceError, open_source
 from prior_sg.services.ingest.sources.tables import NS_PER, order_of, stamps_ns
 from tests.services.ingest.test_sources import render, view

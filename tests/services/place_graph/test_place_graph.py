@@ -642,7 +642,7 @@ def test_unusable_keyframes_leave_the_map_alone_and_the_delta_says_why(name):
     assert not any(
         len(a) for a in (delta.place_ids, delta.removed_ids, delta.merged_ids, delta.edges, delta.removed_edges)
     )
-    assert state.rejected == 1
+    assert len(state.refused) == 1
     assert (canonical(state), encode(publishing.voxel_map(state, CFG))) == before
     assert not any(d.event for d in play(state, ROOM_WALK[6:]))
 

@@ -160,4 +160,4 @@ def test_following_can_be_switched_off():
     run, _ = finished(cfg=cfg)
     run.feed(*turned(walk(3)), TICK)
     assert run.state.seen.spaces.force == SPACE and not run.state.seen.spaces.rivals
-    assert run.state.seen.ignored_pyramids == len(walk(3))
+    assert run.state.seen.losses.count("pyramids ignored") == len(walk(3))

@@ -291,7 +291,7 @@ def test_repeated_and_foreign_pyramids_change_nothing():
     run.feed(walk(3)[2], pyramid(99, look(2, 2, 0), 3, space="other/space"), TICK, TICK)
     assert len(run.deltas) == deltas
     np.testing.assert_array_equal(run.state.seen.evidence.trust, trust)
-    assert run.state.seen.ignored_pyramids == 1  # the other space is kept apart
+    assert run.state.seen.losses.count("pyramids ignored") == 1  # the other space is kept apart
 
 
 def test_deltas_hold_only_what_changed():

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from prior_sg.schemas.features import Pyramid
+from prior_sg.services.losses import Losses
 from prior_sg.services.segmenter.core.config import Config
 from prior_sg.services.segmenter.core.evidence import handover, kernel
 from prior_sg.services.segmenter.core.evidence.archive import FrameArchive, integrate_all
@@ -22,7 +23,7 @@ class Seen:
     query_radius_m: float  # r_Q with which the evidence was integrated
     archive: FrameArchive = field(default_factory=FrameArchive)
     evidence: kernel.Evidence = field(default_factory=kernel.Evidence)
-    ignored_pyramids: int = 0  # repeated, or not of this space
+    losses: Losses = field(default_factory=Losses)  # pyramids ignored
 
     @property
     def rests(self) -> bool:
@@ -33,14 +34,21 @@ class Seen:
         """Integrate a frame into the targets that it sees; their rows. None for a repeat; a pyramid of another space is
         kept apart."""
         if pyramid.space != self.spaces.force:
-            self.ignored_pyramids += not handover.hear(self.spaces, pyramid, self.archive, cfg.spaces)
+            if not handover.hear(self.spaces, pyramid, self.archive, cfg.spaces):
+                self._ignore(pyramid, "its space is not in force")
             return None
         handover.heard_in_force(self.spaces)
         frame = kernel.compact(pyramid)
-        if not (self.evidence.fits(frame) and self.archive.add(pyramid.frame_id, frame)):
-            self.ignored_pyramids += 1
+        if not self.evidence.fits(frame):
+            self._ignore(pyramid, "its embeddings have another size than those before")
+            return None
+        if not self.archive.add(pyramid.frame_id, frame):
+            self._ignore(pyramid, "it repeats one")
             return None
         return kernel.integrate(self.evidence, frame, targets, self.query_radius_m, cfg.kernel)
+
+    def _ignore(self, pyramid: Pyramid, reason: str) -> None:
+        self.losses.add("pyramids ignored", reason, of=f"keyframe {pyramid.frame_id}, {pyramid.space}")
 
     def integrate_afresh(self, place_ids: np.ndarray, positions_m: np.ndarray, cfg: Config) -> np.ndarray:
         """Compute the evidence of some places afresh from all stored frames; the slots (place,) that hold it."""
