@@ -14,14 +14,13 @@ from prior_sg.deploy.api.scene import Scene
 from prior_sg.deploy.running.recorder import TICKS_AFTER
 from prior_sg.deploy.settings import DEFAULT_ROBOT
 from prior_sg.schemas.codec import Message
-from prior_sg.schemas.frames import IngestState, Intrinsics
+from prior_sg.schemas.frames import CameraState, IngestState, Intrinsics
 from prior_sg.schemas.places import MapRequest, SnapshotRequest, VoxelMap
 from prior_sg.schemas.priors import Keep, Kept, Prior, PriorList, PriorRequest, Recall, Recalled, Task
 from prior_sg.schemas.regions import PosteriorReply, PosteriorRequest
 from prior_sg.schemas.scene import SceneRequest
 from prior_sg.schemas.status import Loss, Tick
 from prior_sg.schemas.topics import (
-    CAMERA_STATE,
     INGEST_STATE,
     KEYFRAME,
     OBJECT_DELTA,
@@ -220,7 +219,7 @@ class Mapper:
         self._restless = True
         if isinstance(event, RawFrame):
             self._next_id = max(self._next_id, event.frame_id + 1)
-        for camera in [message for topic, message in published if topic is CAMERA_STATE]:
+        for camera in [message for _, message in published if isinstance(message, CameraState)]:
             published += self._pass_until(camera.stamp_ns)
         return published
 
