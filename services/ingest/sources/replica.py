@@ -54,6 +54,8 @@ def load(path: Path, options: ReadOptions) -> Found:
     described = camera_of(file, camera | {"width": camera.get("w"), "height": camera.get("h")})
     colors, depths = numbered(path / IMAGES, r"frame(\d+)\.(?:jpg|png)"), numbered(path / IMAGES, r"depth(\d+)\.png")
     convention, poses = Convention().changed(options), table(path / POSES, 1)
+    numbers = sorted(colors.keys() | depths.keys())
+    ranked = len(poses) == len(numbers) and numbers[-1:] > [len(poses) - 1]  # numbers begin later, or have gaps
     return Found(
         NAME,
         path,
@@ -63,10 +65,10 @@ def load(path: Path, options: ReadOptions) -> Found:
             Entry(
                 number,
                 round(number * options.frame_ns(RATE_HZ)),
-                partial(_pose, poses, number, convention),
+                partial(_pose, poses, line if ranked else number, convention),
                 partial(images_of, colors, depths, number),
             )
-            for number in sorted(colors.keys() | depths.keys())
+            for line, number in enumerate(numbers)
         ],
         ground_truth=truth_beside(path),
         convention=convention,

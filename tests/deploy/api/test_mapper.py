@@ -156,5 +156,12 @@ def test_a_source_is_read_to_its_end_and_not_twice(mapper, tmp_path):
     before, told = mapper.progress.keyframes, []
     mapper.read(tmp_path / "more.mcap", progress=lambda done, total: told.append((done, total)))
     assert told == [(1, 2), (2, 2)] and mapper.progress.keyframes == before + 2
-    with pytest.raises(prior_sg.SourceError, match=r"no frame of .*more\.mcap can be used"):
+    with pytest.raises(
+        prior_sg.SourceError, match=r"no frame of .*more\.mcap can be used: \d+ of \d+ frames refused: their stamps"
+    ):
         mapper.read(prior_sg.open_source(tmp_path / "more.mcap"))
+
+
+def test_what_is_lost_is_told(mapper):
+    (loss,) = [loss for loss in mapper.losses if loss.reason == "their stamps go back"]
+    assert loss.what == "frames refused" and loss.count >= 1

@@ -13,6 +13,7 @@ from tests.services.ingest.test_sources_reading import (
     dataset,
     npy,
     own,
+    png,
     rows_of,
 )
 
@@ -169,3 +170,16 @@ def test_a_folder_that_is_no_recording_is_told_what_it_lacks(tmp_path):
     dataset(tmp_path / "walk_b")
     with pytest.raises(SourceError, match="in it are sources, give one of them: walk_b"):
         open_source(tmp_path)
+
+
+@pytest.mark.parametrize("number", [lambda i: i, lambda i: i + 1, lambda i: 10 * i])
+def test_lines_of_a_replica_trajectory_belong_to_the_images_in_order(tmp_path, number):
+    (tmp_path / "results").mkdir()
+    np.savetxt(tmp_path / "traj.txt", [pose.ravel() for pose, _, _ in WALK])
+    camera = {"w": 80, "h": 60, "fx": 60, "fy": 60, "cx": 39.5, "cy": 29.5, "scale": 1000}
+    (tmp_path / "cam_params.json").write_text(json.dumps({"camera": camera}))
+    for i, (_, color, depth) in enumerate(WALK):
+        (tmp_path / f"results/frame{number(i):06d}.png").write_bytes(png(color))
+        (tmp_path / f"results/depth{number(i):06d}.png").write_bytes(png(depth))
+    for frame, (pose, _, _) in zip(open_source(tmp_path), WALK, strict=True):
+        np.testing.assert_allclose(frame.world_from_camera, pose, atol=1e-6)

@@ -643,6 +643,8 @@ def test_unusable_keyframes_leave_the_map_alone_and_the_delta_says_why(name):
         len(a) for a in (delta.place_ids, delta.removed_ids, delta.merged_ids, delta.edges, delta.removed_edges)
     )
     assert len(state.refused) == 1
+    (loss,) = state.losses()
+    assert (loss.what, loss.count) == ("keyframes not mapped", 1) and reason in loss.example
     assert (canonical(state), encode(publishing.voxel_map(state, CFG))) == before
     assert not any(d.event for d in play(state, ROOM_WALK[6:]))
 
@@ -743,8 +745,10 @@ def test_keyframes_refused_beside_a_wrong_pose_are_fused_once_it_is_corrected():
     away[0, 3] += 9.0
     wrong = [msgspec.structs.replace(ROOM_WALK[0], world_from_camera=away), *ROOM_WALK[1:3]]
     assert [bool(d.event) for d in play(state, wrong)] == [False, True, True]
+    assert [loss.count for loss in state.losses()] == [2]
     play(state, [truth(ROOM_WALK, [0])])
     assert canonical(state) == canonical(clean)
+    assert state.losses() == [], "what is fused later was not lost"
 
 
 def test_a_correction_may_come_before_its_keyframe(two_rooms):
