@@ -257,8 +257,8 @@ class Run:
         """What the services of this run could not use; one that does not answer says nothing, and that is said."""
         found: list[Loss] = []
         for instance, service in sorted(self.client.alive().items()):
-            if instance not in self.supervisor.pids():
-                continue
+            if not any(f"{instance}-".startswith(f"{name}-") for name in self.supervisor.pids()):
+                continue  # of another run on this router
             try:
                 status = self.client.status(service, instance)
             except BusError as error:
