@@ -60,5 +60,6 @@ def merged(losses: Iterable[Loss]) -> list[Loss]:
 
 def line(loss: Loss, total: int = 0) -> str:
     """One sentence about a loss; `total` = of how many, 0 = unknown."""
-    example = f" ({loss.example})" if loss.example and loss.example != loss.reason else ""
+    told = loss.example.removesuffix(f": {loss.reason}")
+    example = f" ({told})" if told and told != loss.reason else ""
     return f"{loss.count}{f' of {total}' if total else ''} {loss.what}: {loss.reason}{example}"

@@ -10,6 +10,7 @@ import threading
 import time
 from collections import Counter
 
+import msgspec
 import numpy as np
 import pytest
 import spark_dsg
@@ -21,7 +22,8 @@ from prior_sg.deploy.cli.main import main
 from prior_sg.deploy.inspecting.replay import compare, open_log
 from prior_sg.deploy.running.job import Job, run
 from prior_sg.deploy.sample import SAMPLE
-from prior_sg.schemas.codec import DecodeError, decode
+from prior_sg.schemas.codec import DecodeError, decode, encode
+from prior_sg.schemas.frames import Keyframe
 from prior_sg.schemas.topics import (
     BACKFILL,
     ENCODE,
@@ -388,3 +390,28 @@ def test_one_process_maps_the_same_places_as_six(disturbed, tmp_path):
     for name in ("place_ids", "positions_m", "radii_m", "edges", "clearances_m", "trajectory"):
         np.testing.assert_array_equal(getattr(local, name), getattr(scene, name))
     assert (local.place_regions >= 0).all() and local.labels == scene.labels
+
+
+def test_a_run_tells_what_it_could_not_use(tmp_path):
+    """Five frames, the third with a depth image that is cut off: it costs itself, and the closing lines say so."""
+    source = tmp_path / "broken.mcap"
+    with LogWriter(source) as log:
+        for number, logged in enumerate(list(read_log(SAMPLE, [KEYFRAME]))[:5]):
+            keyframe = decode(Keyframe, logged.payload)
+            broken = msgspec.structs.replace(keyframe, depth=keyframe.depth[: len(keyframe.depth) // 2])
+            log.add(
+                logged.topic,
+                logged.key,
+                encode(broken if number == 2 else keyframe),
+                logged.writer,
+                logged.sequence,
+                logged.sent_ns,
+                logged.received_ns,
+            )
+    job = Job(str(source), tmp_path / "out", "residential home", "hospitality service", in_process=True)
+    result = run(job, Console(quiet=True))
+    assert len(result.counts.keyframes) == 4 and len(result.scene.place_ids)
+    unreadable = [text for text in result.loss_lines if "unreadable" in text]
+    assert (
+        len(unreadable) == 1 and unreadable[0].startswith("1 of 5 frames unreadable: ") and "cut off" in unreadable[0]
+    )

@@ -16,6 +16,8 @@ def test_reasons_that_differ_in_numbers_are_one():
     assert line(first, 9) == "3 of 9 frames refused: its stamp is … s before (frame 0: its stamp is 0.500 s before)"
     assert line(second) == "1 frames refused: it is damaged"
     assert losses.count("frames refused") == 4
+    losses.add("frames refused", "its depth is empty", of="frame 9")
+    assert line(losses.told[-1], 9) == "1 of 9 frames refused: its depth is empty (frame 9)"
 
 
 @given(st.lists(st.text(max_size=8)))
