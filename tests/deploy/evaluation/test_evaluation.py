@@ -172,7 +172,7 @@ def test_a_run_tells_how_well_it_found_objects(case, capsys):
     items = methods.ours(Config()).run(full).objects
     scene = replace_struct(methods.ours(Config()).run(case), objects=items)
     counts = Counts(detectors={"segments"})
-    result = Result(scene, full.perception.voxels, Path("log.mcap"), counts, 1.0, full.prior)
+    result = Result(scene, full.perception.voxels, Path("log.mcap"), counts, 1.0, full.prior, [])
     found = compare(result, None, full.objects, Console(width=200))
     assert found["objects_precision"] == 0.5
     assert found["objects_named_precision"] is None  # nothing carries a name, and JSON knows no NaN
