@@ -1,7 +1,6 @@
 """`prior-sg check`: what a source is, and what is wrong with it, before it is mapped."""
 
 import argparse
-import json
 from typing import TYPE_CHECKING
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress
@@ -10,6 +9,7 @@ from rich.table import Table
 from prior_sg.deploy.cli.shared import Commands, add_settings, console
 from prior_sg.deploy.cli.source_options import add_source_options, read_options
 from prior_sg.deploy.errors import UserError
+from prior_sg.deploy.json_text import json_text
 from prior_sg.deploy.terminal import Description, Terminal, line
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ def cmd_check(arguments: argparse.Namespace) -> int:
     """Check a source and show what was found; 1 when there are problems."""
     report = _checked(arguments.source, read_options(arguments))
     if arguments.json:
-        print(json.dumps(as_builtins(report)))
+        print(json_text(as_builtins(report), None))
     else:
         show(report, console)
     return 1 if report.verdict == "problem" else 0

@@ -1,7 +1,6 @@
 """`prior-sg eval`: from the command line to tables and a page."""
 
 import argparse
-import json
 import math
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
@@ -13,6 +12,7 @@ from rich.table import Table
 
 from prior_sg.deploy.cli.shared import add_settings
 from prior_sg.deploy.evaluation.kinds import BASELINES, ORACLES, OURS, SWEEPS
+from prior_sg.deploy.json_text import json_text
 from prior_sg.deploy.settings import DEMO_TASK, Layers, settings_layers
 from prior_sg.deploy.terminal import Description, Terminal
 
@@ -81,9 +81,9 @@ def run(arguments: argparse.Namespace, console: Terminal) -> int:
             datasets, methods, perceiver.perceive, report, priors=arguments.priors, strength=arguments.strength
         )
     found = results.table()
-    (arguments.out / "eval.json").write_text(json.dumps(found, indent=1))
+    (arguments.out / "eval.json").write_text(json_text(found))
     if arguments.json:
-        print(json.dumps(found))
+        print(json_text(found, None))
     else:
         print_tables(results, console)
     if arguments.html:
@@ -116,6 +116,7 @@ def chosen_datasets(paths: Sequence[Path], environments: Sequence[str], task: st
     from prior_sg.deploy.evaluation.priors import library_prior
     from prior_sg.deploy.evaluation.runner import Dataset
     from prior_sg.deploy.truth import read_objects
+    from prior_sg.services.ingest.sources import open_source
 
     named = dict(text.split("=", 1) for text in environments if "=" in text)
     general = [text for text in environments if "=" not in text]
@@ -128,7 +129,7 @@ def chosen_datasets(paths: Sequence[Path], environments: Sequence[str], task: st
         if any(dataset.name == name for dataset in datasets):
             raise EvaluationError(f"two datasets are called {name}; rename one, for tables go by name")
         prior = library_prior(environment, task, list(dict.fromkeys(region.label for region in truth.regions)))
-        datasets.append(Dataset(name, path, truth, prior, read_objects(path)))
+        datasets.append(Dataset(name, path, truth, prior, read_objects(path, open_source(path).origin_m)))
     return datasets
 
 

@@ -31,7 +31,7 @@ def truth_beside(source: Source) -> Beside:
             findings.append(_foreign("regions.json", error))
             regions = None
     try:
-        objects = read_objects(source.path)
+        objects = read_objects(source.path, source.origin_m)
     except (OSError, ValueError, KeyError, TypeError, AttributeError, IndexError) as error:
         findings.append(_foreign("objects.json", error))
     if objects:

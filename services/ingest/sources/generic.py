@@ -52,7 +52,7 @@ from prior_sg.services.ingest.sources.base import (
     read_bytes,
     truth_beside,
 )
-from prior_sg.services.ingest.sources.normalise import scaled
+from prior_sg.services.ingest.sources.cameras import scaled
 from prior_sg.services.ingest.sources.tables import read_json, stamps_ns, text_of
 
 NAME = "generic"

@@ -16,8 +16,8 @@ from prior_sg.schemas.topics import KEYFRAME, POSE_UPDATE
 from prior_sg.services.ingest.core.frames import BadFrame, Correction, RawFrame
 from prior_sg.services.ingest.core.options import ReadOptions
 from prior_sg.services.ingest.core.poses import Convention
-from prior_sg.services.ingest.sources.base import Camera, Found, Images, Source, SourceError, Wanted
-from prior_sg.services.ingest.sources.normalise import LOOKED_AT, UNUSABLE, Normaliser, prepare, shifted_truth
+from prior_sg.services.ingest.sources.base import Camera, Found, Images, Source, SourceError, Wanted, shifted_truth
+from prior_sg.services.ingest.sources.normalise import LOOKED_AT, UNUSABLE, Normaliser, prepare
 from prior_sg.services.runtime.record import Content, LogError, attachments, contents, read_log
 
 NAME = "log"
@@ -40,7 +40,7 @@ class Log:
 def load(path: Path, options: ReadOptions) -> Source:
     """A log as a source. Raises SourceError."""
     recorded, corrected = _opened(path, options.source_robot)
-    samples = _samples(recorded)
+    samples = _samples(recorded, Convention().changed(options))
     found = Found(NAME, path, Camera(recorded.first.intrinsics), recorded.first.depth_scale_m, ())
     moved, notes = prepare(found, options, samples)
     normaliser = replace(moved, origin_m=_sum(recorded.first.origin_m, moved.origin_m))
@@ -62,11 +62,12 @@ def load(path: Path, options: ReadOptions) -> Source:
         total=recorded.total,
         frames=lambda: _frames(recorded, normaliser_of, options),
         ground_truth=shifted_truth(recorded.truth, moved.origin_m),
-        corrections=lambda: _corrections(recorded, normaliser) if corrected else iter(()),
+        corrections=lambda: _corrections(recorded, normaliser, options) if corrected else iter(()),
         why=("it is an MCAP log of ours",),
         notes=notes,
         origin_m=normaliser.origin_m,
         convention=Convention().changed(options),
+        depth_unit_m=normaliser.depth.unit_m,
         world_from_source=normaliser.world_from_source,
         thinned=lambda wanted: _frames(recorded, normaliser_of, options, wanted),
     )
@@ -93,7 +94,7 @@ def _opened(path: Path, robot: str) -> tuple[Log, bool]:
     return recorded, any(content.topic == POSE_UPDATE.name for content in found)
 
 
-def _samples(recorded: Log) -> list[tuple[np.ndarray, Images]]:
+def _samples(recorded: Log, convention: Convention) -> list[tuple[np.ndarray, Images]]:
     """Poses and images of the first frames that have the first one's camera."""
     samples: list[tuple[np.ndarray, Images]] = []
     for payload in _payloads(recorded.path, recorded.key):
@@ -102,7 +103,7 @@ def _samples(recorded: Log) -> list[tuple[np.ndarray, Images]]:
         except DecodeError:
             continue
         if keyframe.intrinsics == recorded.first.intrinsics and keyframe.depth_scale_m == recorded.first.depth_scale_m:
-            samples.append((np.array(keyframe.world_from_camera), _images(keyframe)))
+            samples.append((convention.of_matrix(np.array(keyframe.world_from_camera)), _images(keyframe)))
         if len(samples) == LOOKED_AT:
             break
     return samples
@@ -130,9 +131,9 @@ def _frames(
             yield BadFrame(frame_id=frame_id, reason=str(error), index=index, total=total)
 
 
-def _corrections(recorded: Log, normaliser: Normaliser) -> Iterator[Correction]:
+def _corrections(recorded: Log, normaliser: Normaliser, options: ReadOptions) -> Iterator[Correction]:
     """Pose updates, each stamped as the newest keyframe before it: who wrote it may have had another clock."""
-    stamp_ns, robot = 0, recorded.first.robot
+    stamp_ns, robot, convention = 0, recorded.first.robot, Convention().changed(options)
     for logged in read_log(recorded.path, (KEYFRAME, POSE_UPDATE)):
         if logged.key not in (KEYFRAME.pattern(robot), POSE_UPDATE.pattern(robot)):
             continue
@@ -147,7 +148,9 @@ def _corrections(recorded: Log, normaliser: Normaliser) -> Iterator[Correction]:
             yield Correction(
                 stamp_ns=stamp_ns,
                 frame_ids=np.array(message.frame_ids),
-                world_from_camera=normaliser.pose(np.array(message.world_from_camera)),
+                world_from_camera=normaliser.pose(
+                    np.stack([convention.of_matrix(pose) for pose in np.array(message.world_from_camera)])
+                ),
             )
 
 

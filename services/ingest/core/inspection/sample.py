@@ -39,6 +39,7 @@ class Recording:
     """What is known of all frames read so far."""
 
     total: int  # frames in the source, 0 = unknown
+    depth_unit_m: float = 0.0  # metres per unit of depth as the files hold it; 0 = as the shots say
     read: int = 0
     frame_ids: list[int] = field(default_factory=list)  # of readable frames, as the next two
     stamps_ns: list[int] = field(default_factory=list)
