@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from prior_sg.deploy.inspecting.check import Report
     from prior_sg.services.ingest.core.config import Config
 
+SAID_AT_START = ("reading", "ground truth")
 STYLE = {"ok": "green", "note": "yellow", "problem": "bold red"}
 
 
@@ -56,7 +57,7 @@ def before_start(path: str, cfg: "Config", console: Terminal) -> "Report":
     report = check(open_source(path, options=cfg), cfg, brief=True)
     console.print(report.summary)
     for finding in report.findings:
-        if finding.verdict == "problem" or (finding.topic, finding.verdict) == ("ground truth", "note"):
+        if finding.verdict == "problem" or (finding.verdict == "note" and finding.topic in SAID_AT_START):
             console.print(line((finding.verdict, STYLE[finding.verdict]), f" {finding.topic}: {finding.line()}"))
     if report.problems and report.problems[0].hopeless:
         raise HopelessSource(f"{report.source}: {report.problems[0].line()}; `prior-sg check` says more")

@@ -52,7 +52,7 @@ def cached(name: str, made_of: list[str], export: Callable[[Path], None], suffix
     try:
         return _made(cache_folder() / file, export)
     except OSError as error:
-        _say_temporary(cache_folder(), str(error.strerror))
+        say_temporary(cache_folder(), str(error.strerror))
     try:
         return _made(temporary_cache("onnx") / file, export)
     except OSError as error:
@@ -63,7 +63,7 @@ def cached(name: str, made_of: list[str], export: Callable[[Path], None], suffix
 
 
 @cache
-def _say_temporary(folder: Path, reason: str) -> None:
+def say_temporary(folder: Path, reason: str) -> None:
     """Once, however many networks are exported."""
     log.warning("exports are kept in the temporary folder: %s cannot be written (%s)", folder, reason)
 

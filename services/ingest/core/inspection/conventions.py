@@ -10,7 +10,7 @@ import numpy as np
 from prior_sg.services.geometry import inverse, pose_from_quaternion
 from prior_sg.services.ingest.core.agreement import NOTHING, Agreement, DepthView, agreement, grid_points, with_poses
 from prior_sg.services.ingest.core.inspection.findings import Finding, note, ok, problem
-from prior_sg.services.ingest.core.inspection.sample import Shot, pairs_of
+from prior_sg.services.ingest.core.inspection.sample import Shot, has_moved, pairs_of
 from prior_sg.services.ingest.core.poses import FROM_CAMERA as MOTIONS
 
 FORWARD, BACKWARD = "world_from_camera", "camera_from_world"
@@ -98,9 +98,10 @@ def judge(shots: Sequence[Shot], reading: Reading, depth_unit_m: float = 0.0) ->
 
 def blind_finding(views: Sequence[DepthView], pairs: Sequence[tuple[int, int]]) -> Finding | None:
     """Why the depth images cannot tell one pose from another, if they cannot."""
-    same = sum(np.array_equal(views[i].depth_m, views[j].depth_m) for i, j in pairs)
-    if len(pairs) >= FEW_PAIRS and 2 * same > len(pairs):
-        text = f"{same} of {len(pairs)} depth images are the same as the one before, although the camera moves"
+    moved = [(i, j) for i, j in pairs if has_moved(views[i].world_from_camera, views[j].world_from_camera)]
+    same = sum(np.array_equal(views[i].depth_m, views[j].depth_m) for i, j in moved)
+    if len(moved) >= FEW_PAIRS and 2 * same > len(moved):
+        text = f"{same} of {len(moved)} depth images are the same as the one before, although the camera moves"
         return problem("depth images", text, "give every frame the depth image that was taken with it")
     measured = [view.depth_m[view.depth_m > 0] for view in views]
     if not all(map(len, measured)):
