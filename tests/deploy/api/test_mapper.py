@@ -169,7 +169,7 @@ def test_a_recording_read_again_is_another_walk(tmp_path):
             fields = {name: getattr(frame, name) for name in Keyframe.__struct_fields__ if hasattr(frame, name)}
             keyframe = Keyframe(robot="robot1", **fields)
             log.add(KEYFRAME, KEYFRAME.key_of(keyframe), encode(keyframe), "w/1/1", number, 0, 0)
-    with Mapper("residential home", "real-estate listing", settings={"ingest.every_frame": True}) as mapper:
+    with prior_sg.Mapper(HOME, TASK, settings={"ingest.every_frame": True}) as mapper:
         mapper.read(tmp_path / "walk.mcap")
         once = mapper.progress.keyframes
         mapper.read(tmp_path / "walk.mcap")
