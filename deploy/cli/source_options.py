@@ -36,9 +36,6 @@ OPTIONS = (
         "NAME",
         "layout, as docs/sources.md names it; default: recognised by its files",
     ),
-    Option(
-        "--source-robot", "source_robot", "NAME", "of a log with several robots, the one to read (default: the first)"
-    ),
     Option("--rate", "rate_hz", "HZ", "frames per second, in place of the source's stamps"),
     Option("--stamp-unit", "stamp_unit", "UNIT", "unit of written stamps", choices=("s", "ms", "us", "ns")),
     Option("--stamp-offset", "stamp_offset_s", "SECONDS", "added to the stamps of poses in a list of their own"),

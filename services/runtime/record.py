@@ -16,6 +16,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import Any, BinaryIO
@@ -271,9 +272,9 @@ def _messages(
     schemas: dict[int, str] = {} if index is None else {i: schema.name for i, schema in index.schemas.items()}
     if index is None:
         logger.warning("the log %s was cut off: reading the part that is complete", path)
-    for chunk in _records(file, Opcode.CHUNK) if index is None else _indexed_chunks(file, index, wanted):
+    for read in _all_chunks(file) if index is None else _indexed_chunks(file, index, wanted):
         try:
-            records = breakup_chunk(chunk, validate_crc=True)
+            records = breakup_chunk(read(), validate_crc=True)
         except DAMAGE as error:
             if index is None:
                 return
@@ -308,15 +309,30 @@ def _index(file: BinaryIO) -> Summary | None:
         return None
 
 
-def _indexed_chunks(file: BinaryIO, index: Summary, wanted: set[str] | None) -> Iterator[Chunk]:
+def _all_chunks(file: BinaryIO) -> Iterator[Callable[[], Chunk]]:
+    for chunk in _records(file, Opcode.CHUNK):
+        yield partial(_same, chunk)
+
+
+def _same(chunk: Chunk) -> Chunk:
+    return chunk
+
+
+def _chunk_at(file: BinaryIO, offset: int) -> Chunk:
+    file.seek(offset)
+    chunk: Chunk = Chunk.read(ReadDataStream(file))
+    return chunk
+
+
+def _indexed_chunks(file: BinaryIO, index: Summary, wanted: set[str] | None) -> Iterator[Callable[[], Chunk]]:
+    """What reads each chunk, for one that is damaged must not hide those behind it."""
     ids = {i for i, channel in index.channels.items() if wanted is None or channel.metadata.get("topic") in wanted}
 
     def holds(chunk: ChunkIndex) -> bool:
         return not ids.isdisjoint(chunk.message_index_offsets)
 
     for chunk in sorted(filter(holds, index.chunk_indexes), key=lambda chunk: chunk.chunk_start_offset):
-        file.seek(chunk.chunk_start_offset + struct.calcsize("<BQ"))
-        yield Chunk.read(ReadDataStream(file))
+        yield partial(_chunk_at, file, chunk.chunk_start_offset + struct.calcsize("<BQ"))
 
 
 def _records(file: BinaryIO, wanted: Opcode) -> Iterator[Any]:

@@ -75,7 +75,8 @@ def fits(path: Path) -> bool:
     if not path.is_dir():
         return False
     held = [folder_of(path, names) is not None for names in (COLORS, DEPTHS, POSES)]
-    return all(held) or (any(held[:2]) and pose_lists.find(path) is not None)
+    found = None if all(held) else pose_lists.find(path)
+    return all(held) or (found is not None and (any(held[:2]) or found.name == pose_lists.TRANSFORMS))
 
 
 @dataclass(frozen=True)
@@ -144,7 +145,7 @@ def _folder(path: Path) -> Folder:
     colors, depths, poses = (folder_of(path, names) for names in (COLORS, DEPTHS, POSES))
     found = None if poses is not None else pose_lists.find(path)
     listed = None if found is None else pose_lists.read(found)
-    colors = colors or (listed and listed.images)
+    colors = colors or (None if listed is None else listed.images)
     if colors is None or not colors.is_dir() or (poses is None and listed is None):
         raise SourceError(f"{path} lacks images or poses: looked for {LOOKS}; poses may be {pose_lists.UNDERSTOOD}")
     if depths is None and not (listed and listed.depth_names):

@@ -201,7 +201,7 @@ def _notes(path: Path, streams: Sequence[Content], key: str) -> Iterator[str]:
         counts[content.key] += content.messages
     if len(counts) > 1:
         told = ", ".join(f"{other.split('/')[1]} ({count} keyframes)" for other, count in counts.items())
-        yield f"it holds the robots {told}: {key.split('/')[1]} is read; --source-robot NAME reads another"
+        yield f"it holds the robots {told}: {key.split('/')[1]} is read; --set ingest.source_robot=NAME reads another"
     if not is_whole(path):
         yield f"the log was cut off: the {counts[key]} keyframes that are complete are read"
 

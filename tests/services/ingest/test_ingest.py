@@ -343,7 +343,9 @@ def test_a_log_plays_one_robot(tmp_path):
     assert [f.frame_id for f in open_source(path, robot="b")] == [7, 9]
     with pytest.raises(SourceError, match="no keyframes of c; it holds those of a, b"):
         open_source(path, robot="c")
-    assert any("a (2 keyframes), b (2 keyframes): a is read; --source-robot" in note for note in source.notes)
+    assert any(
+        "a (2 keyframes), b (2 keyframes): a is read; --set ingest.source_robot=" in note for note in source.notes
+    )
 
 
 def test_a_log_that_was_cut_off_says_so(tmp_path):

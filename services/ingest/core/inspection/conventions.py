@@ -9,6 +9,7 @@ import numpy as np
 
 from prior_sg.services.geometry import inverse, pose_from_quaternion
 from prior_sg.services.ingest.core.agreement import NOTHING, Agreement, DepthView, agreement, grid_points, with_poses
+from prior_sg.services.ingest.core.detection import LIKELY_M
 from prior_sg.services.ingest.core.inspection.findings import Finding, note, ok, problem
 from prior_sg.services.ingest.core.inspection.sample import Shot, has_moved, pairs_of
 from prior_sg.services.ingest.core.poses import FROM_CAMERA as MOTIONS
@@ -251,7 +252,7 @@ def best_factor(
     """The factor of depth that makes `scale_m` a usual unit with which depth agrees best, and how well.
 
     Positions are divided instead of depth multiplied, so that the tolerance stays what it is. Units with which no
-    room or street would be seen are left out.
+    room or street would be seen are left out; of units alike, that which makes a room of it is taken.
     """
     few = list(pairs[:: max(1, len(pairs) // SCREENED_PAIRS)])
     median_m = median_depth_m(views)
@@ -261,7 +262,7 @@ def best_factor(
     if not scores:
         return 1.0, NOTHING
     near = [factor for factor, score in scores.items() if score >= max(scores.values()) - ALIKE / 3]
-    chosen = min(near, key=lambda factor: abs(np.log(factor)))
+    chosen = min(near, key=lambda factor: abs(np.log(median_m * factor / LIKELY_M)))
     return chosen, agreement(_moved_less(views, chosen), pairs)
 
 
