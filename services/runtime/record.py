@@ -16,7 +16,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from types import TracebackType
 from typing import Any, BinaryIO
@@ -271,7 +271,7 @@ def _messages(
     channels: dict[int, Channel] = {} if index is None else dict(index.channels)
     schemas: dict[int, str] = {} if index is None else {i: schema.name for i, schema in index.schemas.items()}
     if index is None:
-        logger.warning("the log %s was cut off: reading the part that is complete", path)
+        _say_cut_off(str(path))
     for read in _all_chunks(file) if index is None else _indexed_chunks(file, index, wanted):
         try:
             records = breakup_chunk(read(), validate_crc=True)
@@ -292,6 +292,12 @@ def _messages(
                 channel = channels[record.channel_id]
                 if wanted is None or channel.metadata.get("topic") in wanted:
                     yield channel, schemas.get(channel.schema_id, ""), record
+
+
+@cache
+def _say_cut_off(path: str) -> None:
+    """Once, however often the log is read."""
+    logger.warning("the log %s was cut off: reading the part that is complete", path)
 
 
 def _index(file: BinaryIO) -> Summary | None:

@@ -209,7 +209,7 @@ def _notes(path: Path, streams: Sequence[Content], key: str) -> Iterator[str]:
 def _foreign(path: Path) -> str:
     topics = foreign_topics(path)
     if not topics:
-        return "; it holds no messages of ours"
+        return "; it holds no messages of ours" if is_whole(path) else ": it was cut off before its first complete part"
     told = ", ".join(topic[:60] for topic in topics[:5])
     return f": it was written by another program (topics {told}); export its images, depth and poses into a folder"
 

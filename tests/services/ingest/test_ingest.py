@@ -379,6 +379,9 @@ def test_logs_without_keyframes_are_told_apart(tmp_path):
         pass
     with pytest.raises(SourceError, match="holds no keyframes; it holds no messages of ours"):
         open_source(tmp_path / "empty.mcap")
+    (tmp_path / "cut.mcap").write_bytes((tmp_path / "empty.mcap").read_bytes()[:8])
+    with pytest.raises(SourceError, match="holds no keyframes: it was cut off before its first complete part"):
+        open_source(tmp_path / "cut.mcap")
     with (tmp_path / "ros.mcap").open("wb") as file:
         writer = Writer(file)
         writer.start()
