@@ -125,7 +125,7 @@ def place(plan: Plan, room: Room, thing: Thing) -> bool:
     for _ in range(TRIES):
         rect = room.rects[int(rng.integers(len(room.rects)))].grown(-WALL_M / 2 if room.walled else 0.0)
         side = int(rng.integers(4))
-        footprint = _footprint(rect, side, width, depth, thing.where, rng)
+        footprint = _footprint(rect, side, (width, depth), thing.where, rng)
         gap_m = 0.0 if thing.where == "wall" else 0.5
         if footprint is not None and plan.fits(room, footprint, gap_m):
             put(plan, room, thing.shape(width, depth, thing.height_m), footprint, side)
@@ -137,7 +137,7 @@ def put(plan: Plan, room: Room, parts: Sequence[tuple[str, Local]], footprint: R
     """Build something on a footprint with its back to a side (south, north, west, east)."""
     room.taken.append(footprint)
     for name, (u0, v0, z0, u1, v1, z1) in parts:
-        rect = _placed(footprint, side, u0, v0, u1, v1)
+        rect = _placed(footprint, side, (u0, v0, u1, v1))
         low_m, high_m = room.z_m + rounded(z0), room.z_m + min(rounded(z1), room.height_m)
         if name:
             plan.objects.append(
@@ -153,9 +153,8 @@ def _hollow(parts: Sequence[tuple[str, Local]], name: str) -> bool:
     return index + 1 < len(parts) and parts[index + 1][0] == "" and parts[index][1][2] == 0
 
 
-def _footprint(
-    rect: Rect, side: int, width: float, depth: float, where: Where, rng: np.random.Generator
-) -> Rect | None:
+def _footprint(rect: Rect, side: int, size: tuple[float, float], where: Where, rng: np.random.Generator) -> Rect | None:
+    width, depth = size
     along, across = (rect.width, rect.depth) if side < 2 else (rect.depth, rect.width)
     if width > along or depth > across:
         return None
@@ -172,7 +171,8 @@ def _footprint(
     return Rect(rect.x0 + x, rect.y0 + y, rect.x0 + x + span[0], rect.y0 + y + span[1])
 
 
-def _placed(footprint: Rect, side: int, u0: float, v0: float, u1: float, v1: float) -> Rect:
+def _placed(footprint: Rect, side: int, local: tuple[float, float, float, float]) -> Rect:
+    u0, v0, u1, v1 = local
     x0, y0, x1, y1 = footprint
     if side == 0:
         return Rect(x0 + u0, y0 + v0, x0 + u1, y0 + v1)

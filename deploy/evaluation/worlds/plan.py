@@ -37,6 +37,13 @@ class Box(NamedTuple):
     matter: int
 
 
+class Level(NamedTuple):
+    """A storey: where its floor is, and how high it is to the ceiling, metres."""
+
+    z_m: float
+    height_m: float
+
+
 @dataclass
 class Room:
     """One region: rectangles on one level, with walls around them or without."""
@@ -84,19 +91,24 @@ class Plan:
         low, high = (rect.x0, rect.y0, low_m), (rect.x1, rect.y1, high_m)
         self.boxes.append(Box(snapped(low), snapped(high), matter))
 
-    def storey(self, rect: Rect, z_m: float, height_m: float) -> None:
+    def storey(self, rect: Rect, level: Level) -> None:
         """Floor, ceiling and outer walls."""
-        self.slab(rect.grown(WALL_M / 2), z_m)
-        self.slab(rect.grown(WALL_M / 2), z_m + height_m + SLAB_M)
-        self.walls(rect, z_m, height_m)
+        self.slab(rect.grown(WALL_M / 2), level.z_m)
+        self.slab(rect.grown(WALL_M / 2), level.z_m + level.height_m + SLAB_M)
+        self.walls(rect, level)
 
-    def walls(self, rect: Rect, z_m: float, height_m: float, matter: int = STRUCTURE) -> None:
+    def walls(self, rect: Rect, level: Level, matter: int = STRUCTURE) -> None:
         """Four walls on the edges of a rectangle."""
         for edge in rect.edges():
-            self.box(edge.thick(WALL_M, WALL_M / 2), z_m, z_m + height_m, matter)
+            self.box(edge.thick(WALL_M, WALL_M / 2), level.z_m, level.z_m + level.height_m, matter)
 
-    def room(self, label: str, rects: Rect | Sequence[Rect], z_m: float, height_m: float, walled: bool = True) -> Room:
+    def hollow(self, rect: Rect, level: Level) -> None:
+        """Take away walls that cross a rectangle."""
+        self.box(rect.grown(-WALL_M / 2), level.z_m, level.z_m + level.height_m, NOTHING)
+
+    def room(self, label: str, rects: Rect | Sequence[Rect], level: Level, walled: bool = True) -> Room:
         """A region; with walls, these stand on the outline."""
+        z_m, height_m = level
         parts = (rects,) if isinstance(rects, Rect) else tuple(rects)
         room = Room(label, parts, z_m, height_m, walled, z_m + height_m)
         if walled:

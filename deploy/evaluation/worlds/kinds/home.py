@@ -5,9 +5,9 @@ import itertools
 import numpy as np
 
 from prior_sg.deploy.evaluation.worlds.inventory import furnished
-from prior_sg.deploy.evaluation.worlds.layouts import between, halved, parts, picked
+from prior_sg.deploy.evaluation.worlds.layouts import between, halved, picked, row
 from prior_sg.deploy.evaluation.worlds.outline import Rect
-from prior_sg.deploy.evaluation.worlds.plan import Plan, Room, Unbuildable
+from prior_sg.deploy.evaluation.worlds.plan import Level, Plan, Room, Unbuildable
 
 DAY = ("living room", "dining room", "kitchen")
 FURTHER = ("home office", "bedroom", "bathroom", "laundry room", "storage room", "playroom", "home gym", "bedroom")
@@ -27,19 +27,19 @@ def home(rng: np.random.Generator) -> Plan:
 
 def along_hallway(plan: Plan, z_m: float) -> Rect:
     """Day rooms on one side of a hallway, the others on the other; returns the shell."""
-    rng, height_m = plan.rng, between(plan.rng, 2.4, 2.8)
+    rng, level = plan.rng, Level(z_m, between(plan.rng, 2.4, 2.8))
     rest = ["bedroom", "bathroom", *picked(rng, FURTHER, int(rng.integers(0, 4)))]
     rest = [rest[i] for i in rng.permutation(len(rest))]
     day = [DAY[i] for i in rng.permutation(3)]
     width = between(rng, max(9.0, 2.6 * len(rest)), max(11.0, 3.2 * len(rest)))
     south, hall, north = between(rng, 3.6, 5.0), between(rng, 1.2, 1.7), between(rng, 3.0, 4.2)
     shell = Rect(0, 0, width, south + hall + north)
-    plan.storey(shell, z_m, height_m)
+    plan.storey(shell, level)
     day_rect, hall_rect, rest_rect = shell.cut_y([south, hall, north])
     open_plan = bool(rng.random() < 0.5)
-    day_rooms = _row(plan, day_rect, day, z_m, height_m, walled=not open_plan)
-    hallway = plan.room("hallway", hall_rect, z_m, height_m)
-    rest_rooms = _row(plan, rest_rect, rest, z_m, height_m)
+    day_rooms = _row(plan, day_rect, day, level, walled=not open_plan)
+    hallway = plan.room("hallway", hall_rect, level)
+    rest_rooms = _row(plan, rest_rect, rest, level)
     for room in rest_rooms:
         plan.door(hallway, room)
     _join_day_rooms(plan, day_rooms, hallway, open_plan)
@@ -49,14 +49,14 @@ def along_hallway(plan: Plan, z_m: float) -> Rect:
 def around_living_room(plan: Plan, z_m: float) -> Rect:
     """The largest of some rectangles is the living room; the others open from it, or from each other; returns the
     shell."""
-    rng, height_m = plan.rng, between(plan.rng, 2.4, 2.8)
+    rng, level = plan.rng, Level(z_m, between(plan.rng, 2.4, 2.8))
     count = int(rng.integers(4, 8))
     shell = Rect(0, 0, between(rng, 2.0 * count**0.5 + 3, 2.4 * count**0.5 + 4.5), between(rng, 6.0, 8.5))
-    plan.storey(shell, z_m, height_m)
+    plan.storey(shell, level)
     rects = sorted(halved(rng, shell, count, 2.0), key=lambda rect: -rect.area)
     order = ["kitchen", "bedroom", "bathroom", *picked(rng, ["dining room", *FURTHER], 4)][: count - 1]
     labels = ["living room", *sorted(order, key=lambda label: -SMALL.get(label, LARGE.get(label, 1.0)))]
-    rooms = [plan.room(label, rect, z_m, height_m) for label, rect in zip(labels, rects, strict=True)]
+    rooms = [plan.room(label, rect, level) for label, rect in zip(labels, rects, strict=True)]
     inside, outside = rooms[:1], rooms[1:]
     while outside:
         joined = [(a, b) for b in outside for a in inside if _takes_door(plan, a, b)]
@@ -76,12 +76,9 @@ def _takes_door(plan: Plan, one: Room, other: Room) -> bool:
     return any(edge.length >= 1.4 for edge in plan.edges(one, other))
 
 
-def _row(plan: Plan, rect: Rect, labels: list[str], z_m: float, height_m: float, walled: bool = True) -> list[Room]:
-    weights = [SMALL.get(label, LARGE.get(label, 1.0)) for label in labels]
-    cuts = parts(plan.rng, rect.width, weights, 1.8)
-    return [
-        plan.room(label, piece, z_m, height_m, walled) for label, piece in zip(labels, rect.cut_x(cuts), strict=True)
-    ]
+def _row(plan: Plan, rect: Rect, labels: list[str], level: Level, walled: bool = True) -> list[Room]:
+    weighted = [(label, SMALL.get(label, LARGE.get(label, 1.0))) for label in labels]
+    return row(plan, rect, weighted, level, open_labels=() if walled else labels)
 
 
 def _join_day_rooms(plan: Plan, rooms: list[Room], hallway: Room, open_plan: bool) -> None:
