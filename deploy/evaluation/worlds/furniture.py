@@ -40,16 +40,16 @@ def solid(name: str) -> Shape:
     return lambda width, depth, height: [(name, (0, 0, 0, width, depth, height))]
 
 
-def table(name: str, low_m: float = 0.0) -> Shape:
+def table(name: str) -> Shape:
     """A top on four legs."""
 
     def built(width: float, depth: float, height: float) -> list[tuple[str, Local]]:
-        legs = [(u, v) for u in (0.05, width - 0.1) for v in (0.05, depth - 0.1)]
         parts: list[tuple[str, Local]] = [
-            (name, (0, 0, low_m, width, depth, height)),
-            *(("", (u, v, 0.0, u + 0.05, v + 0.05, height - 0.05)) for u, v in legs),
+            (name, (0, 0, 0, width, depth, height)),
+            ("", (0, 0, height - 0.05, width, depth, height)),
         ]
-        return parts
+        legs = [(u, v) for u in (0.05, width - 0.1) for v in (0.05, depth - 0.1)]
+        return parts + [("", (u, v, 0, u + 0.05, v + 0.05, height)) for u, v in legs]
 
     return built
 
@@ -95,7 +95,8 @@ def table_with_chairs(name: str, chair: str) -> Shape:
     def built(width: float, depth: float, height: float) -> list[tuple[str, Local]]:
         low, high = 0.45, depth - 0.45
         parts: list[tuple[str, Local]] = [
-            (name, (0, low, height - 0.05, width, high, height)),
+            (name, (0, low, 0, width, high, height)),
+            ("", (0, low, height - 0.05, width, high, height)),
             ("", (width / 2 - 0.1, depth / 2 - 0.1, 0, width / 2 + 0.1, depth / 2 + 0.1, height)),
         ]
         for number in range(max(1, int(width / 0.7))):

@@ -10,10 +10,10 @@ from prior_sg.deploy.evaluation.worlds.ways import CELL_M, Ways
 
 Manner = Literal["scanner", "passer-by"]
 NARROW_CELLS = 4  # half of a doorway: the middle keeps 0.35 m from both sides
-ROOM_FOR_A_STAND_M2 = 22.0
-MOST_STANDS = {"scanner": 5, "passer-by": 1}
+ROOM_FOR_A_STAND_M2 = 30.0
+MOST_STANDS = {"scanner": 3, "passer-by": 1}
 VISITED_SHARE = 0.55  # of the regions, by a passer-by
-STRIDE_M = 0.65
+STRIDE_M = 0.75
 TURN_RAD = np.radians(40)
 SPEED_M_S, TURNING_RAD_S = 0.9, 1.2
 LOOK_AHEAD_M = 1.2
@@ -140,7 +140,7 @@ def _stride(points_m: np.ndarray, manner: Manner, rng: np.random.Generator) -> l
 
 def _turned(ground_m: np.ndarray, yaw: float, rng: np.random.Generator) -> list[tuple[np.ndarray, float]]:
     """Looking around: a full turn, in steps that overlap."""
-    count = int(rng.integers(5, 7))
+    count = int(rng.integers(4, 6))
     sign = 1 if rng.random() < 0.5 else -1
     return [(ground_m, yaw + sign * (2 * np.pi * k / count + rng.normal(0, 0.08))) for k in range(count)]
 
