@@ -30,7 +30,7 @@ class Wish(NamedTuple):
     """How many of a thing a room gets, and for each the chance that it does."""
 
     thing: str
-    count: int = 1
+    number: int = 1
     chance: float = 1.0
     per_m2: float = 0.0  # so many more for each square metre
 
@@ -113,7 +113,7 @@ def table_with_chairs(name: str, chair: str) -> Shape:
 def furnish(plan: Plan, room: Room, wishes: Sequence[Wish], things: dict[str, Thing]) -> None:
     """Place what fits, in the order wished."""
     for wish in wishes:
-        for _ in range(wish.count + int(wish.per_m2 * room.area_m2)):
+        for _ in range(wish.number + int(wish.per_m2 * room.area_m2)):
             if plan.rng.random() < wish.chance:
                 place(plan, room, things[wish.thing])
 

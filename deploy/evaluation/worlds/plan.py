@@ -78,6 +78,7 @@ class Plan:
     environment: str  # plain words, for the prior
     voxel_m: float = STEP_M
     range_m: float = 10.0  # of the depth camera
+    stride_m: float = 0.75  # between views on the way
     rooms: list[Room] = field(default_factory=list)
     boxes: list[Box] = field(default_factory=list)
     objects: list[TrueObject] = field(default_factory=list)
@@ -190,7 +191,7 @@ class Plan:
         )
 
     def _open(self, one: Room, other: Room, way: Segment, height_m: float) -> None:
-        low_m = min(one.z_m, other.z_m)
+        low_m = max(one.z_m, other.z_m)  # one of them may be a staircase, which begins below
         self.box(way.thick(3 * WALL_M), low_m, low_m + height_m, NOTHING)
         self._pass(one, other, way, DOOR_SPACE_M)
 

@@ -5,29 +5,28 @@ from typing import Literal
 
 import numpy as np
 
-from prior_sg.deploy.evaluation.worlds.plan import Room, Unbuildable
+from prior_sg.deploy.evaluation.worlds.plan import Plan, Room, Unbuildable
 from prior_sg.deploy.evaluation.worlds.ways import CELL_M, Ways
 
 Manner = Literal["scanner", "passer-by"]
 NARROW_CELLS = 4  # half of a doorway: the middle keeps 0.35 m from both sides
-ROOM_FOR_A_STAND_M2 = 30.0
+ROOM_FOR_A_STAND_M2 = 36.0
 MOST_STANDS = {"scanner": 3, "passer-by": 1}
 VISITED_SHARE = 0.55  # of the regions, by a passer-by
-STRIDE_M = 0.75
+Track = list[tuple[np.ndarray, float]]  # points on the ground, and the heading there
 TURN_RAD = np.radians(40)
 SPEED_M_S, TURNING_RAD_S = 0.9, 1.2
 LOOK_AHEAD_M = 1.2
 
 
-def walked(
-    rooms: Sequence[Room], ways: Ways, manner: Manner, rng: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray]:
+def walked(plan: Plan, ways: Ways, manner: Manner) -> tuple[np.ndarray, np.ndarray]:
     """Stamps (n,) in ns and poses (n, 4, 4) of the camera. Raises Unbuildable where a region cannot be entered."""
-    chosen = list(rooms) if manner == "scanner" else _passed(rooms, rng)
+    rng = plan.rng
+    chosen = plan.rooms if manner == "scanner" else _passed(plan.rooms, rng)
     candidates = _candidates(chosen, ways)
     stands = [_stands(room, nodes, ways, manner, rng) for room, nodes in zip(chosen, candidates, strict=True)]
     stops = _tour(ways, np.concatenate(stands), rng)
-    return _poses(stops, ways, manner, rng)
+    return _poses(plan, [ways.position_m(leg) for leg in stops], manner)
 
 
 def _passed(rooms: Sequence[Room], rng: np.random.Generator) -> list[Room]:
@@ -97,15 +96,13 @@ def _tour(ways: Ways, stands: np.ndarray, rng: np.random.Generator) -> list[np.n
     return legs
 
 
-def _poses(
-    legs: list[np.ndarray], ways: Ways, manner: Manner, rng: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray]:
+def _poses(plan: Plan, legs_m: list[np.ndarray], manner: Manner) -> tuple[np.ndarray, np.ndarray]:
+    rng = plan.rng
     height_m = rng.uniform(1.25, 1.55)
     down_rad = np.radians(rng.uniform(4, 12))
-    track: list[tuple[np.ndarray, float]] = []  # where on the ground, and where to
-    for leg in legs:
-        points_m = ways.position_m(leg)
-        track += _stride(points_m, manner, rng) if len(leg) > 1 else []
+    track: Track = []
+    for points_m in legs_m:
+        track += _stride(plan, points_m, manner) if len(points_m) > 1 else []
         track += _turned(points_m[-1], track[-1][1] if track else 0.0, rng) if manner == "scanner" else []
     track = _with_turns(track)
     stamps, poses, now_s = [], [], 0.0
@@ -120,11 +117,12 @@ def _poses(
     return np.array(stamps, np.int64), np.array(poses)
 
 
-def _stride(points_m: np.ndarray, manner: Manner, rng: np.random.Generator) -> list[tuple[np.ndarray, float]]:
-    """Points along a way with the direction in which it goes on; the last point is left to what comes after."""
+def _stride(plan: Plan, points_m: np.ndarray, manner: Manner) -> Track:
+    """Points along a way with the direction in which it goes on; a scanner looks around at its end."""
+    rng, stride_m = plan.rng, plan.stride_m
     along_m = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(points_m, axis=0), axis=1))))
     sway = np.radians(6 if manner == "scanner" else 14)
-    stops_m = np.arange(STRIDE_M, along_m[-1] - (STRIDE_M / 2 if manner == "scanner" else -0.01), STRIDE_M)
+    stops_m = np.arange(stride_m, along_m[-1] - (stride_m / 2 if manner == "scanner" else -0.01), stride_m)
     at_m, ahead_m = (
         np.stack([np.interp(where, along_m, points_m[:, axis]) for axis in range(3)], axis=1)
         for where in (stops_m, np.minimum(stops_m + LOOK_AHEAD_M, along_m[-1]))
@@ -138,14 +136,14 @@ def _stride(points_m: np.ndarray, manner: Manner, rng: np.random.Generator) -> l
     return track
 
 
-def _turned(ground_m: np.ndarray, yaw: float, rng: np.random.Generator) -> list[tuple[np.ndarray, float]]:
+def _turned(ground_m: np.ndarray, yaw: float, rng: np.random.Generator) -> Track:
     """Looking around: a full turn, in steps that overlap."""
     count = int(rng.integers(4, 6))
     sign = 1 if rng.random() < 0.5 else -1
     return [(ground_m, yaw + sign * (2 * np.pi * k / count + rng.normal(0, 0.08))) for k in range(count)]
 
 
-def _with_turns(track: list[tuple[np.ndarray, float]]) -> list[tuple[np.ndarray, float]]:
+def _with_turns(track: Track) -> Track:
     """The same with looks between two that would lie too far apart."""
     full = track[:1]
     for ground_m, yaw in track[1:]:

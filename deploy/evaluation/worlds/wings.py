@@ -20,6 +20,7 @@ class Wing(NamedTuple):
     depth_m: tuple[float, float]  # of rooms, from and to
     corridor_m: tuple[float, float]
     open_labels: frozenset[str] = frozenset()  # rooms without a wall to the corridor
+    ensuite: frozenset[str] = frozenset()  # rooms with their own bathroom
 
     def sized(self, labels: Sequence[str]) -> list[tuple[str, float]]:
         """Labels with their widths."""
@@ -67,5 +68,23 @@ def _along(plan: Plan, strips: Sequence[Rect], wing: Wing, level: Level) -> Room
     south, way, north = strips
     corridor = plan.room("corridor", way, level, walled=False)
     for rect, labels in ((south, wing.south), (north, wing.north)):
-        connect(plan, corridor, row(plan, rect, wing.sized(labels), level, wing.open_labels))
+        rooms = row(plan, rect, wing.sized(labels), level, wing.open_labels)
+        baths = [(_bathroom(plan, room, corridor, level), room) for room in rooms if room.label in wing.ensuite]
+        connect(plan, corridor, rooms)
+        for bath, room in baths:
+            plan.door(bath, room, 0.8)
     return corridor
+
+
+def _bathroom(plan: Plan, room: Room, corridor: Room, level: Level) -> Room:
+    """Taken from a room beside the corridor, so that one passes it on the way in."""
+    width, depth = between(plan.rng, 1.7, 2.0), between(plan.rng, 1.9, 2.3)
+    (rect,) = room.rects
+    cuts = [width, rect.width - width] if plan.rng.random() < 0.5 else [rect.width - width, width]
+    below = corridor.bounds.y0 >= rect.y1 - 1e-6
+    halves = rect.cut_y([rect.depth - depth, depth] if below else [depth, rect.depth - depth])
+    main, near = halves if below else halves[::-1]
+    pieces = near.cut_x(cuts)
+    bath, passage = pieces if cuts[0] == width else pieces[::-1]
+    room.rects = (main, passage)
+    return plan.room("bathroom", bath, level)

@@ -97,7 +97,7 @@ def _drawn(kind: str, seed: int, walk: Manner, draw: int) -> World:
     rng = _random(kind, seed, draw, 0)
     plan = turned(KINDS[kind](rng), rng)
     grid, origin_m = _filled(plan)
-    stamps_ns, poses = walked(plan.rooms, ways_of(grid, origin_m, plan.voxel_m), walk, rng)
+    stamps_ns, poses = walked(plan, ways_of(grid, origin_m, plan.voxel_m), walk)
     return World(
         name=f"world:{kind}:{seed}",
         kind=kind,
