@@ -126,7 +126,9 @@ def _filled(plan: Plan) -> tuple[np.ndarray, np.ndarray]:
     origin_m = np.floor((low_m.min(axis=0) - MARGIN_M) / coarse_m) * coarse_m
     size = np.ceil((high_m.max(axis=0) + MARGIN_M - origin_m) / coarse_m).astype(int) * 2
     grid = np.zeros(size, np.uint8)
-    low, high = (np.rint((corners - origin_m) / plan.voxel_m).astype(np.int64) for corners in (low_m, high_m))
+    near = 1e-6  # boxes thinner than a voxel fill one all the same
+    low = np.floor((low_m - origin_m) / plan.voxel_m + near).astype(np.int64)
+    high = np.ceil((high_m - origin_m) / plan.voxel_m - near).astype(np.int64)
     fill(grid, low, high, np.array([box.matter for box in plan.boxes], np.uint8))
     return grid, origin_m
 
