@@ -96,7 +96,7 @@ def depths(
 def _drawn(kind: str, seed: int, walk: Manner, draw: int) -> World:
     rng = _random(kind, seed, draw, 0)
     plan = turned(KINDS[kind](rng), rng)
-    grid, origin_m = _filled(plan)
+    grid, origin_m = filled(plan)
     stamps_ns, poses = walked(plan, ways_of(grid, origin_m, plan.voxel_m), walk)
     return World(
         name=f"world:{kind}:{seed}",
@@ -119,7 +119,7 @@ def _random(kind: str, seed: int, index: int, purpose: int) -> np.random.Generat
     return np.random.default_rng([zlib.crc32(kind.encode()), seed, index, purpose])
 
 
-def _filled(plan: Plan) -> tuple[np.ndarray, np.ndarray]:
+def filled(plan: Plan) -> tuple[np.ndarray, np.ndarray]:
     """The grid of matter and its lower corner."""
     low_m, high_m = (np.array([getattr(box, end) for box in plan.boxes]) for end in Box._fields[:2])
     coarse_m = 2 * plan.voxel_m  # so that blocks of voxels are cells of ways
