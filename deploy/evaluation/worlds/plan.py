@@ -79,6 +79,7 @@ class Plan:
     voxel_m: float = STEP_M
     range_m: float = 10.0  # of the depth camera
     stride_m: float = 0.75  # between views on the way
+    outdoors: bool = False  # in large part: to be mapped as such
     rooms: list[Room] = field(default_factory=list)
     boxes: list[Box] = field(default_factory=list)
     objects: list[TrueObject] = field(default_factory=list)

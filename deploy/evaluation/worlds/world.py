@@ -43,6 +43,7 @@ class World:
     origin_m: np.ndarray  # (3,): the lower corner of voxel (0, 0, 0)
     voxel_m: float
     range_m: float  # of the depth camera
+    outdoors: bool  # in large part: to be mapped with the place graph's outdoor preset
     stamps_ns: np.ndarray  # (view,)
     world_from_camera: np.ndarray  # (view, 4, 4)
 
@@ -110,6 +111,7 @@ def _drawn(kind: str, seed: int, walk: Manner, draw: int) -> World:
         origin_m=origin_m,
         voxel_m=plan.voxel_m,
         range_m=plan.range_m,
+        outdoors=plan.outdoors,
         stamps_ns=stamps_ns,
         world_from_camera=poses,
     )

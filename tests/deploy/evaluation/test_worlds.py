@@ -114,7 +114,7 @@ def test_ingest_makes_a_keyframe_of_nearly_every_view_and_believes_all(world):
     assert (seconds > 0).all()
     assert (moved_m / seconds < 3.0).all()  # the place graph's max_speed_m_s
     assert np.mean((moved_m >= cfg.min_translation_m) | (turned_deg >= cfg.min_rotation_deg)) > 0.85
-    assert moved_m.max() < (2.3 if world.kind == "campus" else 1.2)
+    assert moved_m.max() < (2.3 if world.outdoors else 1.2)
     assert turned_deg.max() < 110
 
 
