@@ -1,4 +1,4 @@
-"""How rectangles are divided, and rooms lined up and joined, by many kinds of plans (pure)."""
+"""How rectangles are divided, and rooms lined up and joined, by many kinds of plans."""
 
 import itertools
 from collections.abc import Collection, Iterable, Sequence

@@ -1,4 +1,4 @@
-"""A floor plan while it is built: regions, boxes of matter, furniture; metres, z up, x and y along the walls (pure).
+"""A floor plan while it is built: regions, boxes of matter, furniture; metres, z up, x and y along the walls.
 
 Boxes count in the order in which they were added: a doorway is a box of nothing in a wall that was there before. All
 edges lie on a grid of STEP_M; those of rooms on one of 2 STEP_M, so that walls, which stand half on each side of the

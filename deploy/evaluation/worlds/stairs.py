@@ -1,4 +1,4 @@
-"""Stairs of steps that one can climb (pure)."""
+"""Stairs of steps that one can climb."""
 
 from prior_sg.deploy.evaluation.worlds.outline import Rect
 from prior_sg.deploy.evaluation.worlds.plan import Plan, rounded

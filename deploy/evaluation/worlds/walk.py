@@ -1,4 +1,4 @@
-"""How somebody goes through a world with a camera: poses of a scanner, who sees all, and of a passer-by (pure)."""
+"""How somebody goes through a world with a camera: poses of a scanner, who sees all, and of a passer-by."""
 
 from collections.abc import Sequence
 from typing import Literal

@@ -1,4 +1,4 @@
-"""Worlds without number: from a kind and a seed to a floor plan with its ground truth, a walk, and depth images (pure).
+"""Worlds without number: from a kind and a seed to a floor plan with its ground truth, a walk, and depth images.
 
 A plan is drawn, turned, filled into voxels, and walked through. Draws in which a region cannot be reached are thrown
 away for the next one of the same seed, so that (kind, seed, walk) always gives the same world.

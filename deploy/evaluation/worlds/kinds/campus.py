@@ -1,4 +1,4 @@
-"""Campuses: street, walkway, plaza, lawn and parking lot before a building that one enters (pure)."""
+"""Campuses: street, walkway, plaza, lawn and parking lot before a building that one enters."""
 
 import numpy as np
 
