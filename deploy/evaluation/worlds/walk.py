@@ -15,7 +15,7 @@ MOST_STANDS = {"scanner": 4, "passer-by": 1}
 AIRY_CELLS = 6  # stands keep that far from obstacles where there is room
 SETTLING, STRAY_M = 4, 0.4  # rounds in which stands spread over a room, and how far off they then are
 CANDIDATES = 1500  # for the stands in one room
-VISITED_SHARE = 0.55  # of the regions, by a passer-by
+VISITED_SHARE = 0.65  # of the regions, by a passer-by
 Track = list[tuple[np.ndarray, float]]  # points on the ground, and the heading there
 TURN_RAD = np.radians(40)
 SPEED_M_S, TURNING_RAD_S = 0.9, 1.2
@@ -33,7 +33,7 @@ def walked(plan: Plan, ways: Ways, manner: Manner) -> tuple[np.ndarray, np.ndarr
 
 
 def _passed(rooms: Sequence[Room], rng: np.random.Generator) -> list[Room]:
-    count = max(2, round(VISITED_SHARE * len(rooms)))
+    count = max(3, round(VISITED_SHARE * len(rooms)))
     return [rooms[i] for i in sorted(rng.permutation(len(rooms))[:count].tolist())]
 
 
