@@ -4,38 +4,25 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from prior_sg.deploy.evaluation.datasets import Dataset
 from prior_sg.deploy.evaluation.kinds import OURS
 from prior_sg.deploy.evaluation.methods import Case, Method
 from prior_sg.deploy.evaluation.metrics import SCORES, Reliability, assign, evaluate, reliability
 from prior_sg.deploy.evaluation.object_metrics import NO_DETECTOR, OBJECT_SCORES, object_scores
 from prior_sg.deploy.evaluation.perception import Perception, Report
 from prior_sg.deploy.evaluation.priors import variations
-from prior_sg.deploy.truth import GroundTruth, TrueObject
 from prior_sg.schemas.features import TextEmbeddings
 from prior_sg.schemas.places import VoxelMap
-from prior_sg.schemas.priors import Prior
 from prior_sg.schemas.scene import Scene
 
 KEYS = (*SCORES, "seconds")
 NO_LABEL = "(none)"
 
-PerceiveOf = Callable[[Path, Mapping[str, Any], tuple[str, ...]], Perception]  # the names a detector is to look for
-
-
-@dataclass(frozen=True)
-class Dataset:
-    """One sequence to judge on."""
-
-    name: str
-    path: Path
-    truth: GroundTruth
-    prior: Prior  # the library's
-    objects: tuple[TrueObject, ...] = ()  # of the ground truth, where it names them
+PerceiveOf = Callable[[Dataset, Mapping[str, Any], tuple[str, ...]], Perception]  # the names a detector is to look for
 
 
 @dataclass(frozen=True)
@@ -58,6 +45,23 @@ class Picture:
     voxels: VoxelMap
     calibration: Reliability
     confusion: dict[tuple[str, str], int]  # voxels by (true label, estimated label)
+
+
+@dataclass(frozen=True)
+class Part:
+    """What an evaluation found on one sequence."""
+
+    outcomes: tuple[Outcome, ...]
+    pictures: tuple[Picture, ...]
+    perceiving_s: dict[str, float]  # by part; 0 = was on disk
+
+    def portable(self) -> "Part":
+        """The same for another process: its methods are names that cannot be run."""
+        return Part(
+            tuple(replace(one, method=replace(one.method, run=_elsewhere)) for one in self.outcomes),
+            tuple(replace(one, method=replace(one.method, run=_elsewhere)) for one in self.pictures),
+            self.perceiving_s,
+        )
 
 
 @dataclass(frozen=True)
@@ -117,24 +121,48 @@ def run(
     strength: float = 0.5,
 ) -> Results:
     """Every method on every sequence with every prior, each prior a variation of the library's."""
+    parts = [run_one(one, methods, perceive, report, priors=priors, strength=strength) for one in sequences]
+    return joined(sequences, methods, parts)
+
+
+def run_one(
+    sequence: Dataset,
+    methods: Sequence[Method],
+    perceive: PerceiveOf,
+    report: Report,
+    *,
+    priors: int = 1,
+    strength: float = 0.5,
+) -> Part:
+    """Every method on one sequence with every prior."""
     outcomes: list[Outcome] = []
     pictures: list[Picture] = []
-    perceiving_s: dict[str, dict[str, float]] = {}
-    for sequence in sequences:
-        perceptions: dict[str, Perception] = {}
-        named = tuple(item.name for item in sequence.prior.objects)
-        for done, method in enumerate(methods):
-            report(f"{sequence.name}: {method.name}", done, len(methods))
-            key = repr(sorted(method.features.items()))
-            if key not in perceptions:
-                perceptions[key] = perceive(sequence.path, method.features, named)
-                perceiving_s.setdefault(sequence.name, perceptions[key].seconds)
-            for index, prior in enumerate(variations(sequence.prior, priors, strength)):
-                outcome, picture = judge(method, Case(perceptions[key], prior, sequence.truth, sequence.objects), index)
-                outcomes.append(outcome)
-                pictures += [picture] if index == 0 else []
-        report(sequence.name, len(methods), len(methods))
-    return Results(tuple(sequences), tuple(methods), tuple(outcomes), tuple(pictures), perceiving_s)
+    perceptions: dict[str, Perception] = {}
+    named = tuple(item.name for item in sequence.prior.objects)
+    for done, method in enumerate(methods):
+        report(f"{sequence.name}: {method.name}", done, len(methods))
+        key = repr(sorted(method.features.items()))
+        if key not in perceptions:
+            perceptions[key] = perceive(sequence, method.features, named)
+        for index, prior in enumerate(variations(sequence.prior, priors, strength)):
+            outcome, picture = judge(method, Case(perceptions[key], prior, sequence.truth, sequence.objects), index)
+            outcomes.append(outcome)
+            pictures += [picture] if index == 0 else []
+    report(sequence.name, len(methods), len(methods))
+    first = next(iter(perceptions.values()), None)
+    return Part(tuple(outcomes), tuple(pictures), first.seconds if first else {})
+
+
+def joined(sequences: Sequence[Dataset], methods: Sequence[Method], parts: Sequence[Part]) -> Results:
+    """The parts of all sequences, in their order, as one; methods that came from other processes become these."""
+    known = {method.name: method for method in methods}
+    return Results(
+        tuple(sequences),
+        tuple(methods),
+        tuple(replace(one, method=known[one.method.name]) for part in parts for one in part.outcomes),
+        tuple(replace(one, method=known[one.method.name]) for part in parts for one in part.pictures),
+        {sequence.name: part.perceiving_s for sequence, part in zip(sequences, parts, strict=True)},
+    )
 
 
 def judge(method: Method, case: Case, prior: int = 0) -> tuple[Outcome, Picture]:
@@ -168,6 +196,10 @@ def judge(method: Method, case: Case, prior: int = 0) -> tuple[Outcome, Picture]
         confusion[pair] = confusion.get(pair, 0) + volume
     calibration = reliability(scene, assignment, case.truth)
     return Outcome(name, method, prior, scores), Picture(name, method, scene, voxels, calibration, confusion)
+
+
+def _elsewhere(case: Case) -> Scene:
+    raise RuntimeError("this method ran in another process")
 
 
 def _summary(values: list[float], summary: Callable[..., Any]) -> float:
