@@ -5,7 +5,7 @@ import json
 import math
 import multiprocessing
 import os
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
 from pathlib import Path
@@ -42,7 +42,11 @@ SHOWN = {  # keys with their column titles
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """What `prior-sg eval` can be told."""
     parser.add_argument(
-        "datasets", nargs="+", type=Path, metavar="DATASET", help="sources with ground truth, or world:KIND:SEEDS"
+        "datasets",
+        nargs="+",
+        type=Path,
+        metavar="DATASET",
+        help="sources with ground truth, or generated worlds as world:KIND:SEEDS, with SEEDS such as 3, 0-9 or 1,4,7",
     )
     parser.add_argument(
         "--environment",
@@ -55,8 +59,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--encoder",
         default="",
         metavar="NAME",
-        help="conse, or a simulated one that sees what crops truly show, sim:P or simlike:P with P from 0, never wrong, "
-        "to 1 (default: as configured)",
+        help="conse, or a simulated one that sees what crops truly show, sim:P or simlike:P with P, how often it "
+        "errs, from 0 to 1 (default: as configured)",
     )
     parser.add_argument(
         "--jobs", type=int, default=0, metavar="N", help="datasets at a time (default: the number of cores)"

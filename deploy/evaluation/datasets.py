@@ -83,10 +83,12 @@ def of_world(name: WorldName, task: str) -> Dataset:
     """A generated world. Raises EvaluationError."""
     from prior_sg.deploy.evaluation.worlds import world_of
 
-    world = world_of(name.kind, name.seed)
+    try:
+        world = world_of(name.kind, name.seed)
+    except ValueError as error:
+        raise EvaluationError(str(error)) from error
     prior = _prior(world.environment, task, world.truth)
-    path = Path(f"{WORLD}{name.kind}:{name.seed}")
-    return Dataset(f"{name.kind}-{name.seed}", path, world.truth, prior, tuple(world.objects), name)
+    return Dataset(world.name, Path(world.name), world.truth, prior, tuple(world.objects), name)
 
 
 def named_worlds(text: str) -> list[WorldName]:
@@ -129,7 +131,7 @@ def world_source(name: WorldName) -> Source:
                 total=0,
             )
 
-    return Source("world", Path(f"{WORLD}{name.kind}:{name.seed}"), camera, 0, frames)
+    return Source("world", Path(world.name), camera, 0, frames)
 
 
 def sequence_name(path: Path) -> str:

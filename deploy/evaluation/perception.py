@@ -77,7 +77,7 @@ class Cache:
 
     def _path(self, kind: str, key: Any) -> Path:
         digest = hashlib.blake2b(json.dumps(msgspec.to_builtins(key), sort_keys=True).encode(), digest_size=16)
-        return self.folder / f"{kind}-{digest.hexdigest()}.msgpack"
+        return self.folder / f"{kind.replace(':', '-')}-{digest.hexdigest()}.msgpack"
 
 
 class Layout:
