@@ -201,7 +201,7 @@ def chosen_methods(arguments: argparse.Namespace, layers: Layers) -> "list[Metho
 
 
 def print_tables(results: "Results", console: Terminal) -> None:
-    """One table per dataset, then the mean over all; percent."""
+    """One table per dataset, with worlds one per kind, then the mean over all; percent."""
     console.width = max(console.width, TABLE_COLUMNS)
     names = [dataset.name for dataset in results.sequences]
     for name in [*names, ""] if len(names) > 1 else names:
@@ -213,10 +213,26 @@ def print_tables(results: "Results", console: Terminal) -> None:
         for method in results.methods:
             cells = [_cell(results.mean(method.name, k, name), results.sd(method.name, k, name)) for k in SHOWN]
             table.add_row(method.name, *cells, f"{results.mean(method.name, 'seconds', name):.2f}")
+        if not name:
+            _print_kinds(results, console)
         console.print(table)
         for method in results.methods:
             if name and results.judges_objects(method.name, name):
                 console.print(f"{method.name}, objects of {name}: {_objects(results, method.name, name)}")
+
+
+def _print_kinds(results: "Results", console: Terminal) -> None:
+    """One table per kind of dataset, where some are worlds."""
+    for kind in results.kinds():
+        count = sum(dataset.kind == kind for dataset in results.sequences)
+        table = Table(title=f"{kind}, {count} datasets: percent, mean±standard error", box=SIMPLE, padding=(0, 1, 0, 0))
+        table.add_column("method", no_wrap=True)
+        for heading in SHOWN.values():
+            table.add_column(heading, justify="right", no_wrap=True)
+        for method in results.methods:
+            pairs = [results.of_kind(method.name, key, kind) for key in SHOWN]
+            table.add_row(method.name, *(_cell_with_error(*pair) for pair in pairs))
+        console.print(table)
 
 
 def _objects(results: "Results", method: str, sequence: str) -> str:
@@ -260,6 +276,12 @@ def _cell(mean: float, sd: float) -> str:
     if math.isnan(mean):
         return "–"
     return f"{100 * mean:.1f}±{100 * sd:.0f}" if sd else f"{100 * mean:.1f}"
+
+
+def _cell_with_error(mean: float, error: float) -> str:
+    if math.isnan(mean):
+        return "–"
+    return f"{100 * mean:.1f}" if math.isnan(error) else f"{100 * mean:.1f}±{100 * error:.1f}"
 
 
 def _names(text: str) -> list[str]:

@@ -36,6 +36,7 @@ from prior_sg.services.runtime.service import Identity
 ROBOT = "eval"
 CODE = {"ingest": "core/*.py", "place_graph": "**/*.py", "feature_pyramid": "**/*.py"}  # what makes a perception
 
+CACHE = Path("out/eval/cache")
 IMAGE_PX = 480  # shorter side of the images for which crops and the coarse surface were chosen
 
 Report = Callable[[str, int, int], None]  # what is being done, steps done, steps in all (0 = unknown)
@@ -113,12 +114,33 @@ class Perceiver:
         A prompted detector looks for what its settings name, else for `sought`, the prior's objects. A simulated
         encoder sees the crops that the real one of the settings would see, and detects nothing.
         """
+        encoder = simulated(self.encoder, dataset.seed)
+        if encoder is not None:
+            return seen_by(encoder, self.layout(dataset, features), dataset)
         cfg = self._config("feature_pyramid", features)
         if not cfg.detector_prompts and is_prompted(cfg):
             cfg = msgspec.structs.replace(cfg, detector_prompts=sought)
+        mapped = self._mapped(dataset, cfg)
+        made = self._kept("features", dataset, cfg, lambda: self._features(dataset, cfg), mapped.seconds)
+        return replace(
+            mapped,
+            pyramids=tuple(decode(Pyramid, pyramid) for pyramid in made[::2]),
+            detections=tuple(decode(Detections, found) for found in made[1::2]),
+        )
+
+    def layout(self, dataset: Dataset, features: Mapping[str, Any] | None = None) -> Perception:
+        """Places and pyramids whose crops are chosen and not encoded: what simulated encoders start from."""
+        cfg = layout_config(self._config("feature_pyramid", features), dataset)
+        mapped = self._mapped(dataset, cfg)
+        made = self._kept("layout", dataset, cfg, lambda: self._layouts(dataset, cfg), mapped.seconds)
+        mapped.seconds["features"] = mapped.seconds.pop("layout")
+        return replace(mapped, pyramids=tuple(decode(Pyramid, pyramid) for pyramid in made))
+
+    def _mapped(self, dataset: Dataset, cfg: Any) -> Perception:
+        """Places and voxels, without any crops."""
         seconds: dict[str, float] = {}
         snapshot, voxels = self._kept("places", dataset, None, lambda: self._places(dataset), seconds)
-        seen = Perception(
+        return Perception(
             name=dataset.name,
             places=decode(PlaceDelta, snapshot),
             voxels=decode(VoxelMap, voxels),
@@ -127,23 +149,6 @@ class Perceiver:
             text=lambda concepts: self._text(concepts, cfg),
             seconds=seconds,
         )
-        encoder = simulated(self.encoder, dataset.seed)
-        if encoder is not None:
-            return self._simulated(seen, encoder, dataset, layout_config(cfg, dataset))
-        made = self._kept("features", dataset, cfg, lambda: self._features(dataset, cfg), seconds)
-        return replace(
-            seen,
-            pyramids=tuple(decode(Pyramid, pyramid) for pyramid in made[::2]),
-            detections=tuple(decode(Detections, found) for found in made[1::2]),
-        )
-
-    def _simulated(self, seen: Perception, encoder: SimulatedEncoder, dataset: Dataset, cfg: Any) -> Perception:
-        """What was seen, as a simulated encoder sees it; only the choice of crops is kept on disk."""
-        layouts = self._kept("layout", dataset, cfg, lambda: self._layouts(dataset, cfg), seen.seconds)
-        started_s = time.perf_counter()
-        crops = [encoder.encode(decode(Pyramid, one), dataset.truth, dataset.objects) for one in layouts]
-        seen.seconds["features"] = seen.seconds.pop("layout") + time.perf_counter() - started_s
-        return replace(seen, pyramids=tuple(crops), space=encoder.space, text=encoder.text)
 
     def _kept(
         self, kind: str, dataset: Dataset, features: Any, make: Callable[[], list[bytes]], seconds: dict[str, float]
@@ -221,6 +226,27 @@ class Perceiver:
 
     def _runner(self, name: str, cfg: Any, state: Any = None) -> Runner:
         return Runner(BY_NAME[name], cfg, Identity(ROBOT, name, 1), state=state)
+
+
+def seen_by(encoder: SimulatedEncoder, layout: Perception, dataset: Dataset) -> Perception:
+    """A perception whose crops are not encoded, as a simulated encoder sees it."""
+    started_s = time.perf_counter()
+    pyramids = tuple(encoder.encode(one, dataset.truth, dataset.objects) for one in layout.pyramids)
+    features_s = layout.seconds.get("features", 0.0) + time.perf_counter() - started_s
+    seconds = {**layout.seconds, "features": features_s}
+    return replace(layout, pyramids=pyramids, space=encoder.space, text=encoder.text, seconds=seconds)
+
+
+def simulated_perception(dataset: Dataset, encoder: str, seed: int | None = None, folder: Path = CACHE) -> Perception:
+    """A dataset as a simulated encoder such as `sim:0.3` sees it, with the settings' defaults.
+
+    `seed` is of the encoder's errors, the dataset's own if None; `folder` keeps places and the choice of crops. Raises
+    ValueError for what is no simulated encoder.
+    """
+    chosen = simulated(encoder, dataset.seed if seed is None else seed)
+    if chosen is None:
+        raise ValueError(f"{encoder!r} is no simulated encoder, such as sim:0.3")
+    return seen_by(chosen, Perceiver({}, Cache(folder), lambda *_: None).layout(dataset), dataset)
 
 
 def layout_config(cfg: Any, dataset: Dataset) -> Any:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from prior_sg.deploy.evaluation.datasets import Dataset
+from prior_sg.deploy.evaluation.datasets import SEQUENCE, Dataset
 from prior_sg.deploy.evaluation.kinds import OURS
 from prior_sg.deploy.evaluation.methods import Case, Method
 from prior_sg.deploy.evaluation.metrics import SCORES, Reliability, assign, evaluate, reliability
@@ -82,17 +82,36 @@ class Results:
         """Standard deviation over the same values, 0 for one."""
         return _summary(self._values(method, key, sequence), np.std)
 
+    def kinds(self) -> tuple[str, ...]:
+        """Kinds of datasets, in order; none where none is a world."""
+        kinds = dict.fromkeys(one.kind for one in self.sequences)
+        return tuple(kinds) if set(kinds) - {SEQUENCE} else ()
+
+    def of_kind(self, method: str, key: str, kind: str = "") -> tuple[float, float]:
+        """Mean over the datasets of a kind, or all, of their means over priors, and its standard error; NaN = no such
+        score, or too few datasets for an error."""
+        chosen = [one.name for one in self.sequences if kind in ("", one.kind)]
+        means = np.array([value for name in chosen if not math.isnan(value := self.mean(method, key, name))])
+        error = float(means.std(ddof=1)) / math.sqrt(len(means)) if len(means) > 1 else math.nan
+        return _summary(means.tolist(), np.mean), error
+
     def table(self) -> dict[str, Any]:
         """`{"sequences": {NAME: {METHOD: {...}}}, "mean": {METHOD: {...}}, "sd": {METHOD: {...}}}`; None = no score.
 
-        Rows have KEYS, and OBJECT_SCORES where objects were judged.
+        Rows have KEYS, and OBJECT_SCORES where objects were judged. With worlds there is also
+        `{"kinds": {KIND: {METHOD: {KEY: [MEAN, STANDARD ERROR]}}}}`.
         """
         names = [method.name for method in self.methods]
-        return {
+        kinds = {kind: {m: self._errors(m, kind) for m in names} for kind in self.kinds()}
+        return ({"kinds": kinds} if kinds else {}) | {
             "sequences": {s.name: {m: self._row(self.mean, m, s.name) for m in names} for s in self.sequences},
             "mean": {m: self._row(self.mean, m) for m in names},
             "sd": {m: self._row(self.sd, m) for m in names},
         }
+
+    def _errors(self, method: str, kind: str) -> dict[str, list[float | None]]:
+        found = {key: self.of_kind(method, key, kind) for key in KEYS}
+        return {key: [None if math.isnan(value) else value for value in pair] for key, pair in found.items()}
 
     def _row(self, summary: Callable[..., float], method: str, sequence: str = "") -> dict[str, float | None]:
         keys = (*KEYS, *OBJECT_SCORES) if self.judges_objects(method, sequence) else KEYS
