@@ -26,7 +26,7 @@ from prior_sg.schemas.topics import (
 from prior_sg.services.runtime.runner import Runner
 from prior_sg.services.runtime.service import Ask, Identity
 from prior_sg.services.segmenter.core import inference, report
-from prior_sg.services.segmenter.core.aim import region_concepts
+from prior_sg.services.segmenter.core.aim import border_costs, region_concepts
 from prior_sg.services.segmenter.core.appearance.adaptation import Adaptation, AdaptationConfig
 from prior_sg.services.segmenter.core.appearance.label_bias import BalanceConfig
 from prior_sg.services.segmenter.core.appearance.unmixing import UnmixingConfig
@@ -608,3 +608,30 @@ def test_text_is_asked_in_the_configured_space():
 def test_impossible_settings_are_refused(fields):
     with pytest.raises(ValueError):
         Config(**fields)
+
+
+def test_borders_cost_by_adjacency_against_chance_whatever_a_prior_s_level():
+    """Of pairs at 0.9, 0.3, 0.3 the first is likelier than chance, so its border is cheaper; all halved: alike."""
+    adjacency = np.array([(1.0, 0.9, 0.3), (0.9, 1.0, 0.3), (0.3, 0.3, 1.0)])
+    costs, halved = (
+        border_costs(msgspec.structs.replace(prior(ROOMS), adjacency=(scale * adjacency).astype(np.float32)), Config())
+        for scale in (1.0, 0.5)
+    )
+    chance = np.log((0.9 * 0.3 * 0.3) ** (1 / 3))
+    assert costs[0, 1] == pytest.approx(2 * (1.5 + 0.5 * (chance - np.log(0.9))), abs=1e-5)
+    assert costs[0, 2] == pytest.approx(2 * (1.5 + 0.5 * (chance - np.log(0.3))), abs=1e-5)
+    np.testing.assert_allclose(costs, halved, atol=1e-5)
+    flat = msgspec.structs.replace(prior(ROOMS), adjacency=np.full((3, 3), 0.2, np.float32))
+    np.testing.assert_allclose(border_costs(flat, Config()), 3.0 * (1 - np.eye(3)), atol=1e-6)
+
+
+def test_beliefs_are_the_less_sure_the_less_crops_tell():
+    run, _ = finished()
+    cfg = Config()
+    run.state.labelling.told = 0.4
+    assert inference.temperature(run.state, cfg) == cfg.temperature
+    run.state.labelling.told = 0.05
+    assert inference.temperature(run.state, cfg) == pytest.approx(4 * cfg.temperature)
+    run.state.labelling.told = 0.0
+    assert inference.temperature(run.state, cfg) == inference.LEAST_SURE * cfg.temperature
+    assert inference.temperature(run.state, Config(informed=0.0)) == cfg.temperature
