@@ -1,7 +1,10 @@
 """`prior-sg encoders`: write a published model as a folder, and try an encoder."""
 
 import argparse
+import logging
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from prior_sg.deploy.cli.shared import Commands, console
@@ -47,7 +50,7 @@ def cmd_export(arguments: argparse.Namespace) -> int:
     """Write the folder with progress, and say how far it is from PyTorch. Raises ServiceError."""
     from prior_sg.services.feature_pyramid.encoders.exporting.folder import TOLERANCE, export
 
-    with console.status("starting") as status:
+    with _quiet(), console.status("starting") as status:
         found = export(arguments.choice, arguments.out, arguments.licence, status.update)
     size = f"{found.size_bytes / MB:.0f} MB, {found.dim} numbers per embedding, crops of {found.side_px} px"
     console.print(f"{arguments.out}: {size}", soft_wrap=True)
@@ -62,7 +65,7 @@ def cmd_check(arguments: argparse.Namespace) -> int:
     from prior_sg.services.feature_pyramid.encoders.base import Options, load_encoder
     from prior_sg.services.feature_pyramid.encoders.two_towers import pictures_of_nothing
 
-    with console.status(f"loading {arguments.choice}"):
+    with _quiet(), console.status(f"loading {arguments.choice}"):
         encoder = load_encoder(arguments.choice, Options(device=arguments.device))
         crops = pictures_of_nothing()
         crops = (crops * (TRIED_CROPS // len(crops) + 1))[:TRIED_CROPS]
@@ -79,6 +82,16 @@ def cmd_check(arguments: argparse.Namespace) -> int:
 
 
 ACTIONS = {"export": cmd_export, "check": cmd_check}
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Without what the libraries log: of a failure, our sentence tells the reason."""
+    logging.disable(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        logging.disable(logging.NOTSET)
 
 
 def _run(arguments: argparse.Namespace) -> int:

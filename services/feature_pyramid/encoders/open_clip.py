@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from prior_sg.services.feature_pyramid.encoders import torchvision_parts
-from prior_sg.services.feature_pyramid.encoders.base import EncoderUnavailable, Options, key_chunk, package
+from prior_sg.services.feature_pyramid.encoders.base import EncoderUnavailable, Options, key_chunk, package, reason
 from prior_sg.services.feature_pyramid.encoders.torch_pixels import Pixels
 from prior_sg.services.feature_pyramid.encoders.two_towers import ClipEncoder
 
@@ -47,10 +47,9 @@ def towers_of(choice: str, options: Options) -> "Towers":
         )
         tokenizer = open_clip.get_tokenizer(name)
     except Exception as error:  # the hub, the network, the disk and the model each raise their own
-        why = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
         raise EncoderUnavailable(
-            f"the weights {pretrained!r} of open_clip's {name} cannot be loaded ({why}); fetch them once where the hub "
-            "can be reached, or name a file with them as open_clip/MODEL/FILE."
+            f"the weights {pretrained!r} of open_clip's {name} cannot be loaded ({reason(error)}); fetch them once "
+            "where the hub can be reached, or name a file with them as open_clip/MODEL/FILE."
         ) from error
     return Towers(torch, model.eval(), tokenizer, device)
 

@@ -17,7 +17,7 @@ import msgspec
 import numpy as np
 
 from prior_sg.services.feature_pyramid.encoders import onnx
-from prior_sg.services.feature_pyramid.encoders.base import EncoderUnavailable, Options, package
+from prior_sg.services.feature_pyramid.encoders.base import EncoderUnavailable, Options, package, reason
 from prior_sg.services.feature_pyramid.encoders.exporting.model import ExportError, Model
 from prior_sg.services.feature_pyramid.encoders.two_towers import ClipEncoder
 
@@ -61,21 +61,24 @@ def export(choice: str, folder: Path, licence: str = "", progress: Progress = la
         raise ExportError(f"{choice!r} cannot be exported; write open_clip/MODEL/PRETRAINED or siglip/HF_NAME.")
     package("onnx")
     package("onnxruntime")
-    with _emerging(folder) as partial:
-        progress(f"loading {choice}")
-        model = import_module(family).model_of(choice)
+    _check_free(folder)
+    progress(f"loading {choice}, which the model hub delivers at first use")
+    model = import_module(family).model_of(choice)
+    with _emerging(folder.absolute()) as partial:
         manifest = _write(model, partial, licence or LICENCE, progress)
         progress("reading the folder back, and comparing with PyTorch")
         found = _compared(model, manifest, partial)
     return found
 
 
+def _check_free(folder: Path) -> None:
+    if folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
+        raise ExportError(f"{folder} is there already; name a new folder with --out, or remove it.")
+
+
 @contextmanager
 def _emerging(folder: Path) -> Iterator[Path]:
     """A folder beside the one wanted, which takes its place at the end and is gone after any failure."""
-    if folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
-        raise ExportError(f"{folder} is there already; name a new folder with --out, or remove it.")
-    folder = folder.absolute()
     partial = folder.with_name(f".{folder.name}.{os.getpid()}")
     partial.mkdir(parents=True)
     try:
@@ -124,8 +127,9 @@ def _network(network: object, example: object, path: Path, takes: str) -> dict:
     except (OSError, MemoryError, EncoderUnavailable):
         raise
     except Exception as error:  # the exporter and the models each raise their own
-        why = (str(error).strip().splitlines() or [type(error).__name__])[0]
-        raise ExportError(f"PyTorch cannot write {path.name} of this model ({why}); export another model.") from error
+        raise ExportError(
+            f"PyTorch cannot write {path.name} of this model ({reason(error)}); export another model."
+        ) from error
     described = _described(path)
     return {
         "file": described.file,

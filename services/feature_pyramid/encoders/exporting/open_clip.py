@@ -1,9 +1,6 @@
 """Models of open_clip: `open_clip/MODEL/PRETRAINED`."""
 
 from pathlib import Path
-from typing import Any
-
-import torch
 
 from prior_sg.services.feature_pyramid.encoders import open_clip
 from prior_sg.services.feature_pyramid.encoders.base import Options
@@ -23,21 +20,13 @@ def model_of(choice: str) -> Model:
         packages=("open-clip-torch",),
         pixels=towers.pixels,
         image=Tower(model, model.encode_image).eval(),
-        text=Tower(model, _reader(model, tokenizer)).eval(),
+        text=Tower(model, model.encode_text).eval(),
         logit_scale=towers.logit_scale,
         context=int(tokenizer.context_length),
         pad_id=getattr(getattr(tokenizer, "tokenizer", None), "pad_token_id", None) or 0,
         tokens=lambda texts: tokenizer(texts).numpy(),
         tokenizer=tokenizer_of(tokenizer, name),
     )
-
-
-def _reader(model: Any, tokenizer: Any) -> Any:
-    """The text tower. Where open_clip blanks the separator, the network does: a tokenizer's file cannot say so."""
-    if not getattr(tokenizer, "strip_sep_token", False):
-        return model.encode_text
-    separator = tokenizer.tokenizer.sep_token_id
-    return lambda tokens: model.encode_text(torch.where(tokens == separator, torch.zeros_like(tokens), tokens))
 
 
 def _source(name: str, pretrained: str, file: bool) -> str:

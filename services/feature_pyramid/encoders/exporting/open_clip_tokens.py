@@ -23,7 +23,10 @@ def tokenizer_of(tokenizer: Any, model: str) -> Tokenizer:
     if kind == "SimpleTokenizer" and usual:
         return _of_clip(tokenizer)
     if kind == "HFTokenizer" and usual and backend is not None:
-        return behind(cleaning(_way(tokenizer)), backend)
+        copy = behind(cleaning(_way(tokenizer)), backend)
+        if tokenizer.strip_sep_token:
+            copy.post_processor = _blank_separator(tokenizer.tokenizer)
+        return copy
     raise ExportError(f"the tokenizer of {model} ({kind}) cannot be written as a file; export another model.")
 
 
@@ -52,6 +55,14 @@ def cleaning(way: str) -> list[Any]:
 def _way(tokenizer: Any) -> str:
     """How a tokenizer cleans texts, by the name of the function."""
     return tokenizer.clean_fn.__name__.removeprefix("_clean_")
+
+
+def _blank_separator(own: Any) -> processors.PostProcessor:
+    """BERT's marks around a text, the second of them 0 as everything behind it."""
+    return processors.TemplateProcessing(
+        single=f"{own.cls_token} $A {own.sep_token}",
+        special_tokens=[(own.cls_token, own.cls_token_id), (own.sep_token, 0)],
+    )
 
 
 def _of_clip(tokenizer: Any) -> Tokenizer:

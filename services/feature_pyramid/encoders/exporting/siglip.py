@@ -4,13 +4,14 @@ Both were trained on text in lower case. SigLIP's own tokenizer sees to that; th
 transformers only, so texts are lowered here in any case.
 """
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from tokenizers import Regex, Tokenizer, normalizers, processors
 
 from prior_sg.services.feature_pyramid.encoders import torchvision_parts
-from prior_sg.services.feature_pyramid.encoders.base import EncoderUnavailable, package
+from prior_sg.services.feature_pyramid.encoders.base import EncoderUnavailable, package, reason
 from prior_sg.services.feature_pyramid.encoders.exporting.model import ExportError, Model, Tower
 from prior_sg.services.feature_pyramid.encoders.exporting.open_clip_tokens import PUNCTUATION, behind
 from prior_sg.services.feature_pyramid.encoders.torch_pixels import Interpolation, Pixels
@@ -24,6 +25,7 @@ def model_of(choice: str) -> Model:
     name = choice.removeprefix("siglip/")
     if not name:
         raise ExportError("siglip/ names no model; write siglip/HF_NAME, as siglip/google/siglip-base-patch16-224.")
+    short = name.rstrip("/").rpartition("/")[2]
     look, tokenizer, model = _loaded(name)
     context = int(model.config.text_config.max_position_embeddings)
 
@@ -33,8 +35,8 @@ def model_of(choice: str) -> Model:
         return np.array(tokenizer(lowered, **how)["input_ids"], np.int64)
 
     return Model(
-        name=name.rstrip("/").rpartition("/")[2],
-        source=f"transformers {name}, https://huggingface.co/{name}",
+        name=short,
+        source=f"SigLIP of the folder {short}" if Path(name).is_dir() else f"SigLIP, https://huggingface.co/{name}",
         packages=("transformers", "tokenizers"),
         pixels=_pixels(look, model.config.vision_config.image_size),
         image=Tower(model, lambda pixels: model.vision_model(pixel_values=pixels).pooler_output).eval(),
@@ -60,13 +62,12 @@ def _loaded(name: str) -> tuple[Any, Any, Any]:
         tokenizer = transformers.AutoTokenizer.from_pretrained(name)
         model = transformers.AutoModel.from_pretrained(name, attn_implementation="eager").eval().float()
     except (OSError, ValueError, ImportError) as error:
-        why = next((line for line in str(error).splitlines() if line.strip()), type(error).__name__).strip()
         if any(word in str(error).lower() for word in SENTENCEPIECE):
             raise EncoderUnavailable(
                 f"the tokenizer of {name} needs the package sentencepiece; run `pip install 'prior-sg[export]'`."
             ) from error
         raise EncoderUnavailable(
-            f"SigLIP's weights {name!r} cannot be loaded ({why.rstrip('.')}); name a folder with them, or a model "
+            f"SigLIP's weights {name!r} cannot be loaded ({reason(error)}); name a folder with them, or a model "
             "that this machine can download."
         ) from error
     return look, tokenizer, model
