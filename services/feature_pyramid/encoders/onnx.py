@@ -77,20 +77,27 @@ def space_of(choice: str) -> str:
 
 def load(choice: str, options: Options) -> ClipEncoder:
     """The encoder, its files checked against the manifest. Raises EncoderUnavailable."""
+    return ClipEncoder(space_of(choice), towers_of(choice, options), options.batch_on(_device(options)))
+
+
+def towers_of(choice: str, options: Options) -> "Towers":
+    """The two networks, their files checked against the manifest. Raises EncoderUnavailable."""
     folder = _folder(choice)
     manifest = _manifest(folder)
     for network in (manifest.image, manifest.text):
         if network.weights is not None:
             _checked(folder, network.weights)
     image, text, tokens = (_checked(folder, part) for part in (manifest.image, manifest.text, manifest.tokenizer))
-    device = "cpu" if options.device == "auto" else options.device
-    towers = Towers(
+    return Towers(
         manifest,
-        Session(image, options.threads, device),
-        Session(text, options.threads, device),
+        Session(image, options.threads, _device(options)),
+        Session(text, options.threads, _device(options)),
         tokenizer_of(tokens, manifest.text),
     )
-    return ClipEncoder(space_of(choice), towers, options.batch_on(device))
+
+
+def _device(options: Options) -> str:
+    return "cpu" if options.device == "auto" else options.device
 
 
 class Towers:

@@ -49,6 +49,7 @@ def write_large(
             all_tensors_to_one_file=True,
             location=weights.name,
         )
+    weights.chmod(path.stat().st_mode)  # the library lets nobody else read it
     return weights
 
 

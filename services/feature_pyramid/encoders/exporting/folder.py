@@ -17,9 +17,8 @@ import msgspec
 import numpy as np
 
 from prior_sg.services.feature_pyramid.encoders import onnx
-from prior_sg.services.feature_pyramid.encoders.base import EncoderUnavailable, Options, package, reason
-from prior_sg.services.feature_pyramid.encoders.exporting.model import ExportError, Model
-from prior_sg.services.feature_pyramid.encoders.two_towers import ClipEncoder
+from prior_sg.services.feature_pyramid.encoders.base import EncoderUnavailable, Options, package, reason, unit
+from prior_sg.services.feature_pyramid.encoders.exporting.model import ExportError, Model, TorchTowers
 
 FAMILIES = {  # how a choice begins -> module with `model_of(choice) -> Model`
     "open_clip/": "prior_sg.services.feature_pyramid.encoders.exporting.open_clip",
@@ -147,10 +146,11 @@ def _compared(model: Model, manifest: onnx.Manifest, folder: Path) -> Exported:
     """What the folder gives, beside what PyTorch gives. Raises ExportError."""
     _compare_tokens(model, manifest, folder)
     choice = f"onnx:{folder}"
-    ours, theirs = onnx.load(choice, Options()), model.encoder()
+    ours, theirs = onnx.towers_of(choice, Options()), TorchTowers(model)
     crops = pictures(model.pixels.side_px)
-    image = _distance(ours.encode_images(crops), theirs.encode_images(crops))
-    text = _distance(_texts(ours), _texts(theirs))
+    images = ours.images(crops)
+    image = _distance(images, theirs.images(crops))
+    text = _distance(ours.texts(list(PHRASES)), theirs.texts(list(PHRASES)))
     for what, distance in (("image", image), ("text", text)):
         if not distance <= TOLERANCE:
             raise ExportError(
@@ -158,7 +158,7 @@ def _compared(model: Model, manifest: onnx.Manifest, folder: Path) -> Exported:
                 f"{TOLERANCE:.0e}; nothing was written, export another model."
             )
     size = sum(file.stat().st_size for file in folder.iterdir())
-    return Exported(onnx.space_of(choice), ours.dim, ours.side_px, size, image, text)
+    return Exported(onnx.space_of(choice), images.shape[1], ours.side_px, size, image, text)
 
 
 def _compare_tokens(model: Model, manifest: onnx.Manifest, folder: Path) -> None:
@@ -182,10 +182,6 @@ def pictures(side_px: int) -> list[np.ndarray]:
     return found
 
 
-def _texts(encoder: ClipEncoder) -> np.ndarray:
-    return encoder.encode_text([[phrase] for phrase in PHRASES]).embeddings
-
-
 def _distance(ours: np.ndarray, theirs: np.ndarray) -> float:
-    """The greatest Euclidean distance of rows."""
-    return float(np.linalg.norm(ours.astype(np.float64) - theirs, axis=1).max())
+    """The greatest Euclidean distance of rows, each scaled to unit length."""
+    return float(np.linalg.norm(unit(ours) - unit(theirs), axis=1).max())

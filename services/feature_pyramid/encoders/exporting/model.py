@@ -8,7 +8,6 @@ import numpy as np
 import torch
 from tokenizers import Tokenizer
 
-from prior_sg.services.feature_pyramid.encoders import two_towers
 from prior_sg.services.feature_pyramid.encoders.torch_pixels import Pixels
 from prior_sg.services.runtime.service import ServiceError
 
@@ -45,13 +44,9 @@ class Model:
     tokens: Callable[[list[str]], np.ndarray]  # the model's own way: int64 (text, context)
     tokenizer: Tokenizer  # what is to give the same
 
-    def encoder(self) -> two_towers.ClipEncoder:
-        """The model as an encoder, in PyTorch."""
-        return two_towers.ClipEncoder(self.name, _Towers(self), batch_size=4)
 
-
-class _Towers:
-    """A model for arrays and strings."""
+class TorchTowers:
+    """A model in PyTorch for arrays and strings."""
 
     def __init__(self, model: Model) -> None:
         self._model = model
