@@ -1,6 +1,6 @@
 """Encoders `onnx:FOLDER`: a user's own export of a model with an image and a text tower, described by a manifest.
 
-docs/encoders.md shows the manifest and how to export a model.
+`prior-sg encoders export` writes such a folder; docs/encoders.md shows the manifest.
 """
 
 import hashlib
