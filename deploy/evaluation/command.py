@@ -1,9 +1,11 @@
 """`prior-sg eval`: from the command line to tables and a page."""
 
 import argparse
-import json
 import math
+import multiprocessing
+import os
 from collections.abc import Collection, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,14 +15,17 @@ from rich.table import Table
 
 from prior_sg.deploy.cli.shared import add_settings
 from prior_sg.deploy.evaluation.kinds import BASELINES, ORACLES, OURS, SWEEPS
+from prior_sg.deploy.json_text import json_text
 from prior_sg.deploy.settings import DEMO_TASK, Layers, settings_layers
 from prior_sg.deploy.terminal import Description, Terminal
 
 if TYPE_CHECKING:
+    from prior_sg.deploy.evaluation.datasets import Dataset
     from prior_sg.deploy.evaluation.methods import Method
-    from prior_sg.deploy.evaluation.perception import Report
-    from prior_sg.deploy.evaluation.runner import Dataset, Results
+    from prior_sg.deploy.evaluation.perception import Perceiver, Report
+    from prior_sg.deploy.evaluation.runner import Part, Results
 
+CONSE = "conse"
 TABLE_COLUMNS = 100  # narrower terminals wrap lines, which is better than cells cut short
 SHOWN = {  # keys with their column titles
     "f1_s": "F1_S",
@@ -36,14 +41,29 @@ SHOWN = {  # keys with their column titles
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """What `prior-sg eval` can be told."""
-    parser.add_argument("datasets", nargs="+", type=Path, metavar="DATASET", help="sources with ground truth")
+    parser.add_argument(
+        "datasets",
+        nargs="+",
+        type=Path,
+        metavar="DATASET",
+        help="sources with ground truth, or generated worlds as world:KIND:SEEDS, with SEEDS such as 3, 0-9 or 1,4,7",
+    )
     parser.add_argument(
         "--environment",
         action="append",
         default=[],
         metavar="[NAME=]TEXT",
-        required=True,
-        help="what kind of place it is, in plain words: of all datasets, or of the dataset NAME; may be repeated",
+        help="what kind of place it is, in plain words: of all sequences, or of the sequence NAME; may be repeated",
+    )
+    parser.add_argument(
+        "--encoder",
+        default="",
+        metavar="NAME",
+        help="conse, or a simulated one that sees what crops truly show, sim:P or simlike:P with P, how often it "
+        "errs, from 0 to 1 (default: as configured)",
+    )
+    parser.add_argument(
+        "--jobs", type=int, default=0, metavar="N", help="datasets at a time (default: the number of cores)"
     )
     parser.add_argument("--task", default=DEMO_TASK, help="what the robot is to do (default: %(default)s)")
     parser.add_argument("--methods", default=OURS, help=f"of {', '.join((OURS, *BASELINES))} (default: %(default)s)")
@@ -67,29 +87,99 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace, console: Terminal) -> int:
     """Evaluate, print, and write eval.json (and report.html) to the output folder. Raises EvaluationError."""
     from prior_sg.deploy.evaluation import runner
-    from prior_sg.deploy.evaluation.perception import Cache, EvaluationError, Perceiver
+    from prior_sg.deploy.evaluation.datasets import chosen_datasets
+    from prior_sg.deploy.evaluation.errors import EvaluationError
 
     if arguments.priors < 1 or arguments.strength < 0:
         raise EvaluationError("--priors must be at least 1 and --strength at least 0")
-    layers = settings_layers(arguments.config, arguments.set)
+    if arguments.jobs < 0:
+        raise EvaluationError("--jobs must be at least 1, or 0 for the number of cores")
+    layers = chosen_layers(arguments)
     methods = chosen_methods(arguments, layers)
     datasets = chosen_datasets(arguments.datasets, arguments.environment, arguments.task)
+    check_encoder(arguments, datasets)
     arguments.out.mkdir(parents=True, exist_ok=True)
+    jobs = min(arguments.jobs or os.cpu_count() or 1, len(datasets))
     with progress(Terminal(stderr=True)) as report:
-        perceiver = Perceiver(layers, Cache(arguments.out / "cache"), report)
-        results = runner.run(
-            datasets, methods, perceiver.perceive, report, priors=arguments.priors, strength=arguments.strength
-        )
+        if jobs > 1:
+            results = runner.joined(datasets, methods, in_parallel(arguments, datasets, jobs, report))
+        else:
+            perceive = perceiver_of(arguments, layers, report).perceive
+            results = runner.run(
+                datasets, methods, perceive, report, priors=arguments.priors, strength=arguments.strength
+            )
     found = results.table()
-    (arguments.out / "eval.json").write_text(json.dumps(found, indent=1))
+    (arguments.out / "eval.json").write_text(json_text(found))
     if arguments.json:
-        print(json.dumps(found))
+        print(json_text(found, None))
     else:
         print_tables(results, console)
     if arguments.html:
         _write_page(results, arguments)
         Terminal(stderr=True).print(f"written to {arguments.out}: eval.json, report.html")
     return 0
+
+
+def chosen_layers(arguments: argparse.Namespace) -> Layers:
+    """The settings, with the encoder that was asked for where it is a real one. Raises EvaluationError."""
+    from prior_sg.deploy.evaluation.errors import EvaluationError
+    from prior_sg.deploy.evaluation.simulated import simulated
+    from prior_sg.schemas.features import DEFAULT_SPACE
+
+    layers = settings_layers(arguments.config, arguments.set)
+    try:
+        if not arguments.encoder or simulated(arguments.encoder):
+            return layers
+    except ValueError as error:
+        raise EvaluationError(str(error)) from error
+    if arguments.encoder != CONSE:
+        raise EvaluationError(f"--encoder is {CONSE}, sim:P or simlike:P, not {arguments.encoder!r}")
+    own = layers.get("feature_pyramid", {})
+    if str(own.get("space", DEFAULT_SPACE)).startswith(f"{CONSE}/"):
+        return layers
+    return {**layers, "feature_pyramid": {**own, "space": DEFAULT_SPACE}}
+
+
+def check_encoder(arguments: argparse.Namespace, datasets: "Sequence[Dataset]") -> None:
+    """Raise EvaluationError where an encoder is asked what it cannot tell."""
+    from prior_sg.deploy.evaluation.errors import EvaluationError
+    from prior_sg.deploy.evaluation.simulated import simulated
+
+    if simulated(arguments.encoder) is None:
+        if any(dataset.world for dataset in datasets):
+            raise EvaluationError("worlds have no colours for a real encoder: add --encoder sim:P or simlike:P")
+    elif "encoder" in _names(arguments.sweep):
+        raise EvaluationError("--sweep encoder compares real encoders: leave out --encoder, or that sweep")
+
+
+def perceiver_of(arguments: argparse.Namespace, layers: Layers, report: "Report") -> "Perceiver":
+    """What perceives the datasets of a command line."""
+    from prior_sg.deploy.evaluation.perception import Cache, Perceiver
+
+    return Perceiver(layers, Cache(arguments.out / "cache"), report, arguments.encoder)
+
+
+def in_parallel(
+    arguments: argparse.Namespace, datasets: "Sequence[Dataset]", jobs: int, report: "Report"
+) -> "list[Part]":
+    """Each dataset judged in one of several processes, which start anew: compiled code and threads do not fork."""
+    asked = argparse.Namespace(**{name: value for name, value in vars(arguments).items() if name != "run"})
+    with ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")) as pool:
+        futures = [pool.submit(judge_one, asked, dataset) for dataset in datasets]
+        for done, _ in enumerate(as_completed(futures)):
+            report(f"{jobs} datasets at a time", done + 1, len(datasets))
+        return [future.result() for future in futures]
+
+
+def judge_one(arguments: argparse.Namespace, dataset: "Dataset") -> "Part":
+    """All methods on one dataset, in a process of its own."""
+    from prior_sg.deploy.evaluation import runner
+
+    layers = chosen_layers(arguments)
+    perceive = perceiver_of(arguments, layers, lambda *_: None).perceive
+    methods, priors = chosen_methods(arguments, layers), arguments.priors
+    part = runner.run_one(dataset, methods, perceive, lambda *_: None, priors=priors, strength=arguments.strength)
+    return part.portable()
 
 
 def chosen_methods(arguments: argparse.Namespace, layers: Layers) -> "list[Method]":
@@ -110,30 +200,8 @@ def chosen_methods(arguments: argparse.Namespace, layers: Layers) -> "list[Metho
     return chosen
 
 
-def chosen_datasets(paths: Sequence[Path], environments: Sequence[str], task: str) -> "list[Dataset]":
-    """Datasets with truth and prior; the vocabulary is the ground truth's. Raises EvaluationError or SourceError."""
-    from prior_sg.deploy.evaluation.perception import EvaluationError, ground_truth, sequence_name
-    from prior_sg.deploy.evaluation.priors import library_prior
-    from prior_sg.deploy.evaluation.runner import Dataset
-    from prior_sg.deploy.truth import read_objects
-
-    named = dict(text.split("=", 1) for text in environments if "=" in text)
-    general = [text for text in environments if "=" not in text]
-    datasets: list[Dataset] = []
-    for path in paths:
-        name, truth = sequence_name(path), ground_truth(path)
-        environment = named.get(name, general[-1] if general else "")
-        if not environment:
-            raise EvaluationError(f'say what kind of place {name} is, such as --environment "{name}=residential home"')
-        if any(dataset.name == name for dataset in datasets):
-            raise EvaluationError(f"two datasets are called {name}; rename one, for tables go by name")
-        prior = library_prior(environment, task, list(dict.fromkeys(region.label for region in truth.regions)))
-        datasets.append(Dataset(name, path, truth, prior, read_objects(path)))
-    return datasets
-
-
 def print_tables(results: "Results", console: Terminal) -> None:
-    """One table per dataset, then the mean over all; percent."""
+    """One table per dataset, with worlds one per kind, then the mean over all; percent."""
     console.width = max(console.width, TABLE_COLUMNS)
     names = [dataset.name for dataset in results.sequences]
     for name in [*names, ""] if len(names) > 1 else names:
@@ -145,10 +213,26 @@ def print_tables(results: "Results", console: Terminal) -> None:
         for method in results.methods:
             cells = [_cell(results.mean(method.name, k, name), results.sd(method.name, k, name)) for k in SHOWN]
             table.add_row(method.name, *cells, f"{results.mean(method.name, 'seconds', name):.2f}")
+        if not name:
+            _print_kinds(results, console)
         console.print(table)
         for method in results.methods:
             if name and results.judges_objects(method.name, name):
                 console.print(f"{method.name}, objects of {name}: {_objects(results, method.name, name)}")
+
+
+def _print_kinds(results: "Results", console: Terminal) -> None:
+    """One table per kind of dataset, where some are worlds."""
+    for kind in results.kinds():
+        count = sum(dataset.kind == kind for dataset in results.sequences)
+        table = Table(title=f"{kind}, {count} datasets: percent, mean±standard error", box=SIMPLE, padding=(0, 1, 0, 0))
+        table.add_column("method", no_wrap=True)
+        for heading in SHOWN.values():
+            table.add_column(heading, justify="right", no_wrap=True)
+        for method in results.methods:
+            pairs = [results.of_kind(method.name, key, kind) for key in SHOWN]
+            table.add_row(method.name, *(_cell_with_error(*pair) for pair in pairs))
+        console.print(table)
 
 
 def _objects(results: "Results", method: str, sequence: str) -> str:
@@ -194,12 +278,18 @@ def _cell(mean: float, sd: float) -> str:
     return f"{100 * mean:.1f}±{100 * sd:.0f}" if sd else f"{100 * mean:.1f}"
 
 
+def _cell_with_error(mean: float, error: float) -> str:
+    if math.isnan(mean):
+        return "–"
+    return f"{100 * mean:.1f}" if math.isnan(error) else f"{100 * mean:.1f}±{100 * error:.1f}"
+
+
 def _names(text: str) -> list[str]:
     return list(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
 
 
 def _known(text: str, kinds: Collection[str], option: str) -> list[str]:
-    from prior_sg.deploy.evaluation.perception import EvaluationError
+    from prior_sg.deploy.evaluation.errors import EvaluationError
 
     unknown = [name for name in _names(text) if name not in kinds]
     if unknown:

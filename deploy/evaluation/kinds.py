@@ -4,6 +4,7 @@ from typing import Any
 
 OURS = "ours"
 BASELINES = ("clio", "hovsg", "hydra", "argmax")  # modules of the folder baselines
+SIMULATED = ("sim", "simlike")  # encoders, each followed by :P, how often it errs
 SWEEPS: dict[str, tuple[Any, ...]] = {  # values by setting
     "crop": (112, 224, 448),
     "encoder": tuple(f"conse/efficientnet-lite{size}/minilm-l6-v2" for size in (0, 1, 2)),

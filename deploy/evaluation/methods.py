@@ -10,8 +10,9 @@ import msgspec
 import numpy as np
 
 from prior_sg.deploy.evaluation import oracles, priors
+from prior_sg.deploy.evaluation.errors import EvaluationError
 from prior_sg.deploy.evaluation.kinds import BASELINES, ORACLES, OURS, SWEEPS
-from prior_sg.deploy.evaluation.perception import EvaluationError, Perception
+from prior_sg.deploy.evaluation.perception import Perception
 from prior_sg.deploy.truth import GroundTruth, TrueObject
 from prior_sg.schemas.features import Pyramid, TextEmbeddings
 from prior_sg.schemas.objects import Detections

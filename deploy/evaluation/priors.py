@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import msgspec
 import numpy as np
 
-from prior_sg.deploy.evaluation.perception import EvaluationError
+from prior_sg.deploy.evaluation.errors import EvaluationError
 from prior_sg.deploy.truth import GroundTruth
 from prior_sg.schemas.places import PlaceDelta
 from prior_sg.schemas.priors import Prior, PriorList, PriorRequest, RegionPrior

@@ -12,12 +12,13 @@ from rich.console import Console
 
 from prior_sg.deploy.cli import main
 from prior_sg.deploy.cli.report import compare
-from prior_sg.deploy.evaluation import command, methods, oracles, priors, runner
+from prior_sg.deploy.evaluation import command, datasets, methods, oracles, priors, runner
+from prior_sg.deploy.evaluation.errors import EvaluationError
 from prior_sg.deploy.evaluation.kinds import BASELINES, ORACLES, SWEEPS
 from prior_sg.deploy.evaluation.metrics import Reliability
 from prior_sg.deploy.evaluation.object_metrics import OBJECT_SCORES
 from prior_sg.deploy.evaluation.page import page, reliability_points, true_scene
-from prior_sg.deploy.evaluation.perception import CODE, Cache, EvaluationError, Perception, code_digest, source_digest
+from prior_sg.deploy.evaluation.perception import CODE, Cache, Perception, code_digest, source_digest
 from prior_sg.deploy.evaluation.plots import line_plot
 from prior_sg.deploy.running.job import Counts, Result
 from prior_sg.deploy.truth import GroundTruth, TrueObject, read_objects
@@ -154,7 +155,7 @@ def test_scores_of_objects_stand_beside_the_others(case, capsys):
         runner.Dataset("b", Path("b"), full.truth, full.prior),
     ]
     found = runner.run(
-        sequences, [method], lambda path, features, sought: replace(full.perception, name=str(path)), quiet
+        sequences, [method], lambda dataset, features, sought: replace(full.perception, name=dataset.name), quiet
     )
     table = found.table()
     assert list(table["sequences"]["a"]["ours"]) == [*runner.KEYS, *OBJECT_SCORES]
@@ -290,7 +291,7 @@ def results(case) -> runner.Results:
     chosen = [methods.ours(Config()), methods.baseline("argmax"), *methods.ablations(Config())[:2]]
     chosen += [methods.oracle(Config(), "prior"), *methods.sweep(Config(), "radius")]
     dataset = runner.Dataset("two rooms", Path("two rooms"), case.truth, case.prior)
-    return runner.run([dataset], chosen, lambda path, features, sought: case.perception, lambda *_: None, priors=3)
+    return runner.run([dataset], chosen, lambda dataset, features, sought: case.perception, lambda *_: None, priors=3)
 
 
 def test_results_sum_up_over_priors(results):
@@ -374,11 +375,11 @@ def test_a_digest_of_code_covers_the_files_that_make_a_perception():
 
 
 def test_environments_go_by_name_or_to_all():
-    (home,) = command.chosen_datasets([SAMPLE], ["office floor", "home=residential home"], "tidy up")
+    (home,) = datasets.chosen_datasets([SAMPLE], ["office floor", "home=residential home"], "tidy up")
     assert home.prior.environment == "residential home"
     assert home.prior.vocabulary == [region.label for region in home.truth.regions]
     with pytest.raises(EvaluationError, match="home=residential home"):
-        command.chosen_datasets([SAMPLE], ["other=office floor"], "tidy up")
+        datasets.chosen_datasets([SAMPLE], ["other=office floor"], "tidy up")
 
 
 @pytest.mark.parametrize(
