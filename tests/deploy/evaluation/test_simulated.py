@@ -59,7 +59,8 @@ def layout(depth_m: float = WALL_M, y_m: float = 0.0, frame_id: int = 0, cells: 
 @pytest.fixture
 def noiseless(monkeypatch):
     monkeypatch.setattr(simulated, "NOISE", 0.0)
-    monkeypatch.setattr(simulated, "FRAME_NOISE", 0.0)
+    for name in ("FRAME_NOISE", "CROP_NOISE", "TINT"):
+        monkeypatch.setattr(simulated, name, 0.0)
 
 
 @pytest.mark.parametrize("choice", ["sim:0", "simlike:0"])
@@ -121,7 +122,7 @@ def test_what_an_encoder_says_is_settled_by_its_seed():
 
 def test_crops_without_measured_surface_are_left_out():
     half = layout(cells=2)
-    half.surface_m[:30] = 0.0
+    half.surface_m[:40] = 0.0  # crops are square and overlap
     assert len(encoder_of("sim:0").encode(half, truth()).layers) == 2
     half.surface_m[:] = 0.0
     assert len(encoder_of("sim:0").encode(half, truth()).layers) == 0
@@ -153,15 +154,34 @@ def test_a_share_of_whole_regions_looks_more_like_another_label(share):
     assert np.mean(wrong) == pytest.approx(share, abs=0.06)
 
 
-def test_frames_share_noise_and_small_crops_have_more():
-    encoder, large = encoder_of("simlike:0"), layout(cells=1)
-    small = layout(cells=8)
+def test_frames_share_noise_and_small_crops_have_more(monkeypatch):
+    monkeypatch.setattr(simulated, "TINT", 0.0)
+    encoder, small = encoder_of("simlike:0"), layout(cells=8)
     frames = [encoder.encode(replace_struct(small, frame_id=frame), truth()).embeddings for frame in range(20)]
-    off = np.array(frames, float) - look_of("kitchen")
-    within = off - off.mean(axis=1, keepdims=True)
-    assert off.mean(axis=1).std() > 2 * (within.std() / 8)
-    one = encoder.encode(large, truth()).embeddings[0].astype(float) @ look_of("kitchen")
-    assert (frames[0].astype(float) @ look_of("kitchen")).mean() < one
+    off = np.array(frames, float) - np.mean(frames, axis=(0, 1), dtype=float)
+    apart = off - off.mean(axis=1, keepdims=True)
+    assert np.linalg.norm(off.mean(axis=1), axis=1).mean() > 2 * np.linalg.norm(apart, axis=2).mean() / 8
+    monkeypatch.setattr(simulated, "FRAME_NOISE", 0.0)
+    large, small = (encoder.encode(layout(cells=cells), truth()).embeddings for cells in (1, 8))
+    assert (small.astype(float) @ look_of("kitchen")).mean() < large[0].astype(float) @ look_of("kitchen")
+
+
+def test_an_encoder_favours_labels_everywhere(monkeypatch):
+    encoder = encoder_of("simlike:0")
+    tint = encoder.tint(LABELS)
+    favoured = int(np.argmax([tint @ look_of(name) for name in LABELS]))
+    layouts = [layout(cells=4, frame_id=frame) for frame in range(30)]
+    text = encoder.text([[name] for name in LABELS])
+
+    def standing() -> float:
+        """Of the favoured label above the others, mean over crops."""
+        seen = np.concatenate([encoder.encode(one, truth()).embeddings for one in layouts]).astype(float)
+        z = (seen @ text.embeddings.T - text.background_mean) / text.background_std
+        return float((z[:, favoured] - z.mean(axis=1)).mean())
+
+    tinted = standing()
+    monkeypatch.setattr(simulated, "TINT", 0.0)
+    assert tinted > standing() + 0.1
 
 
 def test_objects_look_like_themselves(noiseless):
