@@ -52,4 +52,4 @@ $(LLM)/installed:
 	touch $@
 
 clean:
-	rm -rf $(VENV) $(LLM) out
+	rm -rf $(VENV) $(LLM) out build

@@ -76,13 +76,19 @@ class TrueObject:
     max_m: np.ndarray  # (3,)
 
 
-def read_objects(path: Path) -> tuple[TrueObject, ...]:
-    """The objects of an `objects.json` in a dataset's folder; none where there is no such file."""
+def read_objects(path: Path, origin_m: Sequence[float] = (0.0, 0.0, 0.0)) -> tuple[TrueObject, ...]:
+    """The objects of an `objects.json` in a dataset's folder; none where there is no such file.
+
+    `origin_m` is where the recording's poses were recentred: boxes move with them.
+    """
     file = path / "objects.json"
     if not file.exists():
         return ()
-    boxes = json.loads(file.read_text())["objects"]
-    return tuple(TrueObject(str(b["label"]), np.array(b["min_m"], float), np.array(b["max_m"], float)) for b in boxes)
+    boxes, zero = json.loads(file.read_text())["objects"], np.array(origin_m, float)
+    return tuple(
+        TrueObject(str(b["label"]), np.array(b["min_m"], float) - zero, np.array(b["max_m"], float) - zero)
+        for b in boxes
+    )
 
 
 def in_view(objects: Sequence[TrueObject], voxels: VoxelMap) -> np.ndarray:

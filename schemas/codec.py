@@ -14,7 +14,6 @@ import struct
 import threading
 from collections.abc import Iterator
 from functools import cache
-from types import UnionType
 from typing import Annotated, Any, ClassVar, TypeVar, get_args, get_origin, get_type_hints
 
 import msgspec
@@ -116,24 +115,32 @@ def _check_plain(value: msgspec.Struct) -> None:
         if isinstance(number, int) and not -(2**63) <= number < 2**63:
             raise ValueError(f"{field}: does not fit 64 bits")
     for field in real:
-        numbers = getattr(value, field)
-        numbers = numbers if isinstance(numbers, tuple) else (numbers,)
-        if not all(number is None or math.isfinite(number) for number in numbers):
+        if not all(map(math.isfinite, _reals(getattr(value, field)))):
             raise ValueError(f"{field}: not finite")
+
+
+def _reals(value: Any) -> Iterator[float]:
+    """The real numbers in a number, or in lists, tuples and dictionaries of them."""
+    if isinstance(value, float | int):
+        yield value
+    elif isinstance(value, list | tuple):
+        for item in value:
+            yield from _reals(item)
+    elif isinstance(value, dict):
+        for item in value.values():
+            yield from _reals(item)
+
+
+def _holds_reals(hint: Any) -> bool:
+    return hint is float or any(map(_holds_reals, get_args(hint)))
 
 
 @cache
 def _numbers(kind: type[msgspec.Struct]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Names of the fields that hold a whole number, and of those that hold one or a few real ones, or None."""
+    """Names of the fields that hold a whole number, and of those that hold real ones."""
     hints = get_type_hints(kind)
-    kinds = {name: {*(get_args(hint) if isinstance(hint, UnionType) else (hint,))} for name, hint in hints.items()}
     whole = tuple(name for name, hint in hints.items() if hint is int)
-    real = tuple(
-        name
-        for name, parts in kinds.items()
-        if any(part is float or (get_origin(part) is tuple and set(get_args(part)) == {float}) for part in parts)
-    )
-    return whole, real
+    return whole, tuple(name for name, hint in hints.items() if _holds_reals(hint))
 
 
 class Part(msgspec.Struct, frozen=True, kw_only=True):

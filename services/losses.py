@@ -10,6 +10,7 @@ from prior_sg.schemas.status import Loss
 
 MOST_REASONS = 32  # of one counter; what comes after is counted together
 OTHER_REASONS = "other reasons"
+_PLURAL = re.compile(r"\b(jump|frame|keyframe|pyramid|detection|service|message)s\b")
 _NUMBER = re.compile(r"[-+]?\d+(?:[.,:]\d+)*(?:e[-+]?\d+)?%?")
 
 
@@ -62,4 +63,5 @@ def line(loss: Loss, total: int = 0) -> str:
     """One sentence about a loss; `total` = of how many, 0 = unknown."""
     told = loss.example.removesuffix(f": {loss.reason}")
     example = f" ({told})" if told and told != loss.reason else ""
-    return f"{loss.count}{f' of {total}' if total else ''} {loss.what}: {loss.reason}{example}"
+    what = loss.what if loss.count != 1 or total > 1 else _PLURAL.sub(r"\1", loss.what)
+    return f"{loss.count}{f' of {total}' if total else ''} {what}: {loss.reason}{example}"

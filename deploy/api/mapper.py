@@ -127,6 +127,9 @@ class Mapper:
     def read(self, source: str | Path | Source, progress: Progress | None = None) -> None:
         """Take all frames of a source, or of the file or folder of one, and the corrected poses that it carries.
 
+        A source goes on where the one before it ended, as a second walk through the same world: frame numbers and
+        stamps are moved so that they rise, which takes three frames. The same recording once more adds its keyframes
+        once more: read each once.
         `progress` is called with the frames read so far and in all. Raises SourceError, also when no frame can be used.
         """
         opened = source if isinstance(source, Source) else open_source(source)

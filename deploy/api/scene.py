@@ -1,7 +1,6 @@
 """A scene graph as Python programs want it: columns of arrays, plain objects, graphs and tables."""
 
 import importlib
-import json
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
@@ -13,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from prior_sg.deploy.api.errors import NotInSceneError, PackageMissingError, SaveError
+from prior_sg.deploy.json_text import json_text
 from prior_sg.schemas.regions import NO_REGION, Region
 from prior_sg.schemas.scene import Scene as SceneMessage
 
@@ -199,7 +199,7 @@ class Scene:
 
     def to_json(self, path: str | Path | None = None) -> str:
         """The same as JSON, also written to a file when one is named. Raises SaveError."""
-        text = json.dumps(self.to_dict(), indent=1)
+        text = json_text(self.to_dict())
         if path is not None:
             try:
                 Path(path).write_text(text)

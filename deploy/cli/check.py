@@ -1,7 +1,6 @@
 """`prior-sg check`: what a source is, and what is wrong with it, before it is mapped."""
 
 import argparse
-import json
 from typing import TYPE_CHECKING
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress
@@ -10,12 +9,14 @@ from rich.table import Table
 from prior_sg.deploy.cli.shared import Commands, add_settings, console
 from prior_sg.deploy.cli.source_options import add_source_options, read_options
 from prior_sg.deploy.errors import UserError
+from prior_sg.deploy.json_text import json_text
 from prior_sg.deploy.terminal import Description, Terminal, line
 
 if TYPE_CHECKING:
     from prior_sg.deploy.inspecting.check import Report
     from prior_sg.services.ingest.core.config import Config
 
+SAID_AT_START = ("reading", "ground truth")
 STYLE = {"ok": "green", "note": "yellow", "problem": "bold red"}
 
 
@@ -42,7 +43,7 @@ def cmd_check(arguments: argparse.Namespace) -> int:
     """Check a source and show what was found; 1 when there are problems."""
     report = _checked(arguments.source, read_options(arguments))
     if arguments.json:
-        print(json.dumps(as_builtins(report)))
+        print(json_text(as_builtins(report), None))
     else:
         show(report, console)
     return 1 if report.verdict == "problem" else 0
@@ -56,7 +57,7 @@ def before_start(path: str, cfg: "Config", console: Terminal) -> "Report":
     report = check(open_source(path, options=cfg), cfg, brief=True)
     console.print(report.summary)
     for finding in report.findings:
-        if finding.verdict == "problem" or (finding.topic, finding.verdict) == ("ground truth", "note"):
+        if finding.verdict == "problem" or (finding.verdict == "note" and finding.topic in SAID_AT_START):
             console.print(line((finding.verdict, STYLE[finding.verdict]), f" {finding.topic}: {finding.line()}"))
     if report.problems and report.problems[0].hopeless:
         raise HopelessSource(f"{report.source}: {report.problems[0].line()}; `prior-sg check` says more")

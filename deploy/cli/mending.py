@@ -9,7 +9,10 @@ from prior_sg.schemas.status import Loss
 ADVICE = (  # the first whose words are in the reason or its example; before all others those about single numbers
     ("stamps", "--rate HZ numbers the frames in place of their stamps; --stamp-unit says what unit they have"),
     ("numbers do not rise", "give every frame a number of its own"),
-    ("poses jump", "--poses, --quaternion and --axes say how poses are written; ingest.max_speed_m_s=0 believes all"),
+    (
+        "poses jump",
+        "--poses, --axes and --position-scale say how poses are written; ingest.max_speed_m_s=0 believes all",
+    ),
     ("pose jumps", "--poses, --quaternion and --axes say how poses are written"),
     ("from the origin", "--origin auto moves the world's zero to the recording"),
     ("no measurement", "--depth-scale, --depth-min and --depth-max say what depth means"),

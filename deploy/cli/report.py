@@ -1,6 +1,5 @@
 """What a run leaves for people: tables on the terminal, files in the output folder."""
 
-import json
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,6 +12,7 @@ from prior_sg.deploy.errors import UserError
 from prior_sg.deploy.evaluation.metrics import evaluate
 from prior_sg.deploy.evaluation.object_metrics import NO_DETECTOR, OBJECT_SHARES, object_scores
 from prior_sg.deploy.inspecting.replay import Log, message_differences, undisturbed
+from prior_sg.deploy.json_text import json_text
 from prior_sg.deploy.running.job import Result
 from prior_sg.deploy.showing.export import map_png, places_png, scene_json
 from prior_sg.deploy.terminal import Terminal
@@ -77,7 +77,7 @@ def write(
         console.print(text)
     losses = msgspec.to_builtins(result.losses)
     if metrics := compare(result, truth, objects, console):
-        (out / "metrics.json").write_text(json.dumps(metrics | {"losses": losses}, indent=1))
+        (out / "metrics.json").write_text(json_text(metrics | {"losses": losses}))
     files = {"scene.json": "json", "dsg.json": "spark-dsg", "map.png": "png"}
     try:
         extras.require("dsg", "dsg.json")
@@ -141,7 +141,7 @@ def _write(
     path.parent.mkdir(parents=True, exist_ok=True)
     if kind == "json":
         told = {} if losses is None else {"losses": losses}
-        path.write_text(json.dumps(scene_json(scene) | told, indent=1))
+        path.write_text(json_text(scene_json(scene) | told))
     elif kind == "spark-dsg":
         from prior_sg.deploy.showing.dsg import spark_dsg_graph
 

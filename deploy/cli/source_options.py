@@ -60,6 +60,7 @@ OPTIONS = (
         "camera axes: opencv (y down), opengl (y up, z back), ros (x ahead, z up), ned (x ahead, z down)",
         choices=("opencv", "opengl", "ros", "ned"),
     ),
+    Option("--position-scale", "position_scale_m", "METRES", "metres per unit of written positions"),
     Option("--intrinsics", "intrinsics", "FX,FY,CX,CY[,W,H]", "the camera, pixels", listed=True),
     Option("--camera-model", "camera_model", "MODEL", "of the lens", choices=("pinhole", "opencv", "fisheye")),
     Option(

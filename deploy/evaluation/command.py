@@ -1,7 +1,6 @@
 """`prior-sg eval`: from the command line to tables and a page."""
 
 import argparse
-import json
 import math
 import multiprocessing
 import os
@@ -16,6 +15,7 @@ from rich.table import Table
 
 from prior_sg.deploy.cli.shared import add_settings
 from prior_sg.deploy.evaluation.kinds import BASELINES, ORACLES, OURS, SWEEPS
+from prior_sg.deploy.json_text import json_text
 from prior_sg.deploy.settings import DEMO_TASK, Layers, settings_layers
 from prior_sg.deploy.terminal import Description, Terminal
 
@@ -109,9 +109,9 @@ def run(arguments: argparse.Namespace, console: Terminal) -> int:
                 datasets, methods, perceive, report, priors=arguments.priors, strength=arguments.strength
             )
     found = results.table()
-    (arguments.out / "eval.json").write_text(json.dumps(found, indent=1))
+    (arguments.out / "eval.json").write_text(json_text(found))
     if arguments.json:
-        print(json.dumps(found))
+        print(json_text(found, None))
     else:
         print_tables(results, console)
     if arguments.html:

@@ -76,7 +76,7 @@ def of_sequence(path: Path, environment: str, task: str) -> Dataset:
     name, truth = sequence_name(path), ground_truth(path)
     if not environment:
         raise EvaluationError(f'say what kind of place {name} is, such as --environment "{name}=residential home"')
-    return Dataset(name, path, truth, _prior(environment, task, truth), read_objects(path))
+    return Dataset(name, path, truth, _prior(environment, task, truth), read_objects(path, open_source(path).origin_m))
 
 
 def of_world(name: WorldName, task: str) -> Dataset:

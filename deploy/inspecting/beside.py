@@ -31,7 +31,7 @@ def truth_beside(source: Source) -> Beside:
             findings.append(_foreign("regions.json", error))
             regions = None
     try:
-        objects = read_objects(source.path)
+        objects = read_objects(source.path, source.origin_m)
     except (OSError, ValueError, KeyError, TypeError, AttributeError, IndexError) as error:
         findings.append(_foreign("objects.json", error))
     if objects:
@@ -40,5 +40,6 @@ def truth_beside(source: Source) -> Beside:
 
 
 def _foreign(name: str, error: Exception) -> Finding:
-    reason = str(error) if isinstance(error, OSError) else type(error).__name__
-    return note("ground truth", f"{name} is not in the layout of docs/sources.md ({reason}), and is left out", WITHOUT)
+    if isinstance(error, OSError):
+        return note("ground truth", f"{name} cannot be read ({error.strerror}), and is left out", WITHOUT)
+    return note("ground truth", f"{name} is not in the layout of docs/sources.md, and is left out", WITHOUT)

@@ -79,7 +79,7 @@ def look(
 ) -> Recording:
     """Read a source: every stamp and pose, and some images; what the time does not suffice for is left out."""
     end_s = time.monotonic() + (BRIEF_LIMIT_S if brief else LIMIT_S)
-    recording = Recording(source.total)
+    recording = Recording(source.total, source.depth_unit_m)
     state = selection.State(robot="sample")  # nobody reads what it would publish
     frames = min(source.total, BRIEF_FRAMES) if brief else source.total
     wants = Picker(frames, BRIEF_PAIRS if brief else PAIRS).wants
@@ -107,7 +107,9 @@ def reading_of(source: Source) -> Reading:
     said = source.convention
     if said is None:
         return Reading(world_from_source=world, fixed=True)
-    return Reading(said.poses, said.quaternion, said.axes, FROM_CAMERA[said.axes], world)
+    return Reading(
+        said.poses, said.quaternion, said.axes, FROM_CAMERA[said.axes], world, position_scale_m=said.position_scale_m
+    )
 
 
 def _read_as(source: Source) -> list[Finding]:

@@ -18,13 +18,13 @@
 Two regions are adjacent when an edge joins a place of one with a place of the other.
 """
 
-import json
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
 
+from prior_sg.deploy.json_text import json_text
 from prior_sg.deploy.showing.map import draw_map
 from prior_sg.deploy.showing.places import draw_places
 from prior_sg.deploy.truth import GroundTruth
@@ -168,7 +168,7 @@ def surfaces_of(scene: Scene) -> dict[int, tuple[np.ndarray, np.ndarray]]:
 
 def save_json(scene: Scene, path: str | Path) -> None:
     """Write `scene_json`, indented. Raises OSError."""
-    Path(path).write_text(json.dumps(scene_json(scene), indent=1) + "\n")
+    Path(path).write_text(json_text(scene_json(scene)) + "\n")
 
 
 def map_png(scene: Scene, voxel_map: VoxelMap | None, path: str | Path, truth: GroundTruth | None = None) -> None:

@@ -18,10 +18,11 @@ MODULES = {  # by extra; what the build file lists there, by the names that code
         "onnxruntime",
     ),
     "clip": ("open_clip",),
+    "export": ("sentencepiece",),
     "dsg": ("spark_dsg",),
     "fast-cut": ("maxflow",),
 }
-CONTAINS = {"encode": ("map",), "clip": ("encode", "map")}
+CONTAINS = {"encode": ("map",), "clip": ("encode", "map"), "export": ("clip", "encode", "map")}
 
 
 class ExtraMissing(ServiceError):

@@ -13,9 +13,10 @@ import json
 import logging
 import struct
 from collections import Counter
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cache, partial
 from pathlib import Path
 from types import TracebackType
 from typing import Any, BinaryIO
@@ -170,11 +171,16 @@ def _array_schema(kind: type) -> dict[str, Any]:
     raise NotImplementedError
 
 
-def read_log(path: str | Path, topics: Collection[Topic] | None = None) -> Iterator[Logged]:
-    """Messages of a log in the order they were added, of all topics or the given ones. Raises LogError."""
+def read_log(
+    path: str | Path, topics: Collection[Topic] | None = None, damaged: Callable[[LogError], None] | None = None
+) -> Iterator[Logged]:
+    """Messages of a log in the order they were added, of all topics or the given ones. Raises LogError.
+
+    A part that is damaged ends it with an error, unless `damaged` takes the error; then what lies behind is read.
+    """
     wanted = {topic.name: topic for topic in (TOPICS if topics is None else topics)}
     with _opened(path) as file:
-        for channel, schema, message in _messages(file, path, set(wanted)):
+        for channel, schema, message in _messages(file, path, set(wanted), damaged):
             topic = wanted[channel.metadata["topic"]]
             yield Logged(
                 topic=topic,
@@ -196,6 +202,23 @@ def _current(path: str | Path, topic: Topic, payload: bytes, schema: str) -> byt
 
 def contents(path: str | Path) -> list[Content]:
     """What a log holds, by key and writer in order of first appearance. Raises LogError."""
+    ours = [(channel, count) for channel, count in _channels(path) if "topic" in channel.metadata]
+    return [Content(c.metadata["topic"], c.topic, c.metadata.get("writer", ""), count) for c, count in ours]
+
+
+def foreign_topics(path: str | Path) -> list[str]:
+    """Topics that other programs wrote into an MCAP file. Raises LogError."""
+    return sorted({channel.topic for channel, _ in _channels(path) if "topic" not in channel.metadata})
+
+
+def is_whole(path: str | Path) -> bool:
+    """Whether a log was closed, and not cut off. Raises LogError."""
+    with _opened(path) as file:
+        return _index(file) is not None
+
+
+def _channels(path: str | Path) -> list[tuple[Channel, int]]:
+    """Channels of an MCAP file of any program and how many messages each has."""
     with _opened(path) as file:
         index = _index(file)
         if index is not None and index.statistics is not None:
@@ -205,8 +228,7 @@ def contents(path: str | Path) -> list[Content]:
             for channel, _, _ in _messages(file, path, None):
                 channels[channel.id] = channel
                 counts[channel.id] += 1
-    ours = ((channels[i], counts[i]) for i in sorted(channels) if "topic" in channels[i].metadata)
-    return [Content(c.metadata["topic"], c.topic, c.metadata.get("writer", ""), count) for c, count in ours]
+    return [(channels[i], counts[i]) for i in sorted(channels)]
 
 
 def summary(path: str | Path) -> dict[str, int]:
@@ -240,21 +262,27 @@ def _opened(path: str | Path) -> Iterator[BinaryIO]:
         raise LogError(f"the log {path} cannot be read: {error.strerror}") from error
 
 
-def _messages(file: BinaryIO, path: str | Path, wanted: set[str] | None) -> Iterator[tuple[Channel, str, Message]]:
+def _messages(
+    file: BinaryIO, path: str | Path, wanted: set[str] | None, damaged: Callable[[LogError], None] | None = None
+) -> Iterator[tuple[Channel, str, Message]]:
     """Messages with their channels and schema names, in file order; `wanted` names topics, None = all messages of any
     program."""
     index = _index(file)
     channels: dict[int, Channel] = {} if index is None else dict(index.channels)
     schemas: dict[int, str] = {} if index is None else {i: schema.name for i, schema in index.schemas.items()}
     if index is None:
-        logger.warning("the log %s was cut off: reading the part that is complete", path)
-    for chunk in _records(file, Opcode.CHUNK) if index is None else _indexed_chunks(file, index, wanted):
+        _say_cut_off(str(path))
+    for read in _all_chunks(file) if index is None else _indexed_chunks(file, index, wanted):
         try:
-            records = breakup_chunk(chunk, validate_crc=True)
+            records = breakup_chunk(read(), validate_crc=True)
         except DAMAGE as error:
             if index is None:
                 return
-            raise LogError(f"the log {path} is damaged: a chunk cannot be read ({error})") from error
+            fault = LogError(f"the log {path} is damaged: a chunk cannot be read ({error})")
+            if damaged is None:
+                raise fault from error
+            damaged(fault)
+            continue
         for record in records:
             if isinstance(record, Channel):
                 channels[record.id] = record
@@ -264,6 +292,12 @@ def _messages(file: BinaryIO, path: str | Path, wanted: set[str] | None) -> Iter
                 channel = channels[record.channel_id]
                 if wanted is None or channel.metadata.get("topic") in wanted:
                     yield channel, schemas.get(channel.schema_id, ""), record
+
+
+@cache
+def _say_cut_off(path: str) -> None:
+    """Once, however often the log is read."""
+    logger.warning("the log %s was cut off: reading the part that is complete", path)
 
 
 def _index(file: BinaryIO) -> Summary | None:
@@ -281,15 +315,30 @@ def _index(file: BinaryIO) -> Summary | None:
         return None
 
 
-def _indexed_chunks(file: BinaryIO, index: Summary, wanted: set[str] | None) -> Iterator[Chunk]:
+def _all_chunks(file: BinaryIO) -> Iterator[Callable[[], Chunk]]:
+    for chunk in _records(file, Opcode.CHUNK):
+        yield partial(_same, chunk)
+
+
+def _same(chunk: Chunk) -> Chunk:
+    return chunk
+
+
+def _chunk_at(file: BinaryIO, offset: int) -> Chunk:
+    file.seek(offset)
+    chunk: Chunk = Chunk.read(ReadDataStream(file))
+    return chunk
+
+
+def _indexed_chunks(file: BinaryIO, index: Summary, wanted: set[str] | None) -> Iterator[Callable[[], Chunk]]:
+    """What reads each chunk, for one that is damaged must not hide those behind it."""
     ids = {i for i, channel in index.channels.items() if wanted is None or channel.metadata.get("topic") in wanted}
 
     def holds(chunk: ChunkIndex) -> bool:
         return not ids.isdisjoint(chunk.message_index_offsets)
 
     for chunk in sorted(filter(holds, index.chunk_indexes), key=lambda chunk: chunk.chunk_start_offset):
-        file.seek(chunk.chunk_start_offset + struct.calcsize("<BQ"))
-        yield Chunk.read(ReadDataStream(file))
+        yield partial(_chunk_at, file, chunk.chunk_start_offset + struct.calcsize("<BQ"))
 
 
 def _records(file: BinaryIO, wanted: Opcode) -> Iterator[Any]:

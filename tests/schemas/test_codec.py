@@ -1,5 +1,6 @@
 """The wire format, against the independent implementation `msgpack`."""
 
+import math
 import struct
 from typing import Annotated
 
@@ -410,3 +411,18 @@ def test_a_message_type_names_the_topic_it_is_published_on():
     assert [topic_of(topic.type) for topic in published] == published  # each type on one topic, beside its jobs
     assert topic_of(ENCODE.type) is KEYFRAME
     assert topic_of(scene.SceneRequest) is None
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_no_part_of_a_message_holds_a_number_that_is_none(value):
+    fields = {
+        "id": 1,
+        "label": "hall",
+        "place_count": 1,
+        "probability": 1.0,
+        "position_m": (0.0, 0.0, 0.0),
+        "area_m2": 1.0,
+    }
+    regions.Region(**fields, hull_m=[(0.0, 0.0), (1.0, 0.0), (0.0, 1.0)])
+    with pytest.raises(ValueError, match="hull_m: not finite"):
+        regions.Region(**fields, hull_m=[(0.0, 0.0), (1.0, value), (0.0, 1.0)])

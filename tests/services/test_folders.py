@@ -48,6 +48,7 @@ def test_a_folder_that_others_can_write_is_never_used(temporary):
 
 def test_exports_go_where_something_can_be_written(temporary, monkeypatch, caplog):
     monkeypatch.setenv("XDG_CACHE_HOME", "/proc/1")
+    onnx_session.say_temporary.cache_clear()
     made = []
 
     def export(path):
@@ -58,6 +59,8 @@ def test_exports_go_where_something_can_be_written(temporary, monkeypatch, caplo
     assert temporary in first.parents and first.read_bytes() == b"network"
     assert "/proc/1" in caplog.text
     assert onnx_session.cached("net", ["torch 1"], export) == first and len(made) == 1
+    onnx_session.cached("other", ["torch 1"], export)
+    assert caplog.text.count("exports are kept in the temporary folder") == 1
     monkeypatch.setattr(tempfile, "tempdir", "/proc/1")
     with pytest.raises(EncoderUnavailable, match="set XDG_CACHE_HOME"):
         onnx_session.cached("net", ["torch 1"], export)

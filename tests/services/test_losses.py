@@ -14,10 +14,18 @@ def test_reasons_that_differ_in_numbers_are_one():
     first, second = losses.told
     assert (first.count, first.reason) == (3, "its stamp is … s before")
     assert line(first, 9) == "3 of 9 frames refused: its stamp is … s before (frame 0: its stamp is 0.500 s before)"
-    assert line(second) == "1 frames refused: it is damaged"
+    assert line(second) == "1 frame refused: it is damaged"
     assert losses.count("frames refused") == 4
     losses.add("frames refused", "its depth is empty", of="frame 9")
     assert line(losses.told[-1], 9) == "1 of 9 frames refused: its depth is empty (frame 9)"
+
+
+def test_one_of_a_kind_is_told_in_the_singular():
+    losses = Losses()
+    losses.add("clock jumps", "the clock jumped by +3600.000 s at frame 6", reason="believed again")
+    assert line(losses.told[0]).startswith("1 clock jump: believed again")
+    losses.add("clock jumps", "the clock jumped by -3600.000 s at frame 9", reason="believed again")
+    assert line(losses.told[0]).startswith("2 clock jumps: ")
 
 
 @given(st.lists(st.text(max_size=8)))

@@ -1,4 +1,4 @@
-"""What stands in rooms: things built of boxes, and where in a room they go (pure)."""
+"""What stands in rooms: things built of boxes, and where in a room they go."""
 
 from collections.abc import Callable, Sequence
 from typing import Literal, NamedTuple

@@ -1,4 +1,4 @@
-"""What there is to stand in rooms, and what rooms of each label hold; plain data (pure)."""
+"""What there is to stand in rooms, and what rooms of each label hold; plain data."""
 
 from prior_sg.deploy.evaluation.worlds.furniture import (
     Thing,

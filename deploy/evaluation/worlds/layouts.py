@@ -1,4 +1,4 @@
-"""How rectangles are divided, and rooms lined up and joined, by many kinds of plans (pure)."""
+"""How rectangles are divided, and rooms lined up and joined, by many kinds of plans."""
 
 import itertools
 from collections.abc import Collection, Iterable, Sequence
@@ -94,7 +94,7 @@ def columns(plan: Plan, rooms: Sequence[Room], spacing_m: float, side_m: float =
 
 def shelving(plan: Plan, room: Room, name: str, height_m: float, way_m: float) -> None:
     """Parallel rows of shelves along the room's longer side, with ways between and around."""
-    bounds = room.bounds.grown(-0.6)
+    bounds = room.bounds.grown(-0.8)
     along_x, depth_m = bounds.width >= bounds.depth, 0.8
     across = bounds.depth if along_x else bounds.width
     count = int((across + way_m) / (depth_m + way_m))

@@ -1,4 +1,4 @@
-"""Rectangles, straight borders between them, and the outline of several that touch (pure). Metres, in the plane."""
+"""Rectangles, straight borders between them, and the outline of several that touch. Metres, in the plane."""
 
 import itertools
 from collections.abc import Iterator, Sequence

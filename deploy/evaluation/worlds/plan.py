@@ -1,4 +1,4 @@
-"""A floor plan while it is built: regions, boxes of matter, furniture; metres, z up, x and y along the walls (pure).
+"""A floor plan while it is built: regions, boxes of matter, furniture; metres, z up, x and y along the walls.
 
 Boxes count in the order in which they were added: a doorway is a box of nothing in a wall that was there before. All
 edges lie on a grid of STEP_M; those of rooms on one of 2 STEP_M, so that walls, which stand half on each side of the
@@ -18,7 +18,7 @@ from prior_sg.deploy.truth import TrueObject, TrueRegion
 STEP_M = 0.05
 WALL_M = 0.1
 SLAB_M = 0.2
-BODY_M = 0.35  # nothing may come nearer to the way between two doors of a room
+BODY_M = 0.45  # nothing may come nearer to the way between two doors of a room
 DOOR_HEIGHT_M = 2.05
 DOOR_SPACE_M = 0.9  # on both sides of a door, kept free of furniture
 
@@ -79,6 +79,7 @@ class Plan:
     voxel_m: float = STEP_M
     range_m: float = 10.0  # of the depth camera
     stride_m: float = 0.75  # between views on the way
+    outdoors: bool = False  # in large part: to be mapped as such
     rooms: list[Room] = field(default_factory=list)
     boxes: list[Box] = field(default_factory=list)
     objects: list[TrueObject] = field(default_factory=list)
@@ -170,7 +171,7 @@ class Plan:
         """Panes in the room's walls that are the building's."""
         for rect in room.rects:
             for edge in (edge for side in shell.edges() for edge in side.overlaps(rect)):
-                if edge.length > 1.6 and self.rng.random() < chance:
+                if edge.length > 1.6 and self.rng.random() < chance and not self._behind(room, edge):
                     pane = edge.shortened(float(self.rng.uniform(0.5, min(1.2, edge.length / 2 - 0.25))))
                     self.box(pane.thick(2 * WALL_M), room.z_m + 0.9, room.z_m + 2.1, GLASS)
 
@@ -189,6 +190,12 @@ class Plan:
             TrueRegion(number, room.label, outline(room.rects, margin), room.z_m - SLAB_M, room.top_m)
             for number, (room, margin) in enumerate(zip(self.rooms, inset, strict=True))
         )
+
+    def _behind(self, room: Room, edge: Segment) -> bool:
+        """Whether another room lies on the other side."""
+        strip, low_m, high_m = edge.thick(2 * WALL_M), room.z_m, room.top_m
+        others = (other for other in self.rooms if other is not room and other.z_m < high_m and low_m < other.top_m)
+        return any(strip.overlaps(rect) for other in others for rect in other.rects)
 
     def _open(self, one: Room, other: Room, way: Segment, height_m: float) -> None:
         low_m = max(one.z_m, other.z_m)  # one of them may be a staircase, which begins below
@@ -222,10 +229,11 @@ def snapped(point_m: tuple[float, float, float]) -> tuple[float, float, float]:
 
 
 def _inside(room: Room, way: Segment) -> tuple[float, float]:
-    """The point half a metre behind the middle of the way."""
+    """The point behind the middle of the way."""
     x, y = way.middle
+    behind_m = 0.5 if room.walled else 0.2
     for sign in (1, -1):
-        point = (x, y + sign * 0.5) if way.along_x else (x + sign * 0.5, y)
+        point = (x, y + sign * behind_m) if way.along_x else (x + sign * behind_m, y)
         if any(rect.holds_point(point) for rect in room.rects):
             return point
     raise Unbuildable(f"{room.label} is too narrow for a door")
@@ -243,7 +251,8 @@ def _portals_joined(room: Room, taken: Sequence[Rect], cell_m: float = 0.1) -> b
 
     for rect in room.rects:
         free[cells(rect)] = True
-    free = ndimage.minimum_filter(np.pad(free, 1), size=7)[1:-1, 1:-1]
+    if room.walled:
+        free = ndimage.minimum_filter(np.pad(free, 1), size=7)[1:-1, 1:-1]
     for rect in taken:
         free[cells(rect.grown(BODY_M))] = False
     parts = ndimage.label(free)[0]

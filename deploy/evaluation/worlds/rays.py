@@ -1,4 +1,4 @@
-"""Depth of rays through a grid of voxels, exact at the voxels' faces (pure)."""
+"""Depth of rays through a grid of voxels, exact at the voxels' faces."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""Stairs of steps that one can climb (pure)."""
+"""Stairs of steps that one can climb."""
 
 from prior_sg.deploy.evaluation.worlds.outline import Rect
 from prior_sg.deploy.evaluation.worlds.plan import Plan, rounded
@@ -12,8 +12,8 @@ def flight(
 ) -> None:
     """Steps from the lower to the higher height over the whole rectangle.
 
-    They rise towards: 1 = to larger y, -1 = to smaller y, 2 = to larger x, -2 = to smaller x. They are hollow below, or solid
-    from a height on.
+    They rise towards: 1 = to larger y, -1 = to smaller y, 2 = to larger x, -2 = to smaller x. They are hollow
+    below, or solid from a height on.
     """
     low_m, high_m = heights_m
     steps = round((high_m - low_m) / RISE_M) - 1

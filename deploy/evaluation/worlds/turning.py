@@ -1,4 +1,4 @@
-"""A plan mirrored and turned, so that no kind always lies the same way (pure)."""
+"""A plan mirrored and turned, so that no kind always lies the same way."""
 
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""How somebody goes through a world with a camera: poses of a scanner, who sees all, and of a passer-by (pure)."""
+"""How somebody goes through a world with a camera: poses of a scanner, who sees all, and of a passer-by."""
 
 from collections.abc import Sequence
 from typing import Literal
@@ -11,8 +11,11 @@ from prior_sg.deploy.evaluation.worlds.ways import CELL_M, Ways
 Manner = Literal["scanner", "passer-by"]
 NARROW_CELLS = 4  # half of a doorway: the middle keeps 0.35 m from both sides
 ROOM_FOR_A_STAND_M2 = 36.0
-MOST_STANDS = {"scanner": 3, "passer-by": 1}
-VISITED_SHARE = 0.55  # of the regions, by a passer-by
+MOST_STANDS = {"scanner": 4, "passer-by": 1}
+AIRY_CELLS = 6  # stands keep that far from obstacles where there is room
+SETTLING, STRAY_M = 4, 0.4  # rounds in which stands spread over a room, and how far off they then are
+CANDIDATES = 1500  # for the stands in one room
+VISITED_SHARE = 0.65  # of the regions, by a passer-by
 Track = list[tuple[np.ndarray, float]]  # points on the ground, and the heading there
 TURN_RAD = np.radians(40)
 SPEED_M_S, TURNING_RAD_S = 0.9, 1.2
@@ -30,7 +33,7 @@ def walked(plan: Plan, ways: Ways, manner: Manner) -> tuple[np.ndarray, np.ndarr
 
 
 def _passed(rooms: Sequence[Room], rng: np.random.Generator) -> list[Room]:
-    count = max(2, round(VISITED_SHARE * len(rooms)))
+    count = max(3, round(VISITED_SHARE * len(rooms)))
     return [rooms[i] for i in sorted(rng.permutation(len(rooms))[:count].tolist())]
 
 
@@ -66,17 +69,17 @@ def _stands(room: Room, nodes: np.ndarray, ways: Ways, manner: Manner, rng: np.r
     """Nodes far from each other and from obstacles; more in larger rooms."""
     count = int(np.clip(round(room.area_m2 / ROOM_FOR_A_STAND_M2), 1, MOST_STANDS[manner]))
     clearance = ways.clearance.reshape(-1)[nodes]
-    nodes = nodes[clearance >= min(int(clearance.max()), 6)]
+    nodes = nodes[clearance >= min(int(clearance.max()), AIRY_CELLS)]
+    nodes = nodes[rng.permutation(len(nodes))[:CANDIDATES]]
     points_m = ways.position_m(nodes)
-    chosen = [int(rng.integers(len(nodes)))]
-    nearest_m = np.linalg.norm(points_m - points_m[chosen[0]], axis=1)
-    if count > 1:
-        chosen = [int(np.argmax(nearest_m))]
-        nearest_m = np.linalg.norm(points_m - points_m[chosen[0]], axis=1)
-    while len(chosen) < count:
-        chosen.append(int(np.argmax(nearest_m)))
-        nearest_m = np.minimum(nearest_m, np.linalg.norm(points_m - points_m[chosen[-1]], axis=1))
-    return nodes[chosen]
+    centers_m = points_m[rng.integers(len(points_m), size=count)]
+    for _ in range(SETTLING):
+        owner = np.argmin(np.linalg.norm(points_m[:, None] - centers_m, axis=2), axis=1)
+        centers_m = np.stack(
+            [points_m[owner == k].mean(axis=0) if (owner == k).any() else centers_m[k] for k in range(count)]
+        )
+    centers_m += rng.normal(0, STRAY_M, centers_m.shape) * (1, 1, 0)
+    return np.unique([nodes[np.argmin(np.linalg.norm(points_m - center_m, axis=1))] for center_m in centers_m])
 
 
 def _tour(ways: Ways, stands: np.ndarray, rng: np.random.Generator) -> list[np.ndarray]:

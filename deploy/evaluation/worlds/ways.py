@@ -1,4 +1,4 @@
-"""Where a person can stand and walk in a grid of voxels, on all levels, and the ways between (pure).
+"""Where a person can stand and walk in a grid of voxels, on all levels, and the ways between.
 
 The plane is divided into cells of CELL_M. A cell has up to LEVELS surfaces with HEADROOM_M above; two neighbouring ones
 are joined where their heights differ by no more than a step, so that stairs join levels and tables do not.

@@ -1,5 +1,5 @@
 """Buildings with corridors: a hall of open zones at the front, then rooms on both sides of a corridor, at times with a
-second corridor across (pure)."""
+second corridor across."""
 
 import itertools
 from collections.abc import Sequence

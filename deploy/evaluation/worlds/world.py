@@ -1,4 +1,4 @@
-"""Worlds without number: from a kind and a seed to a floor plan with its ground truth, a walk, and depth images (pure).
+"""Worlds without number: from a kind and a seed to a floor plan with its ground truth, a walk, and depth images.
 
 A plan is drawn, turned, filled into voxels, and walked through. Draws in which a region cannot be reached are thrown
 away for the next one of the same seed, so that (kind, seed, walk) always gives the same world.
@@ -43,6 +43,7 @@ class World:
     origin_m: np.ndarray  # (3,): the lower corner of voxel (0, 0, 0)
     voxel_m: float
     range_m: float  # of the depth camera
+    outdoors: bool  # in large part: to be mapped with the place graph's outdoor preset
     stamps_ns: np.ndarray  # (view,)
     world_from_camera: np.ndarray  # (view, 4, 4)
 
@@ -96,7 +97,7 @@ def depths(
 def _drawn(kind: str, seed: int, walk: Manner, draw: int) -> World:
     rng = _random(kind, seed, draw, 0)
     plan = turned(KINDS[kind](rng), rng)
-    grid, origin_m = _filled(plan)
+    grid, origin_m = filled(plan)
     stamps_ns, poses = walked(plan, ways_of(grid, origin_m, plan.voxel_m), walk)
     return World(
         name=f"world:{kind}:{seed}",
@@ -110,6 +111,7 @@ def _drawn(kind: str, seed: int, walk: Manner, draw: int) -> World:
         origin_m=origin_m,
         voxel_m=plan.voxel_m,
         range_m=plan.range_m,
+        outdoors=plan.outdoors,
         stamps_ns=stamps_ns,
         world_from_camera=poses,
     )
@@ -119,14 +121,16 @@ def _random(kind: str, seed: int, index: int, purpose: int) -> np.random.Generat
     return np.random.default_rng([zlib.crc32(kind.encode()), seed, index, purpose])
 
 
-def _filled(plan: Plan) -> tuple[np.ndarray, np.ndarray]:
+def filled(plan: Plan) -> tuple[np.ndarray, np.ndarray]:
     """The grid of matter and its lower corner."""
     low_m, high_m = (np.array([getattr(box, end) for box in plan.boxes]) for end in Box._fields[:2])
     coarse_m = 2 * plan.voxel_m  # so that blocks of voxels are cells of ways
     origin_m = np.floor((low_m.min(axis=0) - MARGIN_M) / coarse_m) * coarse_m
     size = np.ceil((high_m.max(axis=0) + MARGIN_M - origin_m) / coarse_m).astype(int) * 2
     grid = np.zeros(size, np.uint8)
-    low, high = (np.rint((corners - origin_m) / plan.voxel_m).astype(np.int64) for corners in (low_m, high_m))
+    near = 1e-6  # boxes thinner than a voxel fill one all the same
+    low = np.floor((low_m - origin_m) / plan.voxel_m + near).astype(np.int64)
+    high = np.ceil((high_m - origin_m) / plan.voxel_m - near).astype(np.int64)
     fill(grid, low, high, np.array([box.matter for box in plan.boxes], np.uint8))
     return grid, origin_m
 

@@ -75,6 +75,12 @@ def package(module: str, name: str = "") -> Any:
         raise EncoderUnavailable(f"the package {name} is not installed; run `pip install {name}`.") from error
 
 
+def reason(error: Exception) -> str:
+    """The first sentence of what a library says went wrong, without its full stop."""
+    first = next((line.strip() for line in str(error).splitlines() if line.strip()), type(error).__name__)
+    return re.split(r"(?<=\.)\s", first)[0].rstrip(".")
+
+
 def key_chunk(name: str) -> str:
     """A name as it may stand in a key and in the name of a space."""
     return re.sub(r"[^\w.-]+", "-", name)

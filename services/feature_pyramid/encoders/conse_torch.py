@@ -1,6 +1,5 @@
 """The two networks of the `conse` encoders in PyTorch: what the weights were published for, and what is exported."""
 
-import warnings
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +8,7 @@ import torch
 from safetensors.torch import load_file
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from prior_sg.services.feature_pyramid.encoders import torchvision_parts
+from prior_sg.services.feature_pyramid.encoders import to_onnx, torchvision_parts
 from prior_sg.services.feature_pyramid.encoders.base import package
 
 torchvision_parts.load_if_installed()
@@ -39,7 +38,7 @@ class Classifier:
         """Write the network as ONNX: `pixels` to `logits`."""
         example = (torch.zeros(2, side_px, side_px, 3, dtype=torch.uint8),)
         network = self.network.to(memory_format=torch.contiguous_format)
-        _export(network, example, path, {"pixels": {0: "crop"}}, "logits")
+        to_onnx.write(network, example, path, {"pixels": {0: "crop"}}, "logits")
 
 
 class _Normalised(torch.nn.Module):
@@ -78,7 +77,7 @@ class Sentences:
         """Write the network as ONNX: `tokens` and `mask` to `means`."""
         example = (torch.tensor([[101, 2023, 102], [101, 102, 0]]), torch.tensor([[1, 1, 1], [1, 1, 0]]))
         axes = {0: "text", 1: "token"}
-        _export(self.network, example, path, {"tokens": axes, "mask": axes}, "means")
+        to_onnx.write(self.network, example, path, {"tokens": axes, "mask": axes}, "means")
 
 
 class _Pooled(torch.nn.Module):
@@ -93,22 +92,6 @@ class _Pooled(torch.nn.Module):
         states = self.model(input_ids=tokens, attention_mask=hidden).last_hidden_state
         shown = mask.unsqueeze(-1).to(states.dtype)
         return (states * shown).sum(dim=1) / shown.sum(dim=1)
-
-
-def _export(network: Any, example: tuple, path: Path, inputs: dict[str, dict[int, str]], output: str) -> None:
-    package("onnx")  # which the exporter needs
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # the tracing exporter works from torch 2.2 on; its successor needs far more
-        torch.onnx.export(
-            network,
-            example,
-            str(path),
-            input_names=list(inputs),
-            output_names=[output],
-            dynamic_axes={**inputs, output: {0: "row"}},
-            opset_version=17,
-            dynamo=False,
-        )
 
 
 def sentence_folder() -> Path:

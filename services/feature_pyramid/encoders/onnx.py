@@ -1,10 +1,11 @@
 """Encoders `onnx:FOLDER`: a user's own export of a model with an image and a text tower, described by a manifest.
 
-docs/encoders.md shows the manifest and how to export a model.
+`prior-sg encoders export` writes such a folder; docs/encoders.md shows the manifest.
 """
 
 import hashlib
 from pathlib import Path
+from typing import Literal
 
 import cv2
 import msgspec
@@ -13,6 +14,7 @@ from tokenizers import Tokenizer
 
 from prior_sg.services.feature_pyramid.encoders.base import EncoderUnavailable, Options, key_chunk
 from prior_sg.services.feature_pyramid.encoders.onnx_session import Session
+from prior_sg.services.feature_pyramid.encoders.resampling import resampled
 from prior_sg.services.feature_pyramid.encoders.two_towers import ClipEncoder
 from prior_sg.services.folders import expanded
 
@@ -27,15 +29,23 @@ class File(msgspec.Struct, frozen=True, kw_only=True):
     sha256: str
 
 
-class Image(File, frozen=True, kw_only=True):
+class Network(File, frozen=True, kw_only=True):
+    """A network, and the file that holds its weights where they do not fit into its own."""
+
+    weights: File | None = None
+
+
+class Image(Network, frozen=True, kw_only=True):
     """The image tower: float32 (crop, 3, side, side), normalised, to embeddings (crop, dim)."""
 
     side_px: int
     mean: tuple[float, float, float]  # of pixels in [0, 1]
     std: tuple[float, float, float]
+    # of crops to the side: `area` averages what shrinks and is fast; the others are those of Pillow and torchvision
+    interpolation: Literal["area", "bicubic", "bilinear"] = "area"
 
 
-class Text(File, frozen=True, kw_only=True):
+class Text(Network, frozen=True, kw_only=True):
     """The text tower: int64 (text, context) token ids, and a mask if it has a second input, to (text, dim)."""
 
     context: int
@@ -50,6 +60,9 @@ class Manifest(msgspec.Struct, frozen=True, kw_only=True):
     text: Text
     tokenizer: File  # in the format of the package tokenizers
     logit_scale: float = 100.0  # the trained one, after the exponential
+    source: str = ""  # where the weights come from
+    licence: str = ""  # of the weights
+    made_with: dict[str, str] = {}  # versions of what wrote the folder
 
 
 _MANIFEST = msgspec.json.Decoder(Manifest)  # built at import: services of one process load encoders side by side
@@ -64,17 +77,27 @@ def space_of(choice: str) -> str:
 
 def load(choice: str, options: Options) -> ClipEncoder:
     """The encoder, its files checked against the manifest. Raises EncoderUnavailable."""
+    return ClipEncoder(space_of(choice), towers_of(choice, options), options.batch_on(_device(options)))
+
+
+def towers_of(choice: str, options: Options) -> "Towers":
+    """The two networks, their files checked against the manifest. Raises EncoderUnavailable."""
     folder = _folder(choice)
     manifest = _manifest(folder)
+    for network in (manifest.image, manifest.text):
+        if network.weights is not None:
+            _checked(folder, network.weights)
     image, text, tokens = (_checked(folder, part) for part in (manifest.image, manifest.text, manifest.tokenizer))
-    device = "cpu" if options.device == "auto" else options.device
-    towers = Towers(
+    return Towers(
         manifest,
-        Session(image, options.threads, device),
-        Session(text, options.threads, device),
-        _tokenizer(tokens, manifest.text),
+        Session(image, options.threads, _device(options)),
+        Session(text, options.threads, _device(options)),
+        tokenizer_of(tokens, manifest.text),
     )
-    return ClipEncoder(space_of(choice), towers, options.batch_on(device))
+
+
+def _device(options: Options) -> str:
+    return "cpu" if options.device == "auto" else options.device
 
 
 class Towers:
@@ -83,14 +106,15 @@ class Towers:
     def __init__(self, about: Manifest, image: Session, text: Session, tokenizer: Tokenizer) -> None:
         self.side_px, self.logit_scale = about.image.side_px, about.logit_scale
         self._image, self._text, self._tokenizer = image, text, tokenizer
-        self._mean = 255 * np.array(about.image.mean, np.float32)
-        self._std = 255 * np.array(about.image.std, np.float32)
+        self._mean, self._std = (
+            255 * np.array(values, np.float32)[:, None, None] for values in (about.image.mean, about.image.std)
+        )
+        self._interpolation = about.image.interpolation
 
     def images(self, crops: list[np.ndarray]) -> np.ndarray:
         """Embeddings (crop, dim) of RGB crops, uint8 (h, w, 3)."""
         pixels = np.stack([self._resized(crop) for crop in crops])
-        normal = (pixels.astype(np.float32) - self._mean) / self._std
-        return self._image(np.ascontiguousarray(normal.transpose(0, 3, 1, 2))).astype(np.float32)
+        return self._image((pixels - self._mean) / self._std).astype(np.float32)
 
     def texts(self, texts: list[str]) -> np.ndarray:
         """Embeddings (text, dim)."""
@@ -104,8 +128,12 @@ class Towers:
         return self._text(*(tokens, mask)[: len(self._text.inputs)])
 
     def _resized(self, crop: np.ndarray) -> np.ndarray:
+        """Float32 (3, side, side)."""
+        if self._interpolation != "area":
+            return resampled(crop, self.side_px, self._interpolation)
         way = cv2.INTER_AREA if crop.shape[0] > self.side_px else cv2.INTER_CUBIC
-        return cv2.resize(crop, (self.side_px, self.side_px), interpolation=way)
+        sized = cv2.resize(crop, (self.side_px, self.side_px), interpolation=way)
+        return sized.transpose(2, 0, 1).astype(np.float32)
 
 
 def _folder(choice: str) -> Path:
@@ -133,7 +161,8 @@ def _checked(folder: Path, part: File) -> Path:
     return path
 
 
-def _tokenizer(path: Path, about: Text) -> Tokenizer:
+def tokenizer_of(path: Path, about: Text) -> Tokenizer:
+    """The tokenizer of a file, giving `context` ids per text. Raises EncoderUnavailable."""
     try:
         tokenizer = Tokenizer.from_file(str(path))
     except Exception as error:  # the package raises plain exceptions

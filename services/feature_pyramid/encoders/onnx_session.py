@@ -4,6 +4,7 @@ import hashlib
 import logging
 import os
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -51,7 +52,7 @@ def cached(name: str, made_of: list[str], export: Callable[[Path], None], suffix
     try:
         return _made(cache_folder() / file, export)
     except OSError as error:
-        log.warning("exports are kept in the temporary folder: %s cannot be written (%s)", cache_folder(), error)
+        say_temporary(cache_folder(), str(error.strerror))
     try:
         return _made(temporary_cache("onnx") / file, export)
     except OSError as error:
@@ -59,6 +60,12 @@ def cached(name: str, made_of: list[str], export: Callable[[Path], None], suffix
             f"neither {cache_folder()} nor the temporary folder can be written ({error.strerror}); set XDG_CACHE_HOME "
             "to a folder that can be, or feature_pyramid.runtime=torch"
         ) from error
+
+
+@cache
+def say_temporary(folder: Path, reason: str) -> None:
+    """Once, however many networks are exported."""
+    log.warning("exports are kept in the temporary folder: %s cannot be written (%s)", folder, reason)
 
 
 def _made(path: Path, export: Callable[[Path], None]) -> Path:

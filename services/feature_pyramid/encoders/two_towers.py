@@ -19,6 +19,7 @@ NULL_PROMPTS = ("a photo", "a picture of nothing", "a blurry photo", "an empty i
 MAX_LOGIT_SCALE = 100.0  # what CLIP clips it to in training
 PICTURES_OF_NOTHING = 48
 PICTURE_PX = 224
+KNOWN_TEXTS = 20_000  # kept: what many priors ask for
 
 
 class Towers(Protocol):
@@ -51,6 +52,7 @@ class ClipEncoder:
     def __init__(self, space: str, towers: "Towers", batch_size: int) -> None:
         self.space, self.side_px, self.batch_size = space, towers.side_px, batch_size
         self._images, self._texts = towers.images, towers.texts
+        self._known: dict[str, np.ndarray] = {}  # embeddings of texts, unit length
         texts, logit_scale = towers.texts, towers.logit_scale
         background = self._encode(pictures_of_nothing())
         null = unit(unit(texts(list(NULL_PROMPTS))).mean(axis=0))
@@ -66,13 +68,22 @@ class ClipEncoder:
 
         Raises ValueError for a concept without phrases.
         """
+        if lacking := [index for index, phrases in enumerate(concepts) if not phrases]:
+            raise ValueError(f"concept {lacking[0]} has no phrases; give each concept at least one")
+        texts = [[template.format(phrase) for phrase in phrases for template in TEMPLATES] for phrases in concepts]
+        self._learn([text for row in texts for text in row])
         embeddings = np.zeros((len(concepts), self.dim), np.float32)
-        for index, phrases in enumerate(concepts):
-            if not phrases:
-                raise ValueError(f"concept {index} has no phrases; give each concept at least one")
-            texts = [template.format(phrase) for phrase in phrases for template in TEMPLATES]
-            embeddings[index] = unit(unit(self._texts(texts)).mean(axis=0))
+        for index, row in enumerate(texts):
+            embeddings[index] = unit(np.stack([self._known[text] for text in row]).mean(axis=0))
         return calibrated(self.space, embeddings, self._calibration)
+
+    def _learn(self, texts: list[str]) -> None:
+        """Embed what is not known yet, all at once. Text towers are slow on processors, and priors repeat phrases."""
+        new = [text for text in dict.fromkeys(texts) if text not in self._known]
+        if new and len(self._known) + len(new) > KNOWN_TEXTS:
+            self._known, new = {}, list(dict.fromkeys(texts))
+        if new:
+            self._known.update(zip(new, unit(self._texts(new)), strict=True))
 
     def _encode(self, crops: list[np.ndarray]) -> np.ndarray:
         starts = range(0, len(crops), self.batch_size)

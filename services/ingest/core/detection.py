@@ -1,5 +1,6 @@
 """What the poses and units of a folder mean, by how well its depth images agree under each meaning (pure)."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
@@ -13,6 +14,7 @@ from prior_sg.services.ingest.core.poses import Convention
 
 UNITS_M = (1e-3, 1 / 5000, 1 / 6553.5, 1 / 4000, 1e-4, 1 / 256, 1e-2)  # metres per unit that tools write
 USUAL_UNIT_M = 1e-3
+LIKELY_M = 2.5  # median depth of a room
 ROOM_M = (0.15, 80.0)  # median depths of rooms, halls and streets
 CLEARLY = 1.25  # times as much agreement as any other meaning
 LEAST_SHARE = 0.5  # of the points that agree under the right meaning, with noise
@@ -110,6 +112,11 @@ def plausible_units(depths: Sequence[np.ndarray]) -> list[float]:
     values = np.concatenate([depth[depth > 0].ravel() for depth in depths]) if depths else np.zeros(0)
     median = float(np.median(values)) if values.size else 0.0
     return [unit_m for unit_m in UNITS_M if ROOM_M[0] <= median * unit_m <= ROOM_M[1]]
+
+
+def likely_unit_m(median_units: float) -> float:
+    """The usual metres per unit that come nearest to making a room of a median depth."""
+    return min((1.0, *UNITS_M), key=lambda unit_m: abs(math.log(max(median_units, 1e-9) * unit_m / LIKELY_M)))
 
 
 def up_of(poses: Sequence[np.ndarray]) -> tuple[tuple[float, float, float], bool]:

@@ -37,6 +37,7 @@ class ReadOptions(msgspec.Struct, frozen=True, kw_only=True):
     quaternion: Literal["", QuaternionOrder] = ""  # order of the written quaternions
     camera_axes: Literal["", CameraAxes] = ""  # opencv: x right, y down; opengl: y up, z back; ros: x ahead, z up;
     # ned: x ahead, z down
+    position_scale_m: float = 1.0  # metres per unit of written positions
     intrinsics: list[float] = msgspec.field(default_factory=list)  # fx fy cx cy, pixels; then width height, if other
     camera_model: Literal["", LensModel] = ""  # of the lens; opencv = radial and tangential, fisheye = Kannala-Brandt
     distortion: list[float] = msgspec.field(default_factory=list)  # its coefficients, as OpenCV orders them
@@ -44,6 +45,8 @@ class ReadOptions(msgspec.Struct, frozen=True, kw_only=True):
     def __post_init__(self) -> None:
         if self.depth_scale_m is not None and not (math.isfinite(self.depth_scale_m) and self.depth_scale_m > 0):
             raise ValueError(f"depth_scale_m must be a positive number of metres, got {self.depth_scale_m}")
+        if not (math.isfinite(self.position_scale_m) and self.position_scale_m > 0):
+            raise ValueError(f"position_scale_m must be a positive number of metres, got {self.position_scale_m}")
         if not (math.isfinite(self.rate_hz) and self.rate_hz >= 0):
             raise ValueError(f"rate_hz must be a number of frames per second, got {self.rate_hz}")
         if not 0 <= self.depth_min_m < (self.depth_max_m or math.inf):

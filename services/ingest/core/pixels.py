@@ -40,12 +40,20 @@ def stored(data: bytes) -> np.ndarray:
 
 
 def _array(data: bytes) -> np.ndarray:
+    array = array_of(data)
+    array = array[..., 0] if array.ndim == 3 and array.shape[2] == 1 else array
+    if array.ndim not in (2, 3):
+        raise ImageError(f"its array has the shape {array.shape}")
+    return array
+
+
+def array_of(data: bytes) -> np.ndarray:
+    """Numbers of a saved array of any shape that holds some. Raises ImageError."""
     try:
         array = np.lib.format.read_array(io.BytesIO(data), allow_pickle=False)
     except (ValueError, EOFError, OSError) as error:
-        raise ImageError(f"it is not a saved array: {error}") from error
-    array = array[..., 0] if array.ndim == 3 and array.shape[2] == 1 else array
-    if array.ndim not in (2, 3) or 0 in array.shape or array.dtype.kind not in "fiub":
+        raise ImageError("it is no saved array of numbers, or it is cut off: write it again with numpy.save") from error
+    if 0 in array.shape or array.dtype.kind not in "fiub":
         raise ImageError(f"its array has the shape {array.shape} and the type {array.dtype}")
     return array
 

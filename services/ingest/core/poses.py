@@ -84,15 +84,22 @@ class Convention:
     poses: str = "world_from_camera"
     axes: str = "opencv"
     quaternion: str = "xyzw"
+    position_scale_m: float = 1.0  # metres per unit of written positions
 
     def changed(self, options: ReadOptions) -> "Convention":
         """The same with what the user says instead."""
         return Convention(
-            options.poses or self.poses, options.camera_axes or self.axes, options.quaternion or self.quaternion
+            options.poses or self.poses,
+            options.camera_axes or self.axes,
+            options.quaternion or self.quaternion,
+            options.position_scale_m * self.position_scale_m,
         )
 
     def of_matrix(self, matrix: np.ndarray) -> np.ndarray:
         """source_from_camera, camera x right, y down, z forward, of a written matrix (4, 4). Raises PoseError."""
+        if self.position_scale_m != 1.0:
+            matrix = np.array(matrix, np.float64)
+            matrix[:3, 3] *= self.position_scale_m
         if self.poses == "world_from_camera" and self.axes == "opencv":
             return matrix
         motion = rigid(matrix)

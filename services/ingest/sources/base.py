@@ -46,6 +46,7 @@ class Source:
     notes: tuple[str, ...] = ()  # everything that was changed or assumed on reading
     origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # where the frames' world has its zero in the source's
     convention: Convention | None = None  # how written poses were read; None = in a way no option changes
+    depth_unit_m: float = MILLIMETRE  # metres per unit of depth as the files hold it
     world_from_source: np.ndarray | None = None  # 4 x 4, levelling and recentring; None = nothing was done
     thinned: "Callable[[Wanted], Iterator[RawFrame | BadFrame]] | None" = None  # the same frames, but images, which
     # cost time, only of the wanted ones; the others' files are looked at and their images left empty
@@ -118,6 +119,23 @@ class Found:
 def truth_beside(path: Path) -> dict[str, Any] | None:
     """Content of a regions.json in the folder. Raises SourceError."""
     return read_json(path / REGIONS) if (path / REGIONS).is_file() else None
+
+
+def shifted_truth(truth: Any, origin_m: Sequence[float]) -> Any:
+    """Regions of a ground truth in the recentred world; what is not ours is handed on as it is."""
+    if not any(origin_m) or not isinstance(truth, dict):
+        return truth
+    x_m, y_m, z_m = origin_m
+    try:
+        regions = [
+            {**region, "polygon_m": [[x - x_m, y - y_m] for x, y in region["polygon_m"]]} for region in truth["regions"]
+        ]
+        floors = [
+            {**floor, "z_min_m": floor["z_min_m"] - z_m, "z_max_m": floor["z_max_m"] - z_m} for floor in truth["floors"]
+        ]
+    except (TypeError, KeyError, ValueError, AttributeError):
+        return truth
+    return {**truth, "regions": regions, "floors": floors}
 
 
 def read_bytes(path: Path) -> bytes:

@@ -1,9 +1,10 @@
 """Folders in a layout of one's own: images, depth, a pose per frame, and a camera.
 
 rgb/ color/ image/    (or their plurals) colour, any number in the name; depth/ 16 bit PNG, TIFF or NPY; floats = metres
-pose/ or poses/       a file per frame: 4 x 4 or 3 x 4 numbers, or tx ty tz and a quaternion
-intrinsics.* camera.* beside them: a 3 x 3 (or 4 x 4) matrix, fx fy cx cy, or JSON or YAML with these names, and where
-                      they have them width, height, depth_scale_m, model, distortion
+pose/ or poses/       a file per frame: 4 x 4 or 3 x 4 numbers, or tx ty tz and a quaternion; or one file of them all
+                      (pose_lists.py)
+intrinsics.* camera.* camera_info.* beside them: a 3 x 3 (or 4 x 4) matrix, fx fy cx cy, or JSON or YAML with these
+                      names, and where they have them width, height, depth_scale_m, model, distortion
 
 Nothing is assumed in silence. What the poses map, the camera's axes, the order of quaternions and the unit of depth are
 taken from the options, or found by how well depth images agree under each meaning; what cannot be told is asked for.
@@ -13,12 +14,11 @@ frames are spaced so that the camera walks rather than flies. All of it is noted
 
 import re
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -39,6 +39,7 @@ from prior_sg.services.ingest.core.headers import ImageError
 from prior_sg.services.ingest.core.options import ReadOptions
 from prior_sg.services.ingest.core.pixels import NPY_MAGIC, stored
 from prior_sg.services.ingest.core.poses import Convention, PoseError, matrix_of, rigid
+from prior_sg.services.ingest.sources import pose_lists
 from prior_sg.services.ingest.sources.base import (
     Camera,
     Entry,
@@ -52,25 +53,30 @@ from prior_sg.services.ingest.sources.base import (
     read_bytes,
     truth_beside,
 )
-from prior_sg.services.ingest.sources.normalise import scaled
-from prior_sg.services.ingest.sources.tables import read_json, stamps_ns, text_of
+from prior_sg.services.ingest.sources.cameras import scaled
+from prior_sg.services.ingest.sources.own_cameras import described, unit_of
+from prior_sg.services.ingest.sources.pose_lists import PoseList
+from prior_sg.services.ingest.sources.tables import stamps_ns
 
 NAME = "generic"
 COLORS = ("rgb", "color", "colour", "image", "images", "rgbs", "colors", "colours")
 DEPTHS, POSES = ("depth", "depths"), ("pose", "poses")
-CAMERAS = ("intrinsics.*", "intrinsic.*", "camera_intrinsics.*", "camera-intrinsics.*", "camera.*", "K.txt")
-LOOKS = "rgb/ (or color/, image/), depth/ and pose/ with a camera in intrinsics.* or camera.* (own layout)"
+LOOKS = "rgb/ (or color/, image/), depth/ and pose/ (or a list of poses) with intrinsics.* or camera.* (own layout)"
 PICTURES, ARRAYS = (".png", ".jpg", ".jpeg", ".bmp", ".webp"), (".png", ".npy", ".tiff", ".tif", ".exr")
 MATRICES = (".txt", ".npy", ".csv", ".pose")
+POSITION_SCALES_M = (0.001, 0.01)  # millimetres and centimetres, tried when metres make no sense
 PAIRS = 8  # pairs of frames that tell what poses mean
 RATE_HZ = 30.0
 EPOCH_S = 10**9  # numbers from here on are stamps
-NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 
 
 def fits(path: Path) -> bool:
     """Whether a folder has this layout."""
-    return path.is_dir() and all(folder_of(path, names) for names in (COLORS, DEPTHS, POSES))
+    if not path.is_dir():
+        return False
+    held = [folder_of(path, names) is not None for names in (COLORS, DEPTHS, POSES)]
+    found = None if all(held) else pose_lists.find(path)
+    return all(held) or (found is not None and (any(held[:2]) or found.name == pose_lists.TRANSFORMS))
 
 
 @dataclass(frozen=True)
@@ -79,23 +85,35 @@ class Files:
 
     color: Path | None
     depth: Path | None
-    pose: Path | None
+    pose: Path | np.ndarray | None  # a file, or the numbers of a list
+
+
+@dataclass(frozen=True)
+class Folder:
+    """What of a folder in a layout of one's own is taken."""
+
+    colors: dict[float, Path]  # by the number of the frame
+    depths: dict[float, Path]
+    poses: Mapping[float, Path | np.ndarray]
+    held: tuple[str, ...]  # what was found
+    listed: PoseList | None = None
+
+
+@dataclass(frozen=True)
+class Known:
+    """What the camera's file says."""
+
+    camera: Camera
+    depth_unit_m: float | None
 
 
 def load(path: Path, options: ReadOptions) -> Found:
     """A folder in a layout of one's own. Raises SourceError."""
-    folders = [folder_of(path, names) for names in (COLORS, DEPTHS, POSES)]
-    if None in folders:
-        raise SourceError(f"{path} lacks folders of images, depth and poses: looked for {LOOKS}")
-    colors, depths, poses = (
-        _by_key(folder, endings)
-        for folder, endings in zip(folders, (PICTURES, ARRAYS, MATRICES), strict=True)
-        if folder is not None
-    )
-    keys = sorted(colors.keys() | depths.keys() | poses.keys())
-    files = [Files(colors.get(key), depths.get(key), poses.get(key)) for key in keys]
-    camera, scale_m, notes = _camera(path, colors, depths, options)
-    verdict, said = _verdict(path, files, camera, scale_m, options)
+    folder = _folder(path)
+    keys = sorted(folder.colors.keys() | folder.depths.keys() | folder.poses.keys())
+    files = [Files(folder.colors.get(key), folder.depths.get(key), folder.poses.get(key)) for key in keys]
+    camera, scale_m, notes = _camera(path, folder, options)
+    verdict, said = _verdict(path, files, Known(camera, scale_m), folder, options)
     convention = verdict.meaning.convention
     up, clear = up_of([pose for file in files if (pose := _posed(file, convention)) is not None])
     said.append(
@@ -116,10 +134,31 @@ def load(path: Path, options: ReadOptions) -> Found:
         up=up,
         ground_truth=truth_beside(path),
         convention=convention,
-        why=(f"{', '.join(f'{folder.name}/' for folder in folders if folder)} lie in it, and no other layout fits",),
+        why=(f"{', '.join(folder.held)} lie in it, and no other layout fits",),
         notes=(*notes, *said, *timed),
         assumed_hz=assumed_hz,
     )
+
+
+def _folder(path: Path) -> Folder:
+    """The files of a folder by the number of their frame. Raises SourceError."""
+    colors, depths, poses = (folder_of(path, names) for names in (COLORS, DEPTHS, POSES))
+    found = None if poses is not None else pose_lists.find(path)
+    listed = None if found is None else pose_lists.read(found)
+    colors = colors or (None if listed is None else listed.images)
+    if colors is None or not colors.is_dir() or (poses is None and listed is None):
+        raise SourceError(f"{path} lacks images or poses: looked for {LOOKS}; poses may be {pose_lists.UNDERSTOOD}")
+    if depths is None and not (listed and listed.depth_names):
+        raise SourceError(f"{path} lacks depth images: put a folder depth/ with one for each colour image into it")
+    by_color = _by_key(colors, PICTURES)
+    stems = {file.stem: key for key, file in by_color.items()}
+    by_depth = {} if depths is None else _by_key(depths, ARRAYS)
+    if listed is not None and listed.depth_names:
+        by_depth = {stems[s]: listed.path.parent / name for s, name in listed.depth_names.items() if s in stems}
+    held = tuple(f"{part.name}/" for part in (colors, depths, poses) if part is not None)
+    if listed is None:
+        return Folder(by_color, by_depth, _by_key(poses, MATRICES) if poses else {}, held)
+    return Folder(by_color, by_depth, listed.of(sorted(by_color), stems), (*held, listed.path.name), listed)
 
 
 def folder_of(path: Path, names: Sequence[str]) -> Path | None:
@@ -147,14 +186,12 @@ def _numbers(keys: Sequence[float]) -> list[int]:
 # The camera.
 
 
-def _camera(
-    path: Path, colors: dict[float, Path], depths: dict[float, Path], options: ReadOptions
-) -> tuple[Camera, float | None, list[str]]:
+def _camera(path: Path, folder: Folder, options: ReadOptions) -> tuple[Camera, float | None, list[str]]:
     """The camera, metres per depth unit where its file says, and notes. Raises SourceError."""
-    files = [file for pattern in CAMERAS for file in sorted(path.glob(pattern)) if file.is_file()]
-    color_size = first_size(list(colors.values()), path)
-    depth_size = first_size(list(depths.values()), path)
-    if not files:
+    color_size = first_size(list(folder.colors.values()), path)
+    depth_size = first_size(list(folder.depths.values()), path)
+    file, fields = described(path, folder.listed)
+    if file is None:
         if not options.intrinsics:
             raise SourceError(
                 f"{path} has no camera: put intrinsics.txt (a 3 x 3 matrix) into it or give --intrinsics FX,FY,CX,CY "
@@ -162,78 +199,18 @@ def _camera(
             )
         return Camera(Intrinsics(*depth_size, *options.intrinsics[:4])), None, []
     try:
-        fields = _fields(files[0])
         fx, fy, cx, cy = (float(fields[name]) for name in ("fx", "fy", "cx", "cy"))
         size = (int(fields["width"]), int(fields["height"])) if "width" in fields and "height" in fields else None
-        notes = [f"the camera is that of {files[0].name}"]
+        notes = [f"the camera is that of {file.name}"]
         if size is None:
             size = min((depth_size, color_size), key=lambda s: abs(2 * cx + 1 - s[0]) + abs(2 * cy + 1 - s[1]))
             notes[0] += f", taken to be for {size[0]} x {size[1]} pixels" if color_size != depth_size else ""
-        scale_m = _scale(fields)
-        return Camera(Intrinsics(*size, fx, fy, cx, cy), *lens_of(files[0], fields)), scale_m, notes
+        scale_m = unit_of(fields)
+        return Camera(Intrinsics(*size, fx, fy, cx, cy), *lens_of(file, fields)), scale_m, notes
     except KeyError as error:
-        raise SourceError(f"{files[0]} is not a camera: it does not say {error.args[0]}") from error
+        raise SourceError(f"{file} is not a camera: it does not say {error.args[0]}") from error
     except (OSError, TypeError, ValueError, AttributeError) as error:
-        raise SourceError(f"{files[0]} is not a camera: {error}") from error
-
-
-def _scale(fields: dict[str, Any]) -> float | None:
-    """Metres per unit; names other than ours may mean units per metre."""
-    if "depth_scale_m" in fields:
-        return float(fields["depth_scale_m"])
-    names = ("depth_scale", "depth_factor", "depthscale", "depthmapfactor", "scale")
-    value = next((float(fields[name]) for name in names if name in fields), None)
-    if value is None or not value > 0:
-        return None
-    return 1 / value if value >= 1 else value
-
-
-def _fields(path: Path) -> dict[str, Any]:
-    """Named numbers of a camera's file. Raises SourceError."""
-    if path.suffix.lower() == ".npy":
-        return _of_matrix(np.ravel(stored(path.read_bytes())).tolist(), path)
-    if path.suffix.lower() == ".json":
-        content = read_json(path)
-        content = content.get("camera", content) if isinstance(content, dict) else {"k": content}
-        fields = _flat({str(key).lower(): value for key, value in content.items()})
-    else:
-        text = text_of(path)
-        named = re.findall(rf"^[\s\-]*([A-Za-z_][\w.]*)\s*[:=]\s*({NUMBER}|[A-Za-z_]\w*)\s*,?\s*$", text, re.MULTILINE)
-        fields = _flat({name.lower().rpartition(".")[2]: value for name, value in named})
-        listed = re.search(rf"(?:camera_matrix|\bK\b)[^\[]*\[((?:[\s,]|{NUMBER})+)\]", text)
-        if "fx" not in fields:
-            numbers = listed[1] if listed else re.sub(r"^\s*#.*$", "", text, flags=re.MULTILINE)
-            fields |= _of_matrix([float(n) for n in re.findall(NUMBER, numbers)], path)
-        bent = re.search(rf"distortion_coefficients[^\[]*\[((?:[\s,]|{NUMBER})+)\]", text)
-        fields |= {"distortion": [float(n) for n in re.findall(NUMBER, bent[1])]} if bent else {}
-    matrix = next((fields[k] for k in ("k", "camera_matrix", "intrinsic_matrix", "intrinsics") if k in fields), None)
-    if "fx" not in fields and matrix is not None:
-        matrix = matrix.get("data", matrix) if isinstance(matrix, dict) else matrix
-        fields |= _of_matrix(np.ravel(np.array(matrix, float)).tolist(), path)
-    return fields
-
-
-ALIASES = {"w": "width", "h": "height", "image_width": "width", "image_height": "height", "fl_x": "fx", "fl_y": "fy",
-           "fx_px": "fx", "fy_px": "fy", "cx_px": "cx", "cy_px": "cy", "ppx": "cx", "ppy": "cy",
-           "width_px": "width", "height_px": "height"}  # fmt: skip
-
-
-def _flat(fields: dict[str, Any]) -> dict[str, Any]:
-    return {ALIASES.get(name, name): value for name, value in fields.items()}
-
-
-def _of_matrix(numbers: Sequence[float], path: Path) -> dict[str, Any]:
-    """fx fy cx cy of a matrix in a row, by rows or by columns, or of the four (or six, with the size) themselves."""
-    if len(numbers) in (4, 6):
-        names = ("fx", "fy", "cx", "cy", "width", "height")
-        return dict(zip(names, numbers, strict=False))
-    side = {9: 3, 12: 4, 16: 4}.get(len(numbers))
-    if side is None:
-        raise SourceError(f"{path} is not a camera: it has {len(numbers)} numbers instead of a matrix of 3 x 3")
-    matrix = np.array(numbers, float).reshape(-1, side)[:3, :3]
-    if matrix[2, 0] and not matrix[0, 2]:  # written by columns
-        matrix = matrix.T
-    return {"fx": matrix[0, 0], "fy": matrix[1, 1], "cx": matrix[0, 2], "cy": matrix[1, 2]}
+        raise SourceError(f"{file} is not a camera: {error}") from error
 
 
 # Poses, and what they mean.
@@ -242,7 +219,9 @@ def _of_matrix(numbers: Sequence[float], path: Path) -> dict[str, Any]:
 def _numbers_of(file: Files) -> np.ndarray:
     """The pose as it is written, (4, 4) or (7,). Raises FrameError or PoseError."""
     if file.pose is None:
-        raise FrameError("it has no pose file")
+        raise FrameError("it has no pose file, and no line in a list of poses")
+    if isinstance(file.pose, np.ndarray):
+        return file.pose
     data = read_bytes(file.pose)
     if data.startswith(NPY_MAGIC):
         text = " ".join(repr(float(number)) for number in np.ravel(stored(data)))
@@ -277,38 +256,68 @@ def _images(file: Files) -> Images:
 
 
 def _verdict(
-    path: Path, files: list[Files], camera: Camera, scale_m: float | None, options: ReadOptions
+    path: Path, files: list[Files], known: Known, folder: Folder, options: ReadOptions
 ) -> tuple[Verdict, list[str]]:
     """What poses and depth mean, and how that is known. Raises SourceError that names the options."""
     pairs = _pairs(path, files)
     depths = [written.depth for pair in pairs for written in pair]
-    told = {"poses": options.poses, "axes": options.camera_axes, "quaternion": options.quaternion}
-    if not any(written.pose.shape == (7,) for pair in pairs for written in pair):
-        told["quaternion"] = told["quaternion"] or "xyzw"
+    told = _told(pairs, folder.listed, options)
     open_ = [name for name, value in told.items() if not value]
-    choices = [(told[name],) if told[name] else CHOICES[name] for name in CHOICES]
-    conventions = [Convention(poses, axes, quaternion) for poses, axes, quaternion in product(*choices)]
-    known_m = options.depth_scale_m or scale_m
-    floats = any(depth.dtype.kind == "f" for depth in depths)
-    units_m = [known_m] if known_m else [1.0] if floats else plausible_units(depths) or [USUAL_UNIT_M]
     if not pairs and open_:
         raise SourceError(f"{path} does not tell what its poses mean, the camera hardly moves: give {_asked(open_)}")
-    size = depths[0].shape if depths else (camera.intrinsics.height_px, camera.intrinsics.width_px)
-    verdict = meaning_of(pairs, _at(camera.intrinsics, (size[1], size[0])), conventions, units_m)
+    camera, known_m = known.camera.intrinsics, options.depth_scale_m or known.depth_unit_m
+    floats = any(depth.dtype.kind == "f" for depth in depths)
+    units_m = [known_m] if known_m else [1.0] if floats else plausible_units(depths) or [USUAL_UNIT_M]
+    size = depths[0].shape if depths else (camera.height_px, camera.width_px)
+    at = _at(camera, (size[1], size[0]))
+    verdict = meaning_of(pairs, at, _conventions(told, options.position_scale_m), units_m)
+    if verdict.share < LEAST_SHARE and options.position_scale_m == 1.0:
+        tried = [meaning_of(pairs, at, _conventions(told, scale), units_m) for scale in POSITION_SCALES_M]
+        verdict = max((verdict, *tried), key=lambda one: one.share if one.share >= LEAST_SHARE else 0.0)
     unclear = [name for name in verdict.unclear if name in open_]
     if open_ and (unclear or verdict.share < LEAST_SHARE):
         raise SourceError(
             f"{path} does not tell what its poses mean: depth images agree by {verdict.share:.0%} at best; "
             f"give {_asked(unclear or open_)}, and --depth-scale"
         )
+    said = _said(verdict, folder.listed, open_)
+    return verdict, said if floats else [*said, _unit_said(known_m, units_m, verdict)]
+
+
+def _told(pairs: Sequence[tuple[Written, Written]], listed: PoseList | None, options: ReadOptions) -> dict[str, str]:
+    """What options, or the format of a list, say of the poses; empty = nobody says."""
+    told: dict[str, str] = {"poses": options.poses, "axes": options.camera_axes, "quaternion": options.quaternion}
+    if listed is not None and listed.convention is not None:
+        told = {name: value or getattr(listed.convention, name) for name, value in told.items()}
+    if not any(written.pose.shape == (7,) for pair in pairs for written in pair):
+        told["quaternion"] = told["quaternion"] or "xyzw"
+    return told
+
+
+def _conventions(told: dict[str, str], position_scale_m: float) -> list[Convention]:
+    choices = [(told[name],) if told[name] else CHOICES[name] for name in CHOICES]
+    return [Convention(poses, axes, quaternion, position_scale_m) for poses, axes, quaternion in product(*choices)]
+
+
+def _unit_said(known_m: float | None, units_m: Sequence[float], verdict: Verdict) -> str:
+    how = "found by the same agreement" if len(units_m) > 1 else "the one that makes a room"
+    if "unit" in verdict.unclear:
+        how = "assumed, the movement does not tell; --depth-scale says otherwise"
+    return f"{verdict.meaning.unit_m:.6g} metres per depth unit ({'as told' if known_m else how})"
+
+
+def _said(verdict: Verdict, listed: PoseList | None, open_: Sequence[str]) -> list[str]:
+    """What the poses were taken for, and how that is known."""
+    convention = verdict.meaning.convention
     how = f"found: depth images agree by {verdict.share:.0%}" if open_ else "as told"
-    said = [f"{verdict.meaning.convention.said()} ({how})"]
-    if not floats:
-        usual = "assumed, the movement does not tell; --depth-scale says otherwise"
-        found = "found by the same agreement" if len(units_m) > 1 else "the one that makes a room"
-        how = "as told" if known_m else usual if "unit" in verdict.unclear else found
-        said.append(f"{verdict.meaning.unit_m:.6g} metres per depth unit ({how})")
-    return verdict, said
+    if listed is not None and listed.convention == replace(convention, position_scale_m=1.0):
+        how = f"as {listed.path.name} has them"
+    said = [f"{convention.said()} ({how})"]
+    if convention.position_scale_m != 1.0:
+        said.append(
+            f"positions are read as units of {convention.position_scale_m:g} m (--position-scale says otherwise)"
+        )
+    return said
 
 
 def _at(camera: Intrinsics, size: tuple[int, int]) -> Intrinsics:

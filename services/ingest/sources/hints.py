@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from pathlib import Path
 
-from prior_sg.services.ingest.sources import dataset, generic
+from prior_sg.services.ingest.sources import dataset, generic, pose_lists
 
 FOLDERS_LOOKED_AT, NAMED = 200, 5
 KINDS = {
@@ -42,5 +42,9 @@ def _lacking(path: Path) -> str:
     lacks = [name for name, names in parts.items() if generic.folder_of(path, names) is None]
     if len(lacks) != 1:
         return ""
-    per_frame = ", with a file of 4 x 4 numbers for each frame" if "pose" in lacks[0] else ""
-    return f"it has no folder of {lacks[0]}{per_frame}"
+    if "pose" not in lacks[0]:
+        return f"it has no folder of {lacks[0]}"
+    others = sorted(child.name for child in path.iterdir() if not child.name.startswith("."))
+    held = ", ".join(name for name in others if name.lower() not in (*generic.COLORS, *generic.DEPTHS))
+    found = f"; what lies there ({held[:120]}) is none" if held else ""
+    return f"it has no folder of {lacks[0]}: understood are {pose_lists.UNDERSTOOD}{found}"

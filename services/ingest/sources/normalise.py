@@ -4,21 +4,20 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 import msgspec
 import numpy as np
 
 from prior_sg.schemas.frames import Intrinsics
+from prior_sg.services.ingest.core.detection import likely_unit_m
 from prior_sg.services.ingest.core.frames import BadFrame, RawFrame
 from prior_sg.services.ingest.core.headers import JPEG_MAGIC, ImageError, is_sized, trimmed
-from prior_sg.services.ingest.core.options import ORIGIN_AUTO, ReadOptions, check_lens, offset_of
+from prior_sg.services.ingest.core.options import ORIGIN_AUTO, ReadOptions, offset_of
 from prior_sg.services.ingest.core.pixels import encoded, measured, millimetres, stored
 from prior_sg.services.ingest.core.poses import EXACT, PoseError, rigid, stretch
 from prior_sg.services.ingest.sources.base import (
     MILLIMETRE,
-    Camera,
     Entry,
     Found,
     FrameError,
@@ -28,26 +27,19 @@ from prior_sg.services.ingest.sources.base import (
     color_pixels,
     depth_pixels,
     levelling,
+    shifted_truth,
 )
+from prior_sg.services.ingest.sources.cameras import Sizes, camera_of_images, straight_maps
 from prior_sg.services.ingest.sources.tables import FEW, SourceError
 
 UNUSABLE = (FrameError, PoseError, ImageError)
 LOOKED_AT, TRIED = 8, 64  # frames that are decoded when a source is opened, and how many may be bad before them
-ASPECT_TOLERANCE = 0.01
 FAR_M, HIGH_M = 1000.0, 50.0  # coordinates beyond are of a map's grid, or above the sea
 EYE_LEVEL_M = 1.5
 FLIGHT_M_S, WALK_M_S = 10.0, 2.5  # a camera faster than this is refused as a jump; how fast one is carried
 SLOWER_HZ = (10.0, 5.0, 2.0, 1.0)
 DEEPEST_M, SHALLOWEST_M = 200.0, 0.01  # no room and no street has a median depth beyond
-EDGE = 0.45  # share of the image by which a principal point may be off its middle; a crop may have 0.4
-
-
-@dataclass(frozen=True)
-class Sizes:
-    """Width and height, pixels, that most images of a source have."""
-
-    color: tuple[int, int]
-    depth: tuple[int, int]
+STORED_M = 65.535  # beyond, depth that is not of whole numbers does not fit into millimetres of 16 bits
 
 
 @dataclass(frozen=True)
@@ -59,6 +51,7 @@ class Depth:
     invalid: tuple[float, ...]
     nearest_m: float
     farthest_m: float  # 0 = no limit
+    unit_m: float  # metres per unit of the numbers that most images hold
 
 
 @dataclass(frozen=True)
@@ -203,6 +196,7 @@ def _valid(units: np.ndarray, invalid: Sequence[float]) -> np.ndarray:
 
 def finish(found: Found, options: ReadOptions) -> Source:
     """The source of what a loader found. Raises SourceError."""
+    _check_applicable(found, options)
     samples, reasons = _look(found.entries)
     if not samples and len(found.entries) >= FEW:
         raise SourceError(f"none of the frames of {found.path} can be read: {_most_common(reasons)}")
@@ -226,9 +220,23 @@ def finish(found: Found, options: ReadOptions) -> Source:
         notes=(*found.notes, *paced, *_rounded(poses), *notes),
         origin_m=normaliser.origin_m,
         convention=found.convention,
+        depth_unit_m=normaliser.depth.unit_m,
         world_from_source=normaliser.world_from_source,
         thinned=lambda wanted: _frames(normaliser, entries, wanted),
     )
+
+
+def _check_applicable(found: Found, options: ReadOptions) -> None:
+    """Raise SourceError when something is said of poses that are read in one way only."""
+    told = {
+        "--poses": options.poses,
+        "--axes": options.camera_axes,
+        "--quaternion": options.quaternion,
+        "--position-scale": options.position_scale_m != 1.0,
+    }
+    if found.convention is None and any(told.values()):
+        flags = ", ".join(flag for flag, given in told.items() if given)
+        raise SourceError(f"poses of the layout {found.layout} are read in one way only: leave out {flags}")
 
 
 def _frames(
@@ -317,14 +325,14 @@ def prepare(
     notes: list[str] = []
     images = [images for _, images in samples]
     sizes = _sizes(images, found.camera.intrinsics)
-    camera = _camera(found, options, sizes, notes)
+    camera = camera_of_images(found, options, sizes, notes)
     depth = _depth(found, options, images, notes)
     world_from_source = levelling(list(options.world_up) or found.up, options.floor_m)
     origin_m = _origin([pose for pose, _ in samples], world_from_source, options, notes)
     if any(origin_m):
         world_from_source = np.eye(4) if world_from_source is None else world_from_source
         world_from_source[:3, 3] -= origin_m
-    normaliser = Normaliser(camera.intrinsics, sizes, depth, _maps(camera), world_from_source, origin_m)
+    normaliser = Normaliser(camera.intrinsics, sizes, depth, straight_maps(camera), world_from_source, origin_m)
     _check_frames(normaliser, found.path, samples)
     return normaliser, tuple(notes)
 
@@ -352,84 +360,6 @@ def _size(data: bytes | np.ndarray) -> tuple[int, int] | None:
     return width_px, height_px
 
 
-def _camera(found: Found, options: ReadOptions, sizes: Sizes, notes: list[str]) -> Camera:
-    """The camera of the depth images. Raises SourceError."""
-    camera = _told(found.camera, options)
-    try:
-        check_lens(camera.model, camera.distortion)
-    except ValueError as error:
-        raise SourceError(f"the camera of {found.path} cannot be: {error}") from error
-    own = (camera.intrinsics.width_px, camera.intrinsics.height_px)
-    if not _same_aspect(sizes.color, sizes.depth):
-        raise SourceError(
-            f"the colour images of {found.path} have {_by(sizes.color)} pixels and the depth images "
-            f"{_by(sizes.depth)}: they do not show the same view; register depth to colour first"
-        )
-    if sizes.color != sizes.depth:
-        notes.append(f"colour of {_by(sizes.color)} pixels is resampled onto depth's {_by(sizes.depth)}")
-    if own != sizes.depth:
-        if not _same_aspect(own, sizes.depth):
-            raise SourceError(
-                f"the camera of {found.path} is for {_by(own)} pixels, the images have {_by(sizes.depth)}: "
-                "give --intrinsics FX,FY,CX,CY,WIDTH,HEIGHT for the images as they are"
-            )
-        notes.append(f"the camera of {_by(own)} pixels is scaled to the images' {_by(sizes.depth)}")
-        camera = replace(camera, intrinsics=scaled(camera.intrinsics, sizes.depth))
-    _check_principal_point(camera, found.path)
-    if camera.model == "fisheye" or any(camera.distortion):
-        notes.append(f"images are undistorted ({camera.model or 'opencv'} lens, {len(camera.distortion)} coefficients)")
-    return camera
-
-
-def _told(camera: Camera, options: ReadOptions) -> Camera:
-    """The camera with what the user says instead."""
-    model = options.camera_model or ("" if options.distortion else camera.model)
-    distortion = tuple(options.distortion) or (() if options.camera_model == "pinhole" else camera.distortion)
-    intrinsics, published = camera.intrinsics, camera.published
-    if options.intrinsics:
-        size = options.intrinsics[4:] or (intrinsics.width_px, intrinsics.height_px)
-        intrinsics, published = Intrinsics(int(size[0]), int(size[1]), *options.intrinsics[:4]), False
-    return Camera(intrinsics, "" if model == "pinhole" else model, () if model == "pinhole" else distortion, published)
-
-
-def _same_aspect(a: tuple[int, int], b: tuple[int, int]) -> bool:
-    return abs(a[0] * b[1] - a[1] * b[0]) <= ASPECT_TOLERANCE * max(a[0] * b[1], a[1] * b[0])
-
-
-def _by(size: tuple[int, int]) -> str:
-    return f"{size[0]} x {size[1]}"
-
-
-def scaled(camera: Intrinsics, size: tuple[int, int]) -> Intrinsics:
-    """The camera of the same picture with another number of pixels."""
-    x, y = size[0] / camera.width_px, size[1] / camera.height_px
-    center = (camera.cx_px + 0.5) * x - 0.5, (camera.cy_px + 0.5) * y - 0.5
-    return Intrinsics(*size, camera.fx_px * x, camera.fy_px * y, *center)
-
-
-def _check_principal_point(camera: Camera, path: Path) -> None:
-    of = camera.intrinsics
-    for name, center, size in (("x", of.cx_px, of.width_px), ("y", of.cy_px, of.height_px)):
-        if not camera.published and not abs(center - (size - 1) / 2) <= EDGE * size:
-            raise SourceError(
-                f"the camera of {path} has its principal point at {name} = {center:.1f} of {size} pixels, outside the "
-                "image: it belongs to another image size; give --intrinsics FX,FY,CX,CY,WIDTH,HEIGHT"
-            )
-
-
-def _maps(camera: Camera) -> tuple[np.ndarray, np.ndarray] | None:
-    if camera.model != "fisheye" and not any(camera.distortion):
-        return None
-    of = camera.intrinsics
-    matrix = np.array(((of.fx_px, 0, of.cx_px), (0, of.fy_px, of.cy_px), (0, 0, 1)))
-    size = (of.width_px, of.height_px)
-    if camera.model == "fisheye":
-        coefficients = np.array(camera.distortion or (0.0,) * 4)
-        return cv2.fisheye.initUndistortRectifyMap(matrix, coefficients, np.eye(3), matrix, size, cv2.CV_32FC1)
-    x, y = cv2.initUndistortRectifyMap(matrix, np.array(camera.distortion), np.eye(3), matrix, size, cv2.CV_32FC1)
-    return x, y
-
-
 def _depth(found: Found, options: ReadOptions, images: Sequence[Images], notes: list[str]) -> Depth:
     """How the depth images are read. Raises SourceError when nothing real is that deep."""
     scale_m = found.depth_scale_m if options.depth_scale_m is None else options.depth_scale_m
@@ -449,13 +379,14 @@ def _depth(found: Found, options: ReadOptions, images: Sequence[Images], notes: 
     measured_m += [array[_valid(array, invalid)] * scale_m for array in whole]
     measured_m += [array[_valid(array, invalid)] * float_scale_m for array in floats]
     medians = [float(np.median(values)) for values in measured_m if values.size]
-    if medians and not SHALLOWEST_M <= (median_m := float(np.median(medians))) <= DEEPEST_M:
-        used = float_scale_m if floats and not whole else scale_m
+    unit_m = float_scale_m if floats and not whole else scale_m
+    deepest_m = STORED_M if floats and not whole else DEEPEST_M
+    if medians and not SHALLOWEST_M <= (median_m := float(np.median(medians))) <= deepest_m:
         raise SourceError(
-            f"the median depth of {found.path} is {median_m:.4g} m: check depth_scale_m ({used:g} metres per unit); "
-            "--depth-scale METRES sets it"
+            f"the median depth of {found.path} is {median_m:.4g} m: check depth_scale_m ({unit_m:g} metres per unit); "
+            f"--depth-scale METRES sets it, {likely_unit_m(median_m / unit_m):.6g} would make a room of it"
         )
-    return Depth(scale_m, float_scale_m, invalid, options.depth_min_m, options.depth_max_m)
+    return Depth(scale_m, float_scale_m, invalid, options.depth_min_m, options.depth_max_m, unit_m)
 
 
 def _float_scale(
@@ -522,20 +453,3 @@ def _check_frames(normaliser: Normaliser, path: Path, samples: Sequence[tuple[np
             reasons.append(str(error))
     if len(reasons) >= FEW:
         raise SourceError(f"none of the frames of {path} can be used: {_most_common(reasons)}")
-
-
-def shifted_truth(truth: Any, origin_m: Sequence[float]) -> Any:
-    """Regions of a ground truth in the recentred world; what is not ours is handed on as it is."""
-    if not any(origin_m) or not isinstance(truth, dict):
-        return truth
-    x_m, y_m, z_m = origin_m
-    try:
-        regions = [
-            {**region, "polygon_m": [[x - x_m, y - y_m] for x, y in region["polygon_m"]]} for region in truth["regions"]
-        ]
-        floors = [
-            {**floor, "z_min_m": floor["z_min_m"] - z_m, "z_max_m": floor["z_max_m"] - z_m} for floor in truth["floors"]
-        ]
-    except (TypeError, KeyError, ValueError, AttributeError):
-        return truth
-    return {**truth, "regions": regions, "floors": floors}

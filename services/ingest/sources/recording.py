@@ -16,9 +16,17 @@ from prior_sg.schemas.topics import KEYFRAME, POSE_UPDATE
 from prior_sg.services.ingest.core.frames import BadFrame, Correction, RawFrame
 from prior_sg.services.ingest.core.options import ReadOptions
 from prior_sg.services.ingest.core.poses import Convention
-from prior_sg.services.ingest.sources.base import Camera, Found, Images, Source, SourceError, Wanted
-from prior_sg.services.ingest.sources.normalise import LOOKED_AT, UNUSABLE, Normaliser, prepare, shifted_truth
-from prior_sg.services.runtime.record import Content, LogError, attachments, contents, read_log
+from prior_sg.services.ingest.sources.base import Camera, Found, Images, Source, SourceError, Wanted, shifted_truth
+from prior_sg.services.ingest.sources.normalise import LOOKED_AT, UNUSABLE, Normaliser, prepare
+from prior_sg.services.runtime.record import (
+    Content,
+    LogError,
+    attachments,
+    contents,
+    foreign_topics,
+    is_whole,
+    read_log,
+)
 
 NAME = "log"
 REGIONS = "regions.json"
@@ -35,14 +43,23 @@ class Log:
     total: int
     first: Keyframe
     truth: dict[str, Any] | None
+    notes: tuple[str, ...]  # on what of the file is not read
 
 
 def load(path: Path, options: ReadOptions) -> Source:
     """A log as a source. Raises SourceError."""
+    try:
+        return _load(path, options)
+    except LogError as error:
+        raise SourceError(str(error)) from error
+
+
+def _load(path: Path, options: ReadOptions) -> Source:
     recorded, corrected = _opened(path, options.source_robot)
-    samples = _samples(recorded)
+    samples = _samples(recorded, Convention().changed(options))
     found = Found(NAME, path, Camera(recorded.first.intrinsics), recorded.first.depth_scale_m, ())
-    moved, notes = prepare(found, options, samples)
+    moved, prepared = prepare(found, options, samples)
+    notes = (*recorded.notes, *prepared)
     normaliser = replace(moved, origin_m=_sum(recorded.first.origin_m, moved.origin_m))
     if options.rate_hz:
         notes = (*notes, f"{options.rate_hz:g} frames a second, as told, in place of the stamps")
@@ -62,11 +79,12 @@ def load(path: Path, options: ReadOptions) -> Source:
         total=recorded.total,
         frames=lambda: _frames(recorded, normaliser_of, options),
         ground_truth=shifted_truth(recorded.truth, moved.origin_m),
-        corrections=lambda: _corrections(recorded, normaliser) if corrected else iter(()),
+        corrections=lambda: _corrections(recorded, normaliser, options) if corrected else iter(()),
         why=("it is an MCAP log of ours",),
         notes=notes,
         origin_m=normaliser.origin_m,
         convention=Convention().changed(options),
+        depth_unit_m=normaliser.depth.unit_m,
         world_from_source=normaliser.world_from_source,
         thinned=lambda wanted: _frames(recorded, normaliser_of, options, wanted),
     )
@@ -77,23 +95,25 @@ def _sum(a: tuple[float, float, float], b: tuple[float, float, float]) -> tuple[
 
 
 def _opened(path: Path, robot: str) -> tuple[Log, bool]:
-    """The stream that was asked for, and whether its poses were corrected. Raises SourceError."""
+    """The stream that was asked for, and whether its poses were corrected. Raises SourceError and LogError."""
     try:
         found = contents(path)
         streams = [content for content in found if content.topic == KEYFRAME.name]
         key = KEYFRAME.pattern(robot) if robot else streams[0].key if streams else ""
         total = sum(content.messages for content in streams if content.key == key)
         if total == 0:
-            raise SourceError(f"{path} holds no keyframes{f' of {robot}' if robot else ''}{_robots(streams)}")
+            raise SourceError(
+                f"{path} holds no keyframes{f' of {robot}' if robot else ''}{_robots(streams) or _foreign(path)}"
+            )
         files = attachments(path)
         truth = json.loads(files[REGIONS]) if REGIONS in files else None
-    except (LogError, ValueError) as error:
-        raise SourceError(str(error)) from error
-    recorded = Log(path, key, total, _first(path, key), truth)
+    except ValueError as error:
+        raise SourceError(f"the ground truth in {path} cannot be read: {error}") from error
+    recorded = Log(path, key, total, _first(path, key), truth, tuple(_notes(path, streams, key)))
     return recorded, any(content.topic == POSE_UPDATE.name for content in found)
 
 
-def _samples(recorded: Log) -> list[tuple[np.ndarray, Images]]:
+def _samples(recorded: Log, convention: Convention) -> list[tuple[np.ndarray, Images]]:
     """Poses and images of the first frames that have the first one's camera."""
     samples: list[tuple[np.ndarray, Images]] = []
     for payload in _payloads(recorded.path, recorded.key):
@@ -102,7 +122,7 @@ def _samples(recorded: Log) -> list[tuple[np.ndarray, Images]]:
         except DecodeError:
             continue
         if keyframe.intrinsics == recorded.first.intrinsics and keyframe.depth_scale_m == recorded.first.depth_scale_m:
-            samples.append((np.array(keyframe.world_from_camera), _images(keyframe)))
+            samples.append((convention.of_matrix(np.array(keyframe.world_from_camera)), _images(keyframe)))
         if len(samples) == LOOKED_AT:
             break
     return samples
@@ -116,6 +136,7 @@ def _frames(
     recorded: Log, normaliser_of: Callable[[Rig], Normaliser], options: ReadOptions, wanted: Wanted | None = None
 ) -> Iterator[RawFrame | BadFrame]:
     total, convention = recorded.total, Convention().changed(options)
+    index = -1
     for index, payload in enumerate(_payloads(recorded.path, recorded.key)):
         frame_id = -1
         try:
@@ -128,12 +149,14 @@ def _frames(
             yield make(index, total, frame_id, stamp_ns, pose, _images(keyframe))
         except (DecodeError, SourceError, *UNUSABLE) as error:
             yield BadFrame(frame_id=frame_id, reason=str(error), index=index, total=total)
+    for lost in range(index + 1, total):
+        yield BadFrame(frame_id=-1, reason="it lies in a damaged part of the log", index=lost, total=total)
 
 
-def _corrections(recorded: Log, normaliser: Normaliser) -> Iterator[Correction]:
+def _corrections(recorded: Log, normaliser: Normaliser, options: ReadOptions) -> Iterator[Correction]:
     """Pose updates, each stamped as the newest keyframe before it: who wrote it may have had another clock."""
-    stamp_ns, robot = 0, recorded.first.robot
-    for logged in read_log(recorded.path, (KEYFRAME, POSE_UPDATE)):
+    stamp_ns, robot, convention = 0, recorded.first.robot, Convention().changed(options)
+    for logged in read_log(recorded.path, (KEYFRAME, POSE_UPDATE), _damaged):
         if logged.key not in (KEYFRAME.pattern(robot), POSE_UPDATE.pattern(robot)):
             continue
         try:
@@ -147,12 +170,19 @@ def _corrections(recorded: Log, normaliser: Normaliser) -> Iterator[Correction]:
             yield Correction(
                 stamp_ns=stamp_ns,
                 frame_ids=np.array(message.frame_ids),
-                world_from_camera=normaliser.pose(np.array(message.world_from_camera)),
+                world_from_camera=normaliser.pose(
+                    np.stack([convention.of_matrix(pose) for pose in np.array(message.world_from_camera)])
+                ),
             )
 
 
 def _payloads(path: Path, key: str) -> Iterator[bytes]:
-    return (logged.payload for logged in read_log(path, (KEYFRAME,)) if logged.key == key)
+    """What is damaged is left out, and warned of."""
+    return (logged.payload for logged in read_log(path, (KEYFRAME,), _damaged) if logged.key == key)
+
+
+def _damaged(error: LogError) -> None:
+    log.warning("%s", error)
 
 
 def _first(path: Path, key: str) -> Keyframe:
@@ -162,6 +192,26 @@ def _first(path: Path, key: str) -> Keyframe:
         except DecodeError:
             continue
     raise SourceError(f"no keyframe in {path} can be read: they come from another version")
+
+
+def _notes(path: Path, streams: Sequence[Content], key: str) -> Iterator[str]:
+    """What of the log is not read. Raises LogError."""
+    counts = {content.key: 0 for content in streams}
+    for content in streams:
+        counts[content.key] += content.messages
+    if len(counts) > 1:
+        told = ", ".join(f"{other.split('/')[1]} ({count} keyframes)" for other, count in counts.items())
+        yield f"it holds the robots {told}: {key.split('/')[1]} is read; --set ingest.source_robot=NAME reads another"
+    if not is_whole(path):
+        yield f"the log was cut off: the {counts[key]} keyframes that are complete are read"
+
+
+def _foreign(path: Path) -> str:
+    topics = foreign_topics(path)
+    if not topics:
+        return "; it holds no messages of ours" if is_whole(path) else ": it was cut off before its first complete part"
+    told = ", ".join(topic[:60] for topic in topics[:5])
+    return f": it was written by another program (topics {told}); export its images, depth and poses into a folder"
 
 
 def _robots(streams: Sequence[Content]) -> str:

@@ -20,7 +20,7 @@ class PriorInForce:
     prior: Prior
     digest: str
     text: TextEmbeddings
-    pairwise: np.ndarray  # (label, label): -beta log P(ri <-> rj), zero diagonal
+    pairwise: np.ndarray  # (label, label), see border_costs
 
     @property
     def labels(self) -> list[str]:
@@ -99,9 +99,7 @@ class Aim:
         text = self.text_of(space, region_concepts(prior, cfg.object_phrases))
         if text is None:
             return None
-        pairwise = -cfg.beta * np.log(np.maximum(prior.adjacency.astype(np.float64), cfg.probability_floor))
-        np.fill_diagonal(pairwise, 0.0)
-        self.in_force = PriorInForce(prior, digest, text, pairwise)
+        self.in_force = PriorInForce(prior, digest, text, border_costs(prior, cfg))
         return self.in_force
 
     def translate(self, text: TextEmbeddings | None) -> None:
@@ -138,6 +136,18 @@ class Aim:
 
     def _holds(self, digest: str) -> bool:
         return self.in_force is not None and self.in_force.digest == digest
+
+
+def border_costs(prior: Prior, cfg: Config) -> np.ndarray:
+    """Pairwise costs (label, label), zero on the diagonal: eq. pairwise_potential without the edge's weight, and with
+    the prior's adjacency against chance, see AdjacencyConfig."""
+    log_adjacency = np.log(np.maximum(prior.adjacency.astype(np.float64), cfg.probability_floor))
+    costs, against = -log_adjacency, cfg.adjacency
+    if against.border > 0 and len(costs) > 1:
+        chance = log_adjacency[~np.eye(len(costs), dtype=bool)].mean()
+        costs = np.clip(against.border + against.trust * (chance - log_adjacency), against.least, against.most)
+    np.fill_diagonal(costs, 0.0)
+    return cfg.beta * costs
 
 
 def region_concepts(prior: Prior, object_phrases: int) -> list[list[str]]:

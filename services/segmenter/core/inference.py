@@ -8,11 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from prior_sg.services.segmenter.core.appearance import adaptation, smoothing
+from prior_sg.services.segmenter.core.appearance import adaptation, smoothing, unmixing
 from prior_sg.services.segmenter.core.appearance.label_bias import label_bias
 from prior_sg.services.segmenter.core.config import Config
 from prior_sg.services.segmenter.core.energy import posteriors
 from prior_sg.services.segmenter.core.energy.mrf import Field
+from prior_sg.services.segmenter.core.energy.region_cost import consolidated
 from prior_sg.services.segmenter.core.experts import REGISTRY, Vote
 from prior_sg.services.segmenter.core.experts.context import Context, ObjectView, standardised
 from prior_sg.services.segmenter.core.map import inclination
@@ -20,6 +21,9 @@ from prior_sg.services.segmenter.core.map.received import with_neighbours
 from prior_sg.services.segmenter.core.state import State
 
 BIAS_SAMPLE = 4096  # places that stand for all when the map's bias is computed
+LEAST_SURE = 10.0  # times the configured temperature at most, however little crops tell
+TOLD_TOLERANCE = 0.1  # smaller relative changes of what crops tell are not worth finding all beliefs again
+CORRECTION_TOLERANCE = 0.01  # smaller changes, in spreads of similarity, are not worth asking the experts again
 
 
 @dataclass
@@ -41,7 +45,7 @@ def votes(state: State, rows: np.ndarray, cfg: Config) -> dict[str, Vote]:
     context = Context(
         prior=aligned.prior,
         text=aligned.text,
-        similarity=state.map.places.similarity[rows],
+        similarity=state.map.places.looks[rows],
         frames=state.seen.evidence.frames[state.map.places.slots[rows]],
         bias=state.labelling.bias,
         positions_m=state.map.graph.positions_m[rows],
@@ -57,17 +61,20 @@ def votes(state: State, rows: np.ndarray, cfg: Config) -> dict[str, Vote]:
     return {name: (np.maximum(log_probabilities, floor), sure) for name, (log_probabilities, sure) in answers.items()}
 
 
-def adapt(state: State, idle: bool, cfg: Config) -> None:
-    """What the labels look like in this map, on a tick after enough of it was seen anew, or when it rests."""
+def survey_due(state: State, idle: bool, cfg: Config) -> bool:
+    """Whether to look over the whole map now: on a tick after enough of it was seen anew, or when it rests."""
     places, evidence, labelling = state.map.places, state.seen.evidence, state.labelling
-    labelling.unadapted += int(places.stale.sum())
-    if not idle:
+    labelling.unsurveyed += int(places.stale.sum())
+    seen = int((evidence.trust[places.slots] > 0).sum())
+    return idle and labelling.survey_due(seen, state.seen.rests, cfg.adaptation.patience) and seen > 0
+
+
+def adapt(state: State, cfg: Config) -> None:
+    """What the labels look like in this map."""
+    places, evidence, labelling = state.map.places, state.seen.evidence, state.labelling
+    if not cfg.adaptation.weight:
         return
     seen = np.flatnonzero(evidence.trust[places.slots] > 0)
-    if not labelling.adaptation_due(len(seen), state.seen.rests, cfg.adaptation.patience):
-        return
-    if not (cfg.adaptation.weight and len(seen)):
-        return
     found = evidence.descriptors(places.slots[seen]).astype(np.float32)
     similarity = standardised(found, state.aim.aligned.text)
     everywhere = np.zeros((len(places.slots), similarity.shape[1]))
@@ -89,6 +96,28 @@ def _visual_labels(state: State, own: np.ndarray, rows: np.ndarray, cfg: Config)
     around = smoothing.shared(own, trust, near, state.map.weights, rows=rows, cfg=cfg.sharing)
     scores = state.aim.aligned.text.temperature * around
     return np.argmax(scores + _bias(state, scores, cfg), axis=1)
+
+
+def tell_apart(state: State, cfg: Config) -> None:
+    """What all crops together say of each place beyond its neighbours, and how much they tell at all."""
+    graph, places, text = state.map.graph, state.map.places, state.aim.aligned.text
+    shown = unmixing.shown(state.seen.archive.frames, graph.positions_m, graph.radii_m)
+    looks = standardised(shown.embeddings.astype(np.float64), text)
+    told = unmixing.told(text.temperature * looks)
+    if abs(told - state.labelling.told) > TOLD_TOLERANCE * told:
+        state.labelling.told = told
+        places.unbelieved[:] = True
+    worth = unmixing.worth(told, cfg.unmixing)
+    now = np.zeros_like(places.similarity)
+    if cfg.unmixing.rounds and worth > 0:
+        apart = unmixing.unmixed(
+            places.similarity, looks, shown.shares, graph.arcs, state.map.weights, cfg=cfg.unmixing
+        )
+        now = worth * (apart - places.similarity)
+    moved = (np.abs(now - places.correction) > CORRECTION_TOLERANCE).any(axis=1)
+    places.correction[moved] = now[moved]
+    places.doubtful |= moved
+    state.labelling.compared += int(moved.sum())
 
 
 def _bias(state: State, scores: np.ndarray, cfg: Config) -> np.ndarray:
@@ -143,7 +172,7 @@ def rebalance(state: State, idle: bool, cfg: Config) -> None:
     seen = np.flatnonzero(state.seen.evidence.frames[places.slots] > 0)
     if not labelling.bias_due(len(seen), idle, cfg.balance.patience):
         return
-    bias = _bias(state, state.aim.aligned.text.temperature * places.similarity[seen], cfg)
+    bias = _bias(state, state.aim.aligned.text.temperature * places.looks[seen], cfg)
     if np.abs(bias - labelling.bias).max(initial=0.0) > cfg.balance.tolerance:
         labelling.bias = bias
         places.doubtful[seen] = True
@@ -152,9 +181,13 @@ def rebalance(state: State, idle: bool, cfg: Config) -> None:
 def evaluate_experts(state: State, idle: bool, cfg: Config) -> None:
     """Unary potentials wherever an expert may have changed its mind (eqs. product_of_experts, unary_potential)."""
     reshape(state, cfg)
-    adapt(state, idle, cfg)
+    surveyed = survey_due(state, idle, cfg)
+    if surveyed:
+        adapt(state, cfg)
     compare(state)
     share(state, cfg)
+    if surveyed:
+        tell_apart(state, cfg)
     rebalance(state, idle, cfg)
     places, rows = state.map.places, np.flatnonzero(state.map.places.doubtful)
     answers = votes(state, rows, cfg)
@@ -174,7 +207,7 @@ def field_of(state: State) -> Field:
 
 def settle(state: State, cfg: Config, *, hurried: bool) -> None:
     """Better labels around the places whose costs changed, within the budget where `hurried`; otherwise until no swap
-    on the whole field gains."""
+    on the whole field gains. Regions that do not pay for themselves then become part of a neighbour."""
     places, solver = state.map.places, state.labelling.solver
     limited = hurried and cfg.budget_ms > 0
     budget = Budget(cfg.budget_ms / cfg.look_ms if limited else np.inf)
@@ -182,21 +215,30 @@ def settle(state: State, cfg: Config, *, hurried: bool) -> None:
     same_rows = len(rows) == len(solver.labels) and np.array_equal(places.solved, rows)
     labels = solver.update(
         field_of(state),
-        places.labels,
+        places.cut_labels,
         budget.expired,
         dirty=np.flatnonzero(places.unsettled),
         previous=None if same_rows else places.solved,
     )
     if not limited:
         labels = solver.drain(budget.expired)
+    places.cut_labels, places.solved = labels, rows
+    labels = consolidated(field_of(state), labels, cfg.region_cost)
     places.unbelieved |= with_neighbours(state.map.graph, labels != places.labels)
-    places.labels, places.solved = labels, rows
+    places.labels = labels
     places.unsettled[:] = False
+
+
+def temperature(state: State, cfg: Config) -> float:
+    """Of the posteriors: the higher, the less the crops of this map tell of the labels."""
+    if not cfg.informed:
+        return cfg.temperature
+    return cfg.temperature * min(max(cfg.informed / max(state.labelling.told, 1e-9), 1.0), LEAST_SURE)
 
 
 def believe(state: State, cfg: Config) -> None:
     """Posteriors of the places whose costs, or whose neighbours' labels, changed."""
     places, rows = state.map.places, np.flatnonzero(state.map.places.unbelieved)
     costs = posteriors.conditional_costs(field_of(state), state.map.graph.arcs, places.labels, rows)
-    places.posteriors[rows] = posteriors.posteriors(costs, cfg.temperature)
+    places.posteriors[rows] = posteriors.posteriors(costs, temperature(state, cfg))
     state.regions.disturb(places.regions[rows])

@@ -14,17 +14,16 @@ class Labelling:
 
     solver: Solver
     adaptation: Adaptation = field(default_factory=Adaptation)
+    told: float = 0.0  # what the crops tell of the labels, prior_sg.services.segmenter.core.appearance.unmixing
     bias: np.ndarray = field(default_factory=lambda: np.zeros(0))  # (label,) of the visual scores in this map
-    unadapted: int = (
-        0  # places whose evidence changed, or that left, since that was looked at; at least one if any edge did
-    )
+    unsurveyed: int = 0  # places that changed or left since the map was looked over; at least one if any edge did
     compared: int = 0  # places whose similarity was computed, or that left, since the bias was
     dirty: bool = False  # something changed since the last solution
 
     def map_changed(self, left: int, touched: bool) -> None:
         """So many places left; `touched`: some came or moved, or an edge changed."""
         self.compared += left
-        self.unadapted += left + touched  # at least one: the map is another
+        self.unsurveyed += left + touched  # at least one: the map is another
         self.dirty = True
 
     def start_afresh(self, labels: int, places: int) -> None:
@@ -35,11 +34,11 @@ class Labelling:
         """The evidence is of another embedding space."""
         self.adaptation, self.dirty = Adaptation(), True
 
-    def adaptation_due(self, seen: int, rests: bool, patience: float) -> bool:
+    def survey_due(self, seen: int, rests: bool, patience: float) -> bool:
         """Whether enough of `seen` observed places changed to look at them again; if so, that counts as done."""
-        due = bool(rests and self.unadapted) or self.unadapted > patience * seen
+        due = bool(rests and self.unsurveyed) or self.unsurveyed > patience * seen
         if due:
-            self.unadapted = 0
+            self.unsurveyed = 0
         return due
 
     def bias_due(self, seen: int, idle: bool, patience: float) -> bool:
@@ -51,4 +50,4 @@ class Labelling:
 
     def labelled(self) -> None:
         """The labels are published; what was not finished remains to be done."""
-        self.dirty = self.solver.pending > 0 or self.compared > 0 or self.unadapted > 0
+        self.dirty = self.solver.pending > 0 or self.compared > 0 or self.unsurveyed > 0

@@ -17,7 +17,7 @@ from prior_sg.schemas.regions import (
 from prior_sg.services.segmenter.core.config import Config
 from prior_sg.services.segmenter.core.energy import posteriors
 from prior_sg.services.segmenter.core.energy.mrf import energy
-from prior_sg.services.segmenter.core.inference import field_of, votes
+from prior_sg.services.segmenter.core.inference import field_of, temperature, votes
 from prior_sg.services.segmenter.core.map.table import UNLABELLED
 from prior_sg.services.segmenter.core.regions import components, ledger
 from prior_sg.services.segmenter.core.state import State
@@ -147,7 +147,7 @@ def explain(state: State, request: PosteriorRequest, cfg: Config) -> PosteriorRe
         found=True,
         label=names[places.labels[row]],
         labels=names,
-        posterior=posteriors.posteriors(costs, cfg.temperature)[0].tolist(),
+        posterior=posteriors.posteriors(costs, temperature(state, cfg))[0].tolist(),
         unary=unary.tolist(),
         votes=[
             ExpertVote(
@@ -173,6 +173,6 @@ def explain(state: State, request: PosteriorRequest, cfg: Config) -> PosteriorRe
         ],
         unknown=1.0 - float(known_mass(state, rows, cfg)[0]),
         predicted=bool(state.seen.evidence.trust[slot] < cfg.predicted_trust),
-        temperature=cfg.temperature,
+        temperature=temperature(state, cfg),
         inclination_rad=float(places.inclination_rad[row]),
     )

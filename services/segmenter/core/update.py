@@ -132,6 +132,7 @@ def follow_spaces(state: State, cfg: Config) -> Iterator[TextRequest]:
     if state.seen.succeed(name, _targets(state), cfg):
         state.aim.translate(text)
         state.map.places.stale[:] = True
+        state.map.places.correction[:] = 0.0
         state.labelling.forget_appearance()
 
 

@@ -162,6 +162,20 @@ def test_a_source_is_read_to_its_end_and_not_twice(mapper, tmp_path):
         mapper.read(prior_sg.open_source(tmp_path / "more.mcap"))
 
 
+def test_a_recording_read_again_is_another_walk(tmp_path):
+    with LogWriter(tmp_path / "walk.mcap") as log:
+        for number in range(4):
+            frame = frame_of(number, **arrays(number))
+            fields = {name: getattr(frame, name) for name in Keyframe.__struct_fields__ if hasattr(frame, name)}
+            keyframe = Keyframe(robot="robot1", **fields)
+            log.add(KEYFRAME, KEYFRAME.key_of(keyframe), encode(keyframe), "w/1/1", number, 0, 0)
+    with prior_sg.Mapper(HOME, TASK, settings={"ingest.every_frame": True}) as mapper:
+        mapper.read(tmp_path / "walk.mcap")
+        once = mapper.progress.keyframes
+        mapper.read(tmp_path / "walk.mcap")
+        assert (once, mapper.progress.keyframes, mapper.progress.rejected) == (4, 8, 0)
+
+
 def test_what_is_lost_is_told(mapper):
     (loss,) = [loss for loss in mapper.losses if loss.reason == "their stamps go back"]
     assert loss.what == "frames refused" and loss.count >= 1

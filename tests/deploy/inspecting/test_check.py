@@ -153,6 +153,7 @@ def test_ground_truth_of_others_is_noted_and_left_out(folder, name, content):
     assert (found.regions, found.objects) == (None, ())
     assert [finding.verdict for finding in found.findings] == ["note"]
     assert name in found.findings[0].text
+    assert "Error" not in found.findings[0].text
 
 
 def test_ground_truth_of_ours_is_kept(folder):

@@ -79,6 +79,22 @@ def test_calibration_is_the_models_own_logit_less_each_concepts_bias(tiny):
         encoder.encode_text([[]])
 
 
+def test_a_text_is_embedded_once(tiny, monkeypatch):
+    """Priors of one environment repeat their phrases; what was asked before costs nothing, and gives the same."""
+    encoder, seen = load_encoder(tiny[1], Options(device="cpu")), []
+    embed = encoder._texts
+    monkeypatch.setattr(encoder, "_texts", lambda texts: seen.append(len(texts)) or embed(texts))
+    first = encoder.encode_text([["a dog", "a cat"], ["a dog"]]).embeddings
+    again = encoder.encode_text([["a dog"], ["a hall"], ["a cat", "a dog"]]).embeddings
+    assert seen == [2 * 3, 3]
+    assert again[0] == pytest.approx(first[1], abs=1e-6) and again[2] == pytest.approx(first[0], abs=1e-6)
+    monkeypatch.setattr(two_towers, "KNOWN_TEXTS", 4)
+    assert encoder.encode_text([["a dog"]]).embeddings[0] == pytest.approx(first[1], abs=1e-6)
+    assert seen == [6, 3] and len(encoder._known) == 9
+    encoder.encode_text([["a wall"]])
+    assert seen == [6, 3, 3] and len(encoder._known) == 3
+
+
 def test_pictures_of_nothing_are_always_the_same():
     first, again = two_towers.pictures_of_nothing(), two_towers.pictures_of_nothing()
     assert all((one == other).all() for one, other in zip(first, again, strict=True))

@@ -7,6 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from mcap.writer import Writer
 from scipy.spatial.transform import Rotation
 
 from prior_sg.deploy.sample.make import PackError, bare_jpeg, pack
@@ -342,6 +343,53 @@ def test_a_log_plays_one_robot(tmp_path):
     assert [f.frame_id for f in open_source(path, robot="b")] == [7, 9]
     with pytest.raises(SourceError, match="no keyframes of c; it holds those of a, b"):
         open_source(path, robot="c")
+    assert any(
+        "a (2 keyframes), b (2 keyframes): a is read; --set ingest.source_robot=" in note for note in source.notes
+    )
+
+
+def test_a_log_that_was_cut_off_says_so(tmp_path):
+    path = log_of(tmp_path / "a.mcap", [("a", number) for number in range(6)])
+    assert not any("cut off" in note for note in open_source(path).notes)
+    path.write_bytes(path.read_bytes()[:-100])
+    assert any("cut off" in note for note in open_source(path).notes)
+
+
+def test_a_damaged_part_of_a_log_costs_what_lies_in_it(tmp_path):
+    path = tmp_path / "a.mcap"
+    with LogWriter(path) as log:
+        for number in range(6):
+            raw = frame(number, number)
+            fields = {name: getattr(raw, name) for name in Keyframe.__struct_fields__ if hasattr(raw, name)}
+            keyframe = Keyframe(robot="a", **fields)
+            log.add(KEYFRAME, KEYFRAME.key_of(keyframe), encode(keyframe), "w", number, sent_ns=0, received_ns=number)
+            log.flush()
+    data = bytearray(path.read_bytes())
+    at = len(data) // 2
+    data[at : at + 8] = b"\xff" * 8
+    path.write_bytes(data)
+    frames = list(open_source(path))
+    lost = [f for f in frames if isinstance(f, BadFrame)]
+    assert len(frames) == 6 and len(lost) == 1
+    assert "damaged" in lost[0].reason
+
+
+def test_logs_without_keyframes_are_told_apart(tmp_path):
+    with LogWriter(tmp_path / "empty.mcap"):
+        pass
+    with pytest.raises(SourceError, match="holds no keyframes; it holds no messages of ours"):
+        open_source(tmp_path / "empty.mcap")
+    (tmp_path / "cut.mcap").write_bytes((tmp_path / "empty.mcap").read_bytes()[:8])
+    with pytest.raises(SourceError, match="holds no keyframes: it was cut off before its first complete part"):
+        open_source(tmp_path / "cut.mcap")
+    with (tmp_path / "ros.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        channel = writer.register_channel("/camera/depth", "cdr", writer.register_schema("Image", "ros2msg", b""))
+        writer.add_message(channel, 0, b"\x00", 0)
+        writer.finish()
+    with pytest.raises(SourceError, match=r"written by another program \(topics /camera/depth\); export its images"):
+        open_source(tmp_path / "ros.mcap")
 
 
 def test_a_malformed_keyframe_of_a_log_is_reported(tmp_path):

@@ -173,6 +173,50 @@ def test_a_unit_wrong_by_a_thousand_is_hopeless():
     assert any(finding.hopeless for finding in inspect(recording(scale_m=1.0), Reading()))
 
 
+@pytest.mark.parametrize(("unit", "scale"), [(1000.0, "0.001"), (100.0, "0.01")])
+def test_the_unit_of_positions_is_named_and_not_that_of_depth(unit, scale):
+    poses = [pose.copy() for pose in POSES]
+    for pose in poses:
+        pose[:3, 3] *= unit
+    found = inspect(recording(poses), Reading())
+    assert mends(found) == [f"--position-scale {scale}"], found
+    told = Reading(position_scale_m=0.5)  # and it is said in whatever unit they were read before
+    assert mends(inspect(recording(poses), told)) == [f"--position-scale {0.5 * float(scale):g}"]
+
+
+def test_the_unit_of_depth_is_named_as_the_files_have_it():
+    read = recording(scale_m=0.01)
+    read.depth_unit_m = 0.1  # of the files; the shots are stored otherwise
+    assert mends(inspect(read, Reading())) == ["--depth-scale 0.01"]
+
+
+@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize("axes", ["opencv", "opengl", "ros"])
+def test_a_mirrored_world_is_named(axis, axes):
+    mirror = np.eye(4)
+    mirror[axis, axis] = -1
+    poses = [mirror @ pose @ lifted(conventions.FROM_CAMERA[axes].T) @ mirror for pose in POSES]
+    found = next(f for f in inspect(recording(poses), Reading()) if f.topic == "poses")
+    assert found.verdict == "problem"
+    assert "mirrored" in found.text, found
+
+
+@pytest.mark.parametrize(
+    "depths",
+    [[np.full_like(DEPTHS[0], 2000)] * 16, [DEPTHS[5]] * 16, [np.full_like(DEPTHS[0], 2000 + i) for i in range(16)]],
+)
+def test_depth_that_shows_nothing_gets_no_hint_on_axes(depths):
+    found = inspect(recording(depths=depths), Reading())
+    assert verdicts(found)["depth images"] == "problem"
+    assert not {"poses", "up", "depth unit", "intrinsics problem"} & set(verdicts(found))
+    assert not any("--axes" in mend or "--poses" in mend for mend in mends(found))
+
+
+def test_a_camera_that_rests_sees_the_same_and_that_is_no_problem():
+    found = inspect(recording([POSES[3]] * 16, [DEPTHS[3]] * 16), Reading())
+    assert "depth images" not in verdicts(found)
+
+
 def test_a_wrong_focal_length_is_named():
     camera = msgspec.structs.replace(room.CAMERA, fx_px=49.0, fy_px=49.0)
     found = inspect(recording(camera=camera), Reading())

@@ -12,8 +12,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from prior_sg.deploy.inspecting.beside import truth_beside
+from prior_sg.deploy.inspecting.check import check
 from prior_sg.deploy.sample.packed import pack_source
 from prior_sg.schemas.frames import Intrinsics
+from prior_sg.services.ingest.core.config import Config
 from prior_sg.services.ingest.core.frames import BadFrame, RawFrame
 from prior_sg.services.ingest.core.headers import ImageError, image_size, trimmed
 from prior_sg.services.ingest.core.options import ReadOptions
@@ -279,6 +282,10 @@ def test_ground_truth_moves_with_the_origin(tmp_path):
     assert moved.ground_truth["regions"][0]["polygon_m"] == [[0, 0], [2, 0], [2, 2]]
     assert moved.ground_truth["floors"][0]["z_max_m"] == 2.5
     assert moved.origin_m == (1.0, 2.0, 0.5)
+    box = {"label": "chair", "min_m": [1, 2, 0.5], "max_m": [2, 3, 1.5]}
+    (folder / "objects.json").write_text(json.dumps({"objects": [box]}))
+    (item,) = truth_beside(moved).objects
+    assert (item.min_m.tolist(), item.max_m.tolist()) == ([0, 0, 0], [1, 1, 1])
 
 
 # Images.
@@ -592,6 +599,54 @@ def test_a_clock_beside_the_images_is_found_told_and_can_be_given(tmp_path, shif
         open_source(tmp_path / "d", options=ReadOptions(stamp_offset_s=123.456))
 
 
+@pytest.mark.parametrize(("unit", "scale_m"), [(1000.0, 0.001), (100.0, 0.01), (3.0, 1 / 3)])
+def test_positions_in_another_unit_are_told(tmp_path, unit, scale_m):
+    poses = [pose.copy() for pose, _, _ in WALK]
+    for pose in poses:
+        pose[:3, 3] *= unit
+    dataset(tmp_path / "d", rows=rows_of(poses))
+    assert_the_walk(open_source(tmp_path / "d", options=ReadOptions(position_scale_m=scale_m)))
+
+
+def test_positions_of_an_own_layout_in_millimetres_are_found_and_told(tmp_path):
+    poses = [(pose.copy(), *rest) for pose, *rest in WALK]
+    for pose, *_ in poses:
+        pose[:3, 3] *= 1000
+    source = open_source(own(tmp_path / "d", poses))
+    assert any("positions are read as units of 0.001 m" in note for note in source.notes), source.notes
+    assert_the_walk(source, stamps=False)
+
+
+def test_shares_of_the_image_are_no_intrinsics(tmp_path):
+    fields = {"fx": 60 / 80, "fy": 1.0, "cx": 39.5 / 80, "cy": 29.5 / 60}
+    with pytest.raises(SourceError, match=r"shares of the image, not pixels.* --intrinsics 60,60,39\.5,29\.5"):
+        open_source(dataset(tmp_path / "d", **fields))
+
+
+@pytest.mark.parametrize("factor", [100, 10_000])
+def test_floating_point_depth_in_another_unit_is_named_with_the_unit_that_mends(tmp_path, factor):
+    folder = dataset(tmp_path / "d")
+    for i, (_, _, depth) in enumerate(WALK):
+        (folder / f"depth/{i:06d}.png").unlink()
+        (folder / f"depth/{i:06d}.npy").write_bytes(npy((depth / 1000 * factor).astype(np.float32)))
+    try:
+        mend = " ".join(f.mend for f in check(open_source(folder), Config()).problems)
+    except SourceError as error:
+        mend = str(error)
+    assert f"--depth-scale {1 / factor:g}" in mend or f"sets it, {1 / factor:g} would" in mend
+    told = list(open_source(folder, options=ReadOptions(depth_scale_m=1 / factor)))
+    assert np.abs(decoded(told[0].depth).astype(int) - WALK[0][2]).max() <= 1
+
+
+def test_a_saved_object_is_told_in_plain_words(tmp_path):
+    folder = dataset(tmp_path / "d")
+    (folder / "depth/000002.png").unlink()
+    np.save(folder / "depth/000002.npy", np.array([{"depth": 1}], object), allow_pickle=True)
+    (bad,) = [frame for frame in open_source(folder) if isinstance(frame, BadFrame)]
+    assert "write it again with numpy.save" in bad.reason
+    assert "pickle" not in bad.reason
+
+
 # Packing.
 
 
@@ -622,6 +677,7 @@ def test_a_packed_log_reads_as_the_source_that_was_put_right(tmp_path):
     [
         ({"depth_scale_m": float("inf")}, "depth_scale_m must be a positive"),
         ({"depth_scale_m": 0.0}, "depth_scale_m must be a positive"),
+        ({"position_scale_m": 0.0}, "position_scale_m must be a positive"),
         ({"rate_hz": -1.0}, "rate_hz"),
         ({"intrinsics": [1.0, 2.0]}, "intrinsics must be fx fy cx cy"),
         ({"distortion": [0.1, 0.2]}, "4 or 5 or 8 distortion coefficients"),

@@ -26,10 +26,11 @@ from prior_sg.schemas.topics import (
 from prior_sg.services.runtime.runner import Runner
 from prior_sg.services.runtime.service import Ask, Identity
 from prior_sg.services.segmenter.core import inference, report
-from prior_sg.services.segmenter.core.aim import region_concepts
+from prior_sg.services.segmenter.core.aim import border_costs, region_concepts
 from prior_sg.services.segmenter.core.appearance.adaptation import Adaptation, AdaptationConfig
 from prior_sg.services.segmenter.core.appearance.label_bias import BalanceConfig
-from prior_sg.services.segmenter.core.config import Config
+from prior_sg.services.segmenter.core.appearance.unmixing import UnmixingConfig
+from prior_sg.services.segmenter.core.config import AdjacencyConfig, Config
 from prior_sg.services.segmenter.core.energy.mrf import energy
 from prior_sg.services.segmenter.core.energy.solver import minimise
 from prior_sg.services.segmenter.core.experts.context import ObjectView
@@ -542,7 +543,7 @@ def test_beta_zero_labels_each_place_by_its_own_evidence():
 def test_pairwise_costs_by_hand(clearance_m, factor):
     """Two places 1 m apart with clearance 0.4: beta exp(-1 / 2) (-log 0.3) = 2 x 0.60653 x 1.20397 = 1.46049."""
     positions = np.array([(0.0, 0.0, 1.0), (1.0, 0.0, 1.0)])
-    cfg = Config(edge_clearance_m=clearance_m, edge_sum=0.0)
+    cfg = Config(edge_clearance_m=clearance_m, edge_sum=0.0, adjacency=AdjacencyConfig(border=0.0))
     run = Run(cfg=cfg).feed(place_delta(positions, np.array([(0, 1)])), task(), prior(ROOMS[:2]))
     mrf = inference.field_of(run.state)
     assert mrf.weights[0] * mrf.pairwise[0, 1] == pytest.approx(1.46049 * factor, abs=1e-4)
@@ -574,7 +575,8 @@ def test_a_label_the_encoder_favours_everywhere_does_not_take_the_map():
     shifted = text(np.eye(len(ROOMS)), background_mean=np.array((0.0, -0.8, 0.0), dtype=np.float32))
     right = {}
     for limit in (0.0, 10.0):
-        cfg = Config(beta=0.0, balance=BalanceConfig(limit=limit, half_places=1.0))
+        balance, apart = BalanceConfig(limit=limit, half_places=1.0), UnmixingConfig(rounds=0)
+        cfg = Config(beta=0.0, region_cost=0.0, balance=balance, unmixing=apart)
         run = Run(cfg=cfg).feed(place_delta(positions, edges), task(), prior(ROOMS), answer_text=False)
         run.feed(shifted, *frames, TICK)
         inside = positions[:, 0] % 4.0 != 0
@@ -606,3 +608,30 @@ def test_text_is_asked_in_the_configured_space():
 def test_impossible_settings_are_refused(fields):
     with pytest.raises(ValueError):
         Config(**fields)
+
+
+def test_borders_cost_by_adjacency_against_chance_whatever_a_prior_s_level():
+    """Of pairs at 0.9, 0.3, 0.3 the first is likelier than chance, so its border is cheaper; all halved: alike."""
+    adjacency = np.array([(1.0, 0.9, 0.3), (0.9, 1.0, 0.3), (0.3, 0.3, 1.0)])
+    costs, halved = (
+        border_costs(msgspec.structs.replace(prior(ROOMS), adjacency=(scale * adjacency).astype(np.float32)), Config())
+        for scale in (1.0, 0.5)
+    )
+    chance = np.log((0.9 * 0.3 * 0.3) ** (1 / 3))
+    assert costs[0, 1] == pytest.approx(2 * (1.5 + 0.5 * (chance - np.log(0.9))), abs=1e-5)
+    assert costs[0, 2] == pytest.approx(2 * (1.5 + 0.5 * (chance - np.log(0.3))), abs=1e-5)
+    np.testing.assert_allclose(costs, halved, atol=1e-5)
+    flat = msgspec.structs.replace(prior(ROOMS), adjacency=np.full((3, 3), 0.2, np.float32))
+    np.testing.assert_allclose(border_costs(flat, Config()), 3.0 * (1 - np.eye(3)), atol=1e-6)
+
+
+def test_beliefs_are_the_less_sure_the_less_crops_tell():
+    run, _ = finished()
+    cfg = Config()
+    run.state.labelling.told = 0.4
+    assert inference.temperature(run.state, cfg) == cfg.temperature
+    run.state.labelling.told = 0.05
+    assert inference.temperature(run.state, cfg) == pytest.approx(4 * cfg.temperature)
+    run.state.labelling.told = 0.0
+    assert inference.temperature(run.state, cfg) == inference.LEAST_SURE * cfg.temperature
+    assert inference.temperature(run.state, Config(informed=0.0)) == cfg.temperature

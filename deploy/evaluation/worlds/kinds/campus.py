@@ -1,4 +1,4 @@
-"""Campuses: street, walkway, plaza, lawn and parking lot before a building that one enters (pure)."""
+"""Campuses: street, walkway, plaza, lawn and parking lot before a building that one enters."""
 
 import numpy as np
 
@@ -17,7 +17,7 @@ PER_M2 = {"lawn": 0.02, "plaza": 0.015, "parking lot": 0.025, "walkway": 0.02, "
 
 def campus(rng: np.random.Generator) -> Plan:
     """Four outdoor zones or more, and a building of four to six rooms."""
-    plan = Plan(rng, "university campus", voxel_m=0.1, range_m=30.0, stride_m=1.5)
+    plan = Plan(rng, "university campus", voxel_m=0.1, range_m=30.0, stride_m=1.5, outdoors=True)
     depths = [between(rng, 6, 8), between(rng, 2.4, 3.2), between(rng, 14, 20), between(rng, 13, 16)]
     site = Rect(0, 0, between(rng, 42, 54), round(sum(depths), 1))
     plan.slab(site, 0.0)

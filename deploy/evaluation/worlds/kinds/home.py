@@ -1,4 +1,4 @@
-"""Homes: a flat along a hallway, with an open-plan day zone at times, or rooms around a living room (pure)."""
+"""Homes: a flat along a hallway, with an open-plan day zone at times, or rooms around a living room."""
 
 import itertools
 

@@ -1,4 +1,4 @@
-"""Hospitals: patient rooms and treatment along corridors, nurse stations open to them, reception in front (pure)."""
+"""Hospitals: patient rooms and treatment along corridors, nurse stations open to them, reception in front."""
 
 import numpy as np
 

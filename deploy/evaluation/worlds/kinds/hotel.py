@@ -1,4 +1,4 @@
-"""Hotels: lobby, bar and restaurant open to each other, then guest rooms with bathrooms along a corridor (pure)."""
+"""Hotels: lobby, bar and restaurant open to each other, then guest rooms with bathrooms along a corridor."""
 
 import numpy as np
 

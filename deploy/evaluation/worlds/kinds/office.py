@@ -1,4 +1,4 @@
-"""Offices: one hall of zones without walls, with partitions and a few rooms of glass (pure)."""
+"""Offices: one hall of zones without walls, with partitions and a few rooms of glass."""
 
 import numpy as np
 

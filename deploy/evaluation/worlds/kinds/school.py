@@ -1,4 +1,4 @@
-"""Schools: classrooms along a corridor, a canteen open to the entrance, a library and a high gymnasium (pure)."""
+"""Schools: classrooms along a corridor, a canteen open to the entrance, a library and a high gymnasium."""
 
 import numpy as np
 

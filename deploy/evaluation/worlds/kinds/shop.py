@@ -1,4 +1,4 @@
-"""Shops: one hall divided by its shelves, checkout and entrance in front, storage behind a wall (pure)."""
+"""Shops: one hall divided by its shelves, checkout and entrance in front, storage behind a wall."""
 
 import numpy as np
 

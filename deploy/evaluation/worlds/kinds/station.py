@@ -1,4 +1,4 @@
-"""Stations: platforms between tracks, stairs up from them, and a concourse above with ticket hall and shops (pure)."""
+"""Stations: platforms between tracks, stairs up from them, and a concourse above with ticket hall and shops."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""Towers: two or three storeys of a house of offices or flats, around one staircase (pure)."""
+"""Towers: two or three storeys of a house of offices or flats, around one staircase."""
 
 import numpy as np
 

@@ -18,7 +18,9 @@ def inspect(recording: Recording, reading: Reading, *, thorough: bool = True) ->
     found = [*stream.judge(recording), *pictures.judge(recording)]
     if not recording.shots or any(finding.hopeless for finding in found):
         return found
-    judged = conventions.judge(recording.shots, reading)
+    judged = conventions.judge(recording.shots, reading, recording.depth_unit_m)
+    if judged.blind:
+        return found + judged.findings
     views = [
         replace(shot.view(judged.factor), world_from_camera=pose)
         for shot, pose in zip(recording.shots, judged.poses, strict=True)

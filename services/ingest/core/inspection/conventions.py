@@ -9,8 +9,9 @@ import numpy as np
 
 from prior_sg.services.geometry import inverse, pose_from_quaternion
 from prior_sg.services.ingest.core.agreement import NOTHING, Agreement, DepthView, agreement, grid_points, with_poses
+from prior_sg.services.ingest.core.detection import LIKELY_M
 from prior_sg.services.ingest.core.inspection.findings import Finding, note, ok, problem
-from prior_sg.services.ingest.core.inspection.sample import Shot, pairs_of
+from prior_sg.services.ingest.core.inspection.sample import Shot, has_moved, pairs_of
 from prior_sg.services.ingest.core.poses import FROM_CAMERA as MOTIONS
 
 FORWARD, BACKWARD = "world_from_camera", "camera_from_world"
@@ -28,6 +29,9 @@ RUNNERS_UP = 5  # readings that are tried with other focal lengths when none con
 USUAL_M = (0.3, 40.0)  # median depth of rooms and streets
 FOCAL_FACTORS = (0.5, 0.6, 0.7, 0.8, 0.9, 1.1, 1.2, 1.3, 1.43, 1.6, 1.8, 2.0)
 SMALL_GAIN = 0.1  # of the share by which another focal length must be better
+FLAT = 0.02  # share by which depth may vary in images that show nothing
+POSITION_UNITS_M = {0.001: "millimetres", 0.01: "centimetres"}
+UNMIRROR = "convert them to a right-handed world: mirror one axis of positions and rotations"
 CONVERT = "convert them to x right, y down, z forward"
 
 
@@ -41,6 +45,7 @@ class Reading:
     from_camera: np.ndarray = field(default_factory=lambda: np.eye(3))  # the axes as written, from ours
     world_from_source: np.ndarray = field(default_factory=lambda: np.eye(4))
     fixed: bool = False  # no option reads them otherwise
+    position_scale_m: float = 1.0  # metres per unit of written positions
 
     def written(self, world_from_camera: np.ndarray) -> np.ndarray:
         """The motion as it is written, from the pose this reading made of it."""
@@ -60,22 +65,29 @@ class Judged:
     findings: list[Finding]
     poses: list[np.ndarray]  # world_from_camera of the sample in the best reading
     factor: float = 1.0  # by which depth must be multiplied
+    blind: bool = False  # the depth images show nothing that poses could be judged by
 
 
-def judge(shots: Sequence[Shot], reading: Reading) -> Judged:
-    """Compare how well depth agrees under the poses as read and under other readings, units and focal lengths."""
+def judge(shots: Sequence[Shot], reading: Reading, depth_unit_m: float = 0.0) -> Judged:
+    """Compare how well depth agrees under the poses as read and under other readings, units and focal lengths.
+
+    `depth_unit_m` is the unit of depth in the files, 0 = that of the shots.
+    """
     views, pairs = [shot.view() for shot in shots], pairs_of(shots)
     poses = [view.world_from_camera for view in views]
+    if (blind := blind_finding(views, pairs)) is not None:
+        return Judged([blind], poses, blind=True)
     given = agreement(views, pairs)
     if given.share >= GOOD:
         return Judged([ok("poses", _said(given))], poses)
     if given.pairs < FEW_PAIRS and len(pairs) < FEW_PAIRS:
         return Judged([note("poses", "too few depth images overlap to say whether the poses are right")], poses)
+    unit_m = depth_unit_m or shots[0].depth_scale_m
     readings = ranked_readings(views, pairs, reading)
-    factor, scaled = best_factor(views, pairs, shots[0].depth_scale_m)
     found = agreement(with_poses(views, reread(poses, reading, readings[0])), pairs)
-    if _beats(scaled, given) and _score(scaled) > _score(found):
-        return Judged([_other_unit(shots[0].depth_scale_m, factor, scaled, given)], poses, factor)
+    best = max(_score(found), _score(given))
+    if other := (_in_other_units(views, pairs, reading, unit_m, best) or _mirrored(views, pairs, reading, given, best)):
+        return other
     if _beats(found, given):
         best_poses = reread(poses, reading, readings[0])
         findings = [_other_reading(reading, readings[0], found, given)]
@@ -83,6 +95,67 @@ def judge(shots: Sequence[Shot], reading: Reading) -> Judged:
         return Judged(findings, best_poses)
     together = _reading_and_camera(views, pairs, reading, readings[:RUNNERS_UP])
     return together or Judged([_contradiction(given, views, pairs)], poses)
+
+
+def blind_finding(views: Sequence[DepthView], pairs: Sequence[tuple[int, int]]) -> Finding | None:
+    """Why the depth images cannot tell one pose from another, if they cannot."""
+    moved = [(i, j) for i, j in pairs if has_moved(views[i].world_from_camera, views[j].world_from_camera)]
+    same = sum(np.array_equal(views[i].depth_m, views[j].depth_m) for i, j in moved)
+    if len(moved) >= FEW_PAIRS and 2 * same > len(moved):
+        text = f"{same} of {len(moved)} depth images are the same as the one before, although the camera moves"
+        return problem("depth images", text, "give every frame the depth image that was taken with it")
+    measured = [view.depth_m[view.depth_m > 0] for view in views]
+    if not all(map(len, measured)):
+        return None
+    low, high = np.array([np.percentile(values, (2, 98)) for values in measured]).T
+    if high.max() <= (1 + FLAT) * low.min():
+        text = f"every depth image is {np.median(low):.3g} m all over: it shows no surfaces"
+        return problem("depth images", text, "give measured depth along the optical axis")
+    return None
+
+
+def _in_other_units(
+    views: Sequence[DepthView], pairs: Sequence[tuple[int, int]], reading: Reading, depth_unit_m: float, best: float
+) -> Judged | None:
+    """The unit of positions, or else of depth, with which depth agrees better than with any other reading."""
+    given, poses = agreement(views, pairs), [view.world_from_camera for view in views]
+    if USUAL_M[0] <= median_depth_m(views) <= USUAL_M[1]:  # depth is likely: positions are looked at first
+        for unit_m, name in POSITION_UNITS_M.items():
+            scaled = _moved_less(views, 1 / unit_m)
+            found = agreement(scaled, pairs)
+            if _beats(found, given) and _score(found) > best:
+                text = _contrast(f"the positions look like {name}, not metres", found, given)
+                mend = f"--position-scale {unit_m * reading.position_scale_m:.6g}"
+                return Judged([problem("position unit", text, mend)], [view.world_from_camera for view in scaled])
+    factor, found = best_factor(views, pairs, depth_unit_m)
+    if _beats(found, given) and _score(found) > best:
+        return Judged([_other_unit(depth_unit_m, factor, found, given)], poses, factor)
+    return None
+
+
+def _mirrored(
+    views: Sequence[DepthView],
+    pairs: Sequence[tuple[int, int]],
+    reading: Reading,
+    given: Agreement,
+    best: float,
+) -> Judged | None:
+    """Poses of a left-handed world, when depth agrees better with their mirror image than with any other reading."""
+    few = list(pairs[:: max(1, len(pairs) // SCREENED_PAIRS)])
+    written = [view.world_from_camera for view in views]
+    tried = []
+    for other in _named_readings(reading):
+        for axis in range(3):
+            mirror = np.eye(4)
+            mirror[axis, axis] = -1.0
+            poses = [mirror @ pose @ mirror for pose in reread(written, reading, other)]
+            tried.append((_score(agreement(with_poses(views, poses), few)), poses))
+    poses = max(tried, key=lambda item: item[0])[1]
+    found = agreement(with_poses(views, poses), pairs)
+    if not (_beats(found, given) and _score(found) > best + ALIKE):
+        return None
+    text = _contrast("the poses look mirrored, as those of a left-handed world", found, given)
+    return Judged([problem("poses", text, UNMIRROR)], poses)
 
 
 def _reading_and_camera(
@@ -179,18 +252,23 @@ def best_factor(
     """The factor of depth that makes `scale_m` a usual unit with which depth agrees best, and how well.
 
     Positions are divided instead of depth multiplied, so that the tolerance stays what it is. Units with which no
-    room or street would be seen are left out.
+    room or street would be seen are left out; of units alike, that which makes a room of it is taken.
     """
     few = list(pairs[:: max(1, len(pairs) // SCREENED_PAIRS)])
-    median_m = float(np.median(np.concatenate([grid_points(view)[:, 2] for view in views]) if views else 0.0))
+    median_m = median_depth_m(views)
     factors = [unit_m / scale_m for unit_m in SCALES_M]
     likely = [factor for factor in factors if USUAL_M[0] <= median_m * factor <= USUAL_M[1]]
     scores = {factor: _score(agreement(_moved_less(views, factor), few)) for factor in likely}
     if not scores:
         return 1.0, NOTHING
     near = [factor for factor, score in scores.items() if score >= max(scores.values()) - ALIKE / 3]
-    chosen = min(near, key=lambda factor: abs(np.log(factor)))
+    chosen = min(near, key=lambda factor: abs(np.log(median_m * factor / LIKELY_M)))
     return chosen, agreement(_moved_less(views, chosen), pairs)
+
+
+def median_depth_m(views: Sequence[DepthView]) -> float:
+    """Of all measurements, as they were read."""
+    return float(np.median(np.concatenate([grid_points(view)[:, 2] for view in views]) if views else 0.0))
 
 
 def _moved_less(views: Sequence[DepthView], factor: float) -> list[DepthView]:

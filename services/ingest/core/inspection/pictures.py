@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from prior_sg.services.ingest.core.inspection.conventions import SCALES_M
+from prior_sg.services.ingest.core.detection import likely_unit_m
 from prior_sg.services.ingest.core.inspection.findings import Finding, note, ok, problem
 from prior_sg.services.ingest.core.inspection.sample import SATURATED, Recording, Shot
 
@@ -14,7 +14,6 @@ USUAL_CENTER = 0.1  # share of the image by which the principal point may lie be
 SQUARE = 0.05  # by which fx and fy may differ
 USUAL_MEDIAN_M = (0.2, 60.0)
 ABSURD_MEDIAN_M = (0.01, 300.0)
-LIKELY_MEDIAN_M = 2.5
 REPEATED = 0.03  # share of measured pixels that one value at the far end may have
 FEW_VALID = 0.2
 
@@ -28,7 +27,7 @@ def judge(recording: Recording) -> list[Finding]:
     ]
     if not shots:
         return damaged
-    return [*damaged, *_camera(shots[0]), *_depth(shots)]
+    return [*damaged, *_camera(shots[0]), *_depth(shots, recording.depth_unit_m or shots[0].depth_scale_m)]
 
 
 def _camera(shot: Shot) -> list[Finding]:
@@ -56,7 +55,8 @@ def _camera(shot: Shot) -> list[Finding]:
     return [ok("intrinsics", said)]
 
 
-def _depth(shots: Sequence[Shot]) -> list[Finding]:
+def _depth(shots: Sequence[Shot], unit_m: float) -> list[Finding]:
+    """`unit_m` is that of the numbers in the files, which may be others than the shots'."""
     values = np.concatenate([shot.depth[::4, ::4].ravel() for shot in shots]).astype(np.float64)
     measured = values[values > 0]
     valid = len(measured) / len(values)
@@ -64,25 +64,21 @@ def _depth(shots: Sequence[Shot]) -> list[Finding]:
         return [problem("depth", "no pixel of the sample has a measurement", "give depth images", hopeless=True)]
     scale_m = shots[0].depth_scale_m
     if not math.isfinite(scale_m):
-        better_m = _likely_scale_m(float(np.median(measured)))
+        better_m = likely_unit_m(float(np.median(measured)))
         text = f"a unit of depth of {scale_m} m is none"
         return [problem("depth", text, f"--depth-scale {better_m:.6g}", hopeless=True)]
     low, median, high = np.percentile(measured, (1, 50, 99)) * scale_m
     said = f"{low:.4g} to {high:.4g} m, median {median:.4g} m, in {valid:.0%} of the pixels"
     if not USUAL_MEDIAN_M[0] <= median <= USUAL_MEDIAN_M[1]:
-        better_m = _likely_scale_m(float(np.median(measured)))
+        better_m = likely_unit_m(median / unit_m)
         hopeless = not ABSURD_MEDIAN_M[0] <= median <= ABSURD_MEDIAN_M[1]
-        text = f"the median depth is {median:.4g} m with {scale_m:.4g} m per unit"
+        text = f"the median depth is {median:.4g} m with {unit_m:.4g} m per unit"
         return [problem("depth", text, f"--depth-scale {better_m:.6g}", hopeless=hopeless)]
     found = [note("depth", said) if valid < FEW_VALID else ok("depth", said)]
-    return found + _repeated(measured, scale_m)
+    return found + _repeated(measured, scale_m, unit_m)
 
 
-def _likely_scale_m(median_units: float) -> float:
-    return min(SCALES_M, key=lambda scale_m: abs(math.log(median_units * scale_m / LIKELY_MEDIAN_M)))
-
-
-def _repeated(measured: np.ndarray, scale_m: float) -> list[Finding]:
+def _repeated(measured: np.ndarray, scale_m: float, unit_m: float) -> list[Finding]:
     """One value at the far end that many pixels have: a limit, or a sign for "nothing measured"."""
     largest = measured.max()
     share = float((measured == largest).mean())
@@ -91,6 +87,7 @@ def _repeated(measured: np.ndarray, scale_m: float) -> list[Finding]:
         verdict = problem if share > REPEATED else note
         return [verdict("invalid depth", text, f"--depth-invalid {SATURATED}")]
     if share > REPEATED:
-        text = f"{share:.1%} of measured pixels have the largest value {largest:.0f} ({largest * scale_m:.1f} m)"
-        return [note("invalid depth", text, f"--depth-invalid {largest:.0f} if it means that nothing was measured")]
+        value = f"{largest * scale_m / unit_m:.6g}"
+        text = f"{share:.1%} of measured pixels have the largest value {value} ({largest * scale_m:.1f} m)"
+        return [note("invalid depth", text, f"--depth-invalid {value} if it means that nothing was measured")]
     return []

@@ -39,6 +39,7 @@ class Recording:
     """What is known of all frames read so far."""
 
     total: int  # frames in the source, 0 = unknown
+    depth_unit_m: float = 0.0  # metres per unit of depth as the files hold it; 0 = as the shots say
     read: int = 0
     frame_ids: list[int] = field(default_factory=list)  # of readable frames, as the next two
     stamps_ns: list[int] = field(default_factory=list)
@@ -48,6 +49,12 @@ class Recording:
     keyframes: int = 0
     shots: list[Shot] = field(default_factory=list)
     damaged: Counter[str] = field(default_factory=Counter)  # images of the sample that could not be decoded, by reason
+
+
+def has_moved(one: np.ndarray, other: np.ndarray) -> bool:
+    """Whether a camera at two poses has moved or turned enough to tell conventions apart."""
+    moved = inverse(one) @ other
+    return bool(np.linalg.norm(moved[:3, 3]) >= MOVED_M or rotation_angle_rad(moved) >= MOVED_RAD)
 
 
 class Picker:
@@ -61,9 +68,7 @@ class Picker:
     def wants(self, index: int, world_from_camera: np.ndarray) -> bool:
         """Whether the frame belongs to the sample; frames come in their order."""
         if self._first is not None:
-            moved = inverse(self._first[1]) @ world_from_camera
-            enough = np.linalg.norm(moved[:3, 3]) >= MOVED_M or rotation_angle_rad(moved) >= MOVED_RAD
-            if not (enough or index - self._first[0] >= REACH):
+            if not (has_moved(self._first[1], world_from_camera) or index - self._first[0] >= REACH):
                 return False
             again = index >= self._begun * self._spacing  # the second of this pair is the first of the next
             self._first = (index, world_from_camera) if again else None

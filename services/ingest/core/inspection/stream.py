@@ -104,7 +104,7 @@ def _motion(recording: Recording) -> list[Finding]:
     if steps_m.sum() < 1e-3 and turns_deg.sum() < 0.1:
         return [note("motion", "the camera rests throughout", "check that every frame has a pose of its own")]
     if _median(speeds) > FAST_M_S:
-        mend = "--rate HZ if the stamps are wrong; convert positions to metres if they are in another unit"
+        mend = "--rate HZ if the stamps are wrong; --position-scale METRES if positions are in another unit"
         return [problem("motion", f"{said} is faster than a camera moves", mend)]
     jumps = int((speeds > FAST_M_S).sum())
     if jumps:

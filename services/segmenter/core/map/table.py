@@ -12,10 +12,12 @@ UNLABELLED = -1
 _FILLS: dict[str, tuple[float | bool, str]] = {  # what a new place gets, and the column's type
     "slots": (-1, "int64"),
     "labels": (UNLABELLED, "int64"),
+    "cut_labels": (UNLABELLED, "int64"),
     "regions": (NO_REGION, "int64"),
     "solved": (-1, "int64"),
     "own_similarity": (0.0, "float64"),
     "similarity": (0.0, "float64"),
+    "correction": (0.0, "float64"),
     "unary": (0.0, "float64"),
     "posteriors": (0.0, "float32"),
     "sight": (0.0, "float64"),
@@ -29,7 +31,7 @@ _FILLS: dict[str, tuple[float | bool, str]] = {  # what a new place gets, and th
     "unsettled": (True, "bool"),
     "unbelieved": (True, "bool"),
 }
-_PER_LABEL = ("own_similarity", "similarity", "unary", "posteriors")
+_PER_LABEL = ("own_similarity", "similarity", "correction", "unary", "posteriors")
 _AFTER_A_SWITCH = ("stale", "unshared", "doubtful", "unsettled", "unbelieved")
 
 
@@ -39,10 +41,12 @@ class Places:
 
     slots: np.ndarray  # of the evidence
     labels: np.ndarray  # UNLABELLED = not yet
+    cut_labels: np.ndarray  # those of the graph cuts, before regions that do not pay for themselves are given away
     regions: np.ndarray
     solved: np.ndarray  # row in the field that the solver has seen last, -1 = new to it
     own_similarity: np.ndarray  # (place, label) standardised
-    similarity: np.ndarray  # (place, label) its average over the surroundings
+    similarity: np.ndarray  # (place, label) its average over the neighbours
+    correction: np.ndarray  # (place, label) to be added: what all crops together say, as of the last look over the map
     unary: np.ndarray  # (place, label)
     posteriors: np.ndarray  # (place, label)
     sight: np.ndarray  # confidence of the visual expert
@@ -55,6 +59,11 @@ class Places:
     doubtful: np.ndarray  # what an expert looks at changed: ask the experts again
     unsettled: np.ndarray  # costs changed: look for a better label
     unbelieved: np.ndarray  # costs or a neighbour's label changed: find the posterior again
+
+    @property
+    def looks(self) -> np.ndarray:
+        """(place, label) How much each place looks like each label, all considered."""
+        return self.similarity + self.correction
 
     @classmethod
     def none(cls) -> "Places":
@@ -76,7 +85,7 @@ class Places:
         rows, columns = len(self.labels), {name: getattr(self, name) for name in _FILLS}
         columns |= {name: np.zeros((rows, count), _FILLS[name][1]) for name in _PER_LABEL}
         columns |= {name: np.ones(rows, dtype=bool) for name in _AFTER_A_SWITCH}
-        return Places(**(columns | {"labels": np.full(rows, UNLABELLED)}))
+        return Places(**(columns | {name: np.full(rows, UNLABELLED) for name in ("labels", "cut_labels")}))
 
 
 def _realigned(column: np.ndarray, previous: np.ndarray, old: np.ndarray, fill: float | bool) -> np.ndarray:

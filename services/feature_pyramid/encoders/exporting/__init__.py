@@ -1,0 +1,1 @@
+"""Published models with an image and a text tower, written as the folder that `onnx:FOLDER` reads."""

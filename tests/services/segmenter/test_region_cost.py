@@ -1,0 +1,70 @@
+"""Regions that must pay for themselves, against brute force on random fields."""
+
+import numpy as np
+import pytest
+
+from prior_sg.services.segmenter.core.energy.mrf import Field, energy
+from prior_sg.services.segmenter.core.energy.region_cost import consolidated
+from prior_sg.services.segmenter.core.energy.solver import minimise
+from prior_sg.services.segmenter.core.regions.components import numbered
+
+POTTS = 1.0 - np.eye(3)
+
+
+def chain(unary: np.ndarray) -> Field:
+    count = len(unary)
+    edges = np.column_stack((np.arange(count - 1), np.arange(1, count)))
+    return Field(unary.astype(float), edges, np.ones(count - 1), POTTS)
+
+
+def random_field(seed: int) -> Field:
+    rng = np.random.default_rng(seed)
+    count = int(rng.integers(8, 40))
+    tree = [(int(rng.integers(0, place)), place) for place in range(1, count)]
+    more = [tuple(sorted(rng.choice(count, 2, replace=False).tolist())) for _ in range(count)]
+    edges = np.array(sorted(set(tree + more)), np.int64)
+    pairwise = rng.uniform(0.2, 2.0, (4, 4))
+    pairwise = (pairwise + pairwise.T) / 2
+    np.fill_diagonal(pairwise, 0.0)
+    return Field(rng.uniform(0, 3, (count, 4)), edges, rng.uniform(0.1, 1.0, len(edges)), pairwise)
+
+
+def regions(field: Field, labels: np.ndarray) -> int:
+    return int(numbered(labels, field.edges).max()) + 1
+
+
+def test_a_place_that_gains_little_joins_its_neighbours_and_one_that_gains_more_stays():
+    """Five places in a row; the middle one is cheaper under label 1 by 5, less two borders of 1: it gains 3."""
+    unary = np.zeros((5, 3))
+    unary[:, 1:] = 9.0
+    unary[2] = (5.0, 0.0, 9.0)
+    labels = np.array([0, 0, 1, 0, 0])
+    assert consolidated(chain(unary), labels, 2.9).tolist() == labels.tolist()
+    assert consolidated(chain(unary), labels, 3.1).tolist() == [0] * 5
+    assert labels.tolist() == [0, 0, 1, 0, 0]  # left as they were
+
+
+def test_without_cost_or_neighbours_nothing_changes():
+    field = random_field(0)
+    labels = minimise(field, field.unary.argmin(axis=1))
+    np.testing.assert_array_equal(consolidated(field, labels, 0.0), labels)
+    alone = Field(np.ones((2, 3)), np.zeros((0, 2), np.int64), np.zeros(0), POTTS)
+    assert consolidated(alone, np.array([0, 2]), 100.0).tolist() == [0, 2]
+
+
+@pytest.mark.parametrize("cost", [0.5, 2.0, 8.0])
+@pytest.mark.parametrize("seed", range(40))
+def test_each_region_that_is_left_pays_and_those_given_away_did_not(seed, cost):
+    field = random_field(seed)
+    before = minimise(field, field.unary.argmin(axis=1))
+    after = consolidated(field, before, cost)
+    gone = regions(field, before) - regions(field, after)
+    assert gone >= 0
+    assert energy(field, after) <= energy(field, before) + cost * gone + 1e-9
+    region_of = numbered(after, field.edges)
+    for region in range(regions(field, after)):
+        inside = region_of == region
+        crossing = inside[field.edges[:, 0]] != inside[field.edges[:, 1]]
+        for label in set(after[field.edges[crossing].reshape(-1)].tolist()) - set(after[inside].tolist()):
+            otherwise = np.where(inside, label, after)
+            assert energy(field, otherwise) - energy(field, after) >= cost - 1e-9
