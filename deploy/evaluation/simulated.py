@@ -37,7 +37,7 @@ COMMON = 0.3  # cosine of the looks of any two names, as pictures of places rese
 NUDGE_M = 0.1
 CELL_M = 1.0
 BACKGROUND = 1000  # looks over which similarities are read
-READING = {  # temperature and null score; of `sim` those of `conse`, of `simlike` chosen on development crops as those are
+READING = {  # temperature and null score: those of `conse`; and chosen on development crops as those were
     "sim": (0.52, 3.2),
     "simlike": (0.55, 1.4),
 }

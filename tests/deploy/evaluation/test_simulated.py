@@ -11,7 +11,8 @@ from prior_sg.deploy.evaluation import simulated
 from prior_sg.deploy.evaluation.datasets import WorldName, named_worlds, of_sequence, world_source
 from prior_sg.deploy.evaluation.errors import EvaluationError
 from prior_sg.deploy.evaluation.perception import simulated_perception
-from prior_sg.deploy.evaluation.simulated import SimulatedEncoder, look_of, simulated as encoder_of
+from prior_sg.deploy.evaluation.simulated import SimulatedEncoder, look_of
+from prior_sg.deploy.evaluation.simulated import simulated as encoder_of
 from prior_sg.deploy.truth import GroundTruth, TrueObject
 from prior_sg.schemas.features import Pyramid
 from prior_sg.schemas.frames import Intrinsics
@@ -117,7 +118,9 @@ def test_what_an_encoder_says_is_settled_by_its_seed():
         first, again, other = (encoder_of(choice, seed).encode(layout(cells=3), truth()) for seed in (0, 0, 1))
         np.testing.assert_array_equal(first.embeddings, again.embeddings)
         assert not np.array_equal(first.embeddings, other.embeddings)
-    assert look_of("kitchen")[:2].tolist() == pytest.approx([-0.0946045, 0.1082202], abs=1e-6)  # also in another process
+    assert look_of("kitchen")[:2].tolist() == pytest.approx(
+        [-0.0946045, 0.1082202], abs=1e-6
+    )  # also in another process
 
 
 def test_crops_without_measured_surface_are_left_out():
