@@ -152,5 +152,5 @@ def test_what_ahead_would_ignore_is_refused(extra, capsys):
 def test_the_table_names_the_dataset():
     found = score([stop(0, [8], [False])], given(1))
     console = Console(record=True, width=120)
-    command.print_ahead({"somewhere": dict.fromkeys(NEARNESS, {"ours": found})}, console)
+    command.print_ahead({"somewhere": {key: {"ours": found} for key in NEARNESS}}, console)
     assert "somewhere" in console.export_text()
