@@ -24,7 +24,7 @@ from prior_sg.schemas.features import Pyramid, TextEmbeddings, TextRequest
 from prior_sg.schemas.frames import Keyframe
 from prior_sg.schemas.objects import Detections
 from prior_sg.schemas.places import MapRequest, PlaceDelta, SnapshotRequest, VoxelMap
-from prior_sg.schemas.topics import DETECTIONS, KEYFRAME, PLACE_SNAPSHOT, PYRAMID, TEXT, VOXEL_MAP
+from prior_sg.schemas.topics import DETECTIONS, KEYFRAME, PLACE_DELTA, PLACE_SNAPSHOT, PYRAMID, TEXT, VOXEL_MAP
 from prior_sg.services.feature_pyramid.core.crops import smallest_crop_px
 from prior_sg.services.feature_pyramid.detectors.load import is_prompted, load_detector
 from prior_sg.services.feature_pyramid.worker import Worker
@@ -136,6 +136,11 @@ class Perceiver:
         mapped.seconds["features"] = mapped.seconds.pop("layout")
         return replace(mapped, pyramids=tuple(decode(Pyramid, pyramid) for pyramid in made))
 
+    def deltas(self, dataset: Dataset) -> list[PlaceDelta]:
+        """The changes of the place graph, one for each keyframe."""
+        kept = self._kept("deltas", dataset, None, lambda: self._deltas(dataset), {})
+        return [decode(PlaceDelta, delta) for delta in kept]
+
     def _mapped(self, dataset: Dataset, cfg: Any) -> Perception:
         """Places and voxels, without any crops."""
         seconds: dict[str, float] = {}
@@ -183,6 +188,11 @@ class Perceiver:
             runner.feed(keyframe)
         requests = ((PLACE_SNAPSHOT, SnapshotRequest(robot=ROBOT)), (VOXEL_MAP, MapRequest(robot=ROBOT)))
         return [encode(runner.answer(query, request)) for query, request in requests]
+
+    def _deltas(self, dataset: Dataset) -> list[bytes]:
+        runner = self._runner("place_graph", self._config("place_graph"))
+        published = (output for keyframe in self._keyframes(dataset, "deltas") for output in runner.feed(keyframe))
+        return [encode(message) for topic, message in published if topic is PLACE_DELTA]
 
     def _layouts(self, dataset: Dataset, cfg: Any) -> list[bytes]:
         """The pyramid of each keyframe, its crops chosen and not encoded."""
