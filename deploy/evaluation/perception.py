@@ -160,7 +160,7 @@ class Perceiver:
     ) -> list[bytes]:
         made_by: dict[str, Any] = {"ingest": (self._config("ingest"), self._code["ingest"])}
         if features is None:
-            made_by["place_graph"] = (self._config("place_graph"), self._code["place_graph"])
+            made_by["place_graph"] = (self.mapping(dataset), self._code["place_graph"])
         else:
             made_by["feature_pyramid"] = (features, self._code["feature_pyramid"], "pyramids and detections")
         key = {"source": dataset_digest(dataset), "made_by": made_by}
@@ -173,12 +173,17 @@ class Perceiver:
             self.cache.put(f"{dataset.name}-{kind}", key, content)
         return content
 
+    def mapping(self, dataset: Dataset) -> Any:
+        """Settings of the place graph, with the preset that suits a world unless they name one."""
+        chosen = "preset" in self.layers.get("place_graph", {})
+        return self._config("place_graph", {"preset": "outdoor"} if dataset.outdoors and not chosen else None)
+
     def _config(self, name: str, changes: Mapping[str, Any] | None = None) -> Any:
         layers = {name: {**self.layers.get(name, {}), **(changes or {})}}
         return resolve(BY_NAME[name].config, name, layers)
 
     def _places(self, dataset: Dataset) -> list[bytes]:
-        runner = self._runner("place_graph", self._config("place_graph"))
+        runner = self._runner("place_graph", self.mapping(dataset))
         for keyframe in self._keyframes(dataset, "places"):
             runner.feed(keyframe)
         requests = ((PLACE_SNAPSHOT, SnapshotRequest(robot=ROBOT)), (VOXEL_MAP, MapRequest(robot=ROBOT)))
