@@ -1,4 +1,4 @@
-"""Settings are chosen on some scores and judged on those left out (pure)."""
+"""Settings are chosen on some scores and judged on those left out."""
 
 import math
 from collections import Counter
