@@ -4,7 +4,7 @@ import argparse
 import math
 import multiprocessing
 import os
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
 from pathlib import Path
@@ -20,6 +20,7 @@ from prior_sg.deploy.settings import DEMO_TASK, Layers, settings_layers
 from prior_sg.deploy.terminal import Description, Terminal
 
 if TYPE_CHECKING:
+    from prior_sg.deploy.evaluation.ahead import Ahead
     from prior_sg.deploy.evaluation.datasets import Dataset
     from prior_sg.deploy.evaluation.methods import Method
     from prior_sg.deploy.evaluation.perception import Perceiver, Report
@@ -78,6 +79,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--oracle", default="", help=f"ours with a part made perfect: {', '.join(ORACLES)}")
     parser.add_argument("--sweep", default="", help=f"ours over values of a setting: {', '.join(SWEEPS)}")
     parser.add_argument(
+        "--ahead",
+        action="store_true",
+        help="instead, how right labels are before their places are near, by distance, with and without a pyramid; "
+        "writes ahead.json, one dataset after the other, such as: prior-sg eval world:station:0 --encoder sim:0.3 "
+        "--ahead",
+    )
+    parser.add_argument(
         "--priors",
         type=int,
         default=1,
@@ -101,11 +109,17 @@ def run(arguments: argparse.Namespace, console: Terminal) -> int:
         raise EvaluationError("--priors must be at least 1 and --strength at least 0")
     if arguments.jobs < 0:
         raise EvaluationError("--jobs must be at least 1, or 0 for the number of cores")
+    if arguments.ahead and (arguments.methods != OURS or arguments.ablate or arguments.oracle or arguments.sweep):
+        raise EvaluationError("--ahead brings its own methods: leave out --methods, --ablate, --oracle and --sweep")
+    if arguments.ahead and (arguments.priors > 1 or arguments.jobs > 1):
+        raise EvaluationError("--ahead takes one prior and one dataset at a time: leave out --priors and --jobs")
     layers = chosen_layers(arguments)
     methods = chosen_methods(arguments, layers)
     datasets = chosen_datasets(arguments.datasets, arguments.environment, arguments.task)
     check_encoder(arguments.encoder, datasets, arguments.sweep)
     arguments.out.mkdir(parents=True, exist_ok=True)
+    if arguments.ahead:
+        return judge_ahead(arguments, layers, datasets, console)
     jobs = min(arguments.jobs or os.cpu_count() or 1, len(datasets))
     with progress(Terminal(stderr=True)) as report:
         if jobs > 1:
@@ -125,6 +139,63 @@ def run(arguments: argparse.Namespace, console: Terminal) -> int:
         _write_page(results, arguments)
         Terminal(stderr=True).print(f"written to {arguments.out}: eval.json, report.html")
     return 0
+
+
+def judge_ahead(arguments: argparse.Namespace, layers: Layers, datasets: "Sequence[Dataset]", console: Terminal) -> int:
+    """Judge labels before their places are near; print, write ahead.json (and ahead.html). Raises EvaluationError."""
+    from prior_sg.deploy.evaluation.ahead import joined
+    from prior_sg.deploy.evaluation.ahead_page import page
+    from prior_sg.deploy.evaluation.ahead_walks import judged
+    from prior_sg.deploy.evaluation.methods import Case
+    from prior_sg.services.registry import BY_NAME
+    from prior_sg.services.runtime.config import resolve
+
+    config: Any = resolve(BY_NAME["segmenter"].config, "segmenter", layers)
+    found: dict[str, dict[str, dict[str, Ahead]]] = {}
+    with progress(Terminal(stderr=True)) as report:
+        perceiver = perceiver_of(arguments, layers, report)
+        for dataset in datasets:
+            sought = tuple(item.name for item in dataset.prior.objects)
+            case = Case(perceiver.perceive(dataset, None, sought), dataset.prior, dataset.truth, dataset.objects)
+            deltas = perceiver.deltas(dataset)
+            report(f"{dataset.name}: ahead", 0, 0)
+            found[dataset.name] = judged(case, deltas, config)
+    if len(found) > 1:
+        parts = list(found.values())
+        found["all datasets"] = {
+            nearness: {method: joined(part[nearness][method] for part in parts) for method in rows}
+            for nearness, rows in parts[0].items()
+        }
+    tables = {
+        name: {near: {method: one.table() for method, one in rows.items()} for near, rows in kinds.items()}
+        for name, kinds in found.items()
+    }
+    (arguments.out / "ahead.json").write_text(json_text(tables))
+    if arguments.json:
+        print(json_text(tables, None))
+    else:
+        print_ahead(found, console)
+    if arguments.html:
+        (arguments.out / "ahead.html").write_text(page(found))
+        Terminal(stderr=True).print(f"written to {arguments.out}: ahead.json, ahead.html")
+    return 0
+
+
+def print_ahead(found: "Mapping[str, Mapping[str, Mapping[str, Ahead]]]", console: Terminal) -> None:
+    """Two tables per dataset, and over all, for when a place counts as near."""
+    from prior_sg.deploy.evaluation.ahead import NEARNESS
+    from prior_sg.deploy.evaluation.ahead_page import HEADINGS, cells
+
+    console.width = max(console.width, TABLE_COLUMNS)
+    for name, nearness in ((name, nearness) for name in found for nearness in NEARNESS):
+        title = f"{name}: percent right ahead (places), {NEARNESS[nearness]}"
+        table = Table(title=title, box=SIMPLE, padding=(0, 1, 0, 0))
+        table.add_column("method", no_wrap=True)
+        for heading in HEADINGS:
+            table.add_column(heading, justify="right", no_wrap=True)
+        for method, one in found[name][nearness].items():
+            table.add_row(method, *cells(one))
+        console.print(table)
 
 
 def chosen_layers(arguments: argparse.Namespace) -> Layers:

@@ -37,6 +37,7 @@ class Dataset:
     prior: Prior  # the library's
     objects: tuple[TrueObject, ...] = ()  # of the ground truth, where it names them
     world: WorldName | None = None
+    outdoors: bool = False  # a world that is to be mapped with the place graph's outdoor preset
 
     @property
     def kind(self) -> str:
@@ -88,7 +89,7 @@ def of_world(name: WorldName, task: str) -> Dataset:
     except ValueError as error:
         raise EvaluationError(str(error)) from error
     prior = _prior(world.environment, task, world.truth)
-    return Dataset(world.name, Path(world.name), world.truth, prior, tuple(world.objects), name)
+    return Dataset(world.name, Path(world.name), world.truth, prior, tuple(world.objects), name, world.outdoors)
 
 
 def named_worlds(text: str) -> list[WorldName]:

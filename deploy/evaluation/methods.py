@@ -115,9 +115,6 @@ def ablations(config: Config) -> list[Method]:
     def bare(case: Case) -> Prior:
         return priors.with_one_phrase(case.prior)
 
-    def large(case: Case) -> list[Pyramid]:
-        return [oracles.top_layer(pyramid) for pyramid in case.perception.pyramids]
-
     def but(part: str, **changes: Any) -> Variant:
         """Ours with a part's settings changed."""
         changed = msgspec.structs.replace(getattr(config, part), **changes)
@@ -140,7 +137,7 @@ def ablations(config: Config) -> list[Method]:
         "no scale trust": (unscaled, "crops of any scale count alike"),
         "no occlusion test": (but("kernel", occlusion_tolerance_m=NEVER_M), "hidden places count as seen"),
         "global feature": (
-            replace(unscaled, pyramids=large),
+            without_pyramid(config)["global feature"],
             "only the pyramid's largest crops, which show nearly the whole image",
         ),
         "one phrase": (Variant(config, prior=bare), "each region is described by its name alone"),
@@ -148,6 +145,17 @@ def ablations(config: Config) -> list[Method]:
     }
     rows = [Method(name, variant.run, about, "ablation") for name, (variant, about) in parts.items()]
     return expert_rows(config) + rows
+
+
+def without_pyramid(config: Config) -> dict[str, Variant]:
+    """Ours with nothing but each pyramid's largest crops: at any distance alike, and with scale trust as configured."""
+
+    def large(case: Case) -> list[Pyramid]:
+        return [oracles.top_layer(pyramid) for pyramid in case.perception.pyramids]
+
+    kernel = msgspec.structs.replace(config.kernel, gamma=ANY_SCALE)
+    unscaled = msgspec.structs.replace(config, kernel=kernel)
+    return {"global feature": Variant(unscaled, pyramids=large), "no pyramid": Variant(config, pyramids=large)}
 
 
 def expert_rows(config: Config) -> list[Method]:

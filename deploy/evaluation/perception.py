@@ -24,7 +24,7 @@ from prior_sg.schemas.features import Pyramid, TextEmbeddings, TextRequest
 from prior_sg.schemas.frames import Keyframe
 from prior_sg.schemas.objects import Detections
 from prior_sg.schemas.places import MapRequest, PlaceDelta, SnapshotRequest, VoxelMap
-from prior_sg.schemas.topics import DETECTIONS, KEYFRAME, PLACE_SNAPSHOT, PYRAMID, TEXT, VOXEL_MAP
+from prior_sg.schemas.topics import DETECTIONS, KEYFRAME, PLACE_DELTA, PLACE_SNAPSHOT, PYRAMID, TEXT, VOXEL_MAP
 from prior_sg.services.feature_pyramid.core.crops import smallest_crop_px
 from prior_sg.services.feature_pyramid.detectors.load import is_prompted, load_detector
 from prior_sg.services.feature_pyramid.worker import Worker
@@ -136,6 +136,11 @@ class Perceiver:
         mapped.seconds["features"] = mapped.seconds.pop("layout")
         return replace(mapped, pyramids=tuple(decode(Pyramid, pyramid) for pyramid in made))
 
+    def deltas(self, dataset: Dataset) -> list[PlaceDelta]:
+        """The changes of the place graph, one for each keyframe."""
+        kept = self._kept("deltas", dataset, None, lambda: self._deltas(dataset), {})
+        return [decode(PlaceDelta, delta) for delta in kept]
+
     def _mapped(self, dataset: Dataset, cfg: Any) -> Perception:
         """Places and voxels, without any crops."""
         seconds: dict[str, float] = {}
@@ -155,7 +160,7 @@ class Perceiver:
     ) -> list[bytes]:
         made_by: dict[str, Any] = {"ingest": (self._config("ingest"), self._code["ingest"])}
         if features is None:
-            made_by["place_graph"] = (self._config("place_graph"), self._code["place_graph"])
+            made_by["place_graph"] = (self.mapping(dataset), self._code["place_graph"])
         else:
             made_by["feature_pyramid"] = (features, self._code["feature_pyramid"], "pyramids and detections")
         key = {"source": dataset_digest(dataset), "made_by": made_by}
@@ -168,16 +173,26 @@ class Perceiver:
             self.cache.put(f"{dataset.name}-{kind}", key, content)
         return content
 
+    def mapping(self, dataset: Dataset) -> Any:
+        """Settings of the place graph, with the preset that suits a world unless they name one."""
+        chosen = "preset" in self.layers.get("place_graph", {})
+        return self._config("place_graph", {"preset": "outdoor"} if dataset.outdoors and not chosen else None)
+
     def _config(self, name: str, changes: Mapping[str, Any] | None = None) -> Any:
         layers = {name: {**self.layers.get(name, {}), **(changes or {})}}
         return resolve(BY_NAME[name].config, name, layers)
 
     def _places(self, dataset: Dataset) -> list[bytes]:
-        runner = self._runner("place_graph", self._config("place_graph"))
+        runner = self._runner("place_graph", self.mapping(dataset))
         for keyframe in self._keyframes(dataset, "places"):
             runner.feed(keyframe)
         requests = ((PLACE_SNAPSHOT, SnapshotRequest(robot=ROBOT)), (VOXEL_MAP, MapRequest(robot=ROBOT)))
         return [encode(runner.answer(query, request)) for query, request in requests]
+
+    def _deltas(self, dataset: Dataset) -> list[bytes]:
+        runner = self._runner("place_graph", self._config("place_graph"))
+        published = (output for keyframe in self._keyframes(dataset, "deltas") for output in runner.feed(keyframe))
+        return [encode(message) for topic, message in published if topic is PLACE_DELTA]
 
     def _layouts(self, dataset: Dataset, cfg: Any) -> list[bytes]:
         """The pyramid of each keyframe, its crops chosen and not encoded."""

@@ -10,9 +10,10 @@ region's label with probability 1 - P, else another label of the sequence, which
 
 `simlike:P`: errors that persist, as those of encoders trained on pictures. Each region as a whole leans towards one
 other label and looks the more like it the more it leans; a share P of the regions looks more like the other label than
-like its own. The other label is likely to have a similar name, or to be one that this encoder sees everywhere. Every
-frame adds noise that its crops share, small crops add more of their own than large ones, and surface of a true object
-looks half like that object.
+like its own. The other label is likely to have a similar name, or to be one that this encoder sees everywhere. Beyond
+that all crops are tinted alike, by the labels that this encoder favours; every frame adds noise that its crops share,
+small crops add more of their own than large ones, and surface of a true object looks half like that object. Tint and
+noise stand to what tells regions apart as in `conse` on the development sequences, which is most like `simlike:0.4`.
 
 Surface in no region wears, cube by cube, looks that mean nothing.
 """
@@ -36,12 +37,17 @@ COMMON = 0.3  # cosine of the looks of any two names, as pictures of places rese
 NUDGE_M = 0.1
 CELL_M = 1.0
 BACKGROUND = 1000  # looks over which similarities are read
-TEMPERATURE, NULL_SCORE = 0.52, 3.2
+READING = {  # temperature and null score: those of `conse`; and chosen on development crops as those were
+    "sim": (0.52, 3.2),
+    "simlike": (0.55, 1.4),
+}
 
 ARTICLES = ("a ", "an ")
 ALIKE = 3.0  # of `simlike`: how much likelier a label is to be taken for one whose name shares its letters
 FAVOUR = 1.0  # standard deviation, in the same unit, of how readily the encoder sees a label anywhere
-FRAME_NOISE = 0.4  # length of the noise that the crops of a frame share
+TINT = 0.22  # of the labels that it favours, in every crop
+FRAME_NOISE = 2.5  # length of the noise that the crops of a frame share
+CROP_NOISE = 1.5  # length of the noise of a crop as high as the image; of half that, sqrt(2) times
 OBJECT_SHARE = 0.5  # of an object's own look in the look of its surface
 
 
@@ -61,14 +67,16 @@ class SimulatedEncoder:
     def text(self, concepts: Sequence[Sequence[str]]) -> TextEmbeddings:
         """Each concept by the name that its first phrase says, less the article."""
         embeddings = np.array([look_of(name_in(phrases[0])) for phrases in concepts]).reshape(-1, DIM)
-        similarity = background() @ embeddings.T
+        noise = np.hypot(FRAME_NOISE, CROP_NOISE) if self.kind == "simlike" else 0.0
+        similarity = background(float(noise)) @ embeddings.T
+        temperature, null_score = READING[self.kind]
         return TextEmbeddings(
             space=self.space,
             embeddings=embeddings.astype(np.float32),
             background_mean=similarity.mean(axis=0).astype(np.float32),
             background_std=similarity.std(axis=0).astype(np.float32),
-            temperature=TEMPERATURE,
-            null_score=NULL_SCORE,
+            temperature=temperature,
+            null_score=null_score,
         )
 
     def encode(self, layout: Pyramid, truth: GroundTruth, objects: Sequence[TrueObject] = ()) -> Pyramid:
@@ -84,7 +92,9 @@ class SimulatedEncoder:
         counts = covered @ np.eye(len(looks), dtype=np.float32)[surface]
         kept = counts.any(axis=1)
         shown = (counts[kept] / counts[kept].sum(axis=1, keepdims=True)) @ looks
-        noisy = shown + self._noise(layout, kept)
+        noisy = shown + self._noise(layout)[kept]
+        if self.kind == "simlike":
+            noisy += self.tint(list(dict.fromkeys(region.label for region in truth.regions)))
         return self._with(layout, kept, noisy / np.linalg.norm(noisy, axis=1, keepdims=True))
 
     def _with(self, layout: Pyramid, kept: np.ndarray, embeddings: np.ndarray) -> Pyramid:
@@ -148,23 +158,30 @@ class SimulatedEncoder:
             return look_of(label)
         rng = _rng(f"region {self.seed} {region} {label}")
         others = [other for other in labels if other != label]
-        readiness = [ALIKE * likeness(label, o) + FAVOUR * _rng(f"favour {self.seed} {o}").normal() for o in others]
+        readiness = [ALIKE * likeness(label, other) + FAVOUR * self._favour(other) for other in others]
         chances = np.exp(np.array(readiness) - max(readiness))
         other = others[rng.choice(len(others), p=chances / chances.sum())]
         lean = leaning(rng.random(), self.errors)
         return _unit((1 - lean) * look_of(label) + lean * look_of(other))
 
-    def _noise(self, layout: Pyramid, kept: np.ndarray) -> np.ndarray:
-        """Noise (crop, DIM) of the kept crops."""
+    def tint(self, labels: Sequence[str]) -> np.ndarray:
+        """What an encoder adds to all it sees (DIM,): labels above and below their mean, as it favours them."""
+        favours = np.array([self._favour(label) for label in labels])
+        looks = np.array([look_of(label) for label in labels]).reshape(-1, DIM)
+        return TINT * ((favours - favours.mean()) @ looks if len(labels) else np.zeros(DIM))
+
+    def _favour(self, label: str) -> float:
+        return float(_rng(f"favour {self.seed} {label}").standard_normal())
+
+    def _noise(self, layout: Pyramid) -> np.ndarray:
+        """Noise (crop, DIM)."""
         rng = np.random.default_rng([self.seed, layout.frame_id])
-        length = np.full((len(kept), 1), NOISE)
-        noise = rng.standard_normal((len(kept), DIM)) / np.sqrt(DIM)
-        if self.kind == "simlike":
-            shorter_px = min(layout.intrinsics.width_px, layout.intrinsics.height_px)
-            length *= np.sqrt(shorter_px / (2 * layout.sigmas_px[:, None]))
-            shared = FRAME_NOISE * rng.standard_normal(DIM) / np.sqrt(DIM)
-            return ((length * noise) + shared)[kept]
-        return (length * noise)[kept]
+        noise = rng.standard_normal((len(layout.layers), DIM)) / np.sqrt(DIM)
+        if self.kind == "sim":
+            return NOISE * noise
+        shorter_px = min(layout.intrinsics.width_px, layout.intrinsics.height_px)
+        lengths = CROP_NOISE * np.sqrt(shorter_px / (2 * layout.sigmas_px[:, None]))
+        return lengths * noise + FRAME_NOISE * rng.standard_normal(DIM) / np.sqrt(DIM)
 
 
 def simulated(choice: str, seed: int = 0) -> SimulatedEncoder | None:
@@ -194,9 +211,11 @@ def look_of(name: str) -> np.ndarray:
 
 
 @cache
-def background() -> np.ndarray:
-    """The looks (look, DIM) of nothing in particular over which similarities are read."""
-    return np.array([_random_look(f"background {number}") for number in range(BACKGROUND)])
+def background(noise: float) -> np.ndarray:
+    """Crops (crop, DIM) of nothing in particular, with noise of a length, over which similarities are read."""
+    looks = np.array([_random_look(f"background {number}") for number in range(BACKGROUND)])
+    noisy = looks + noise / np.sqrt(DIM) * _rng("background").standard_normal(looks.shape)
+    return noisy / np.linalg.norm(noisy, axis=1, keepdims=True)
 
 
 def likeness(one: str, other: str) -> float:

@@ -1,6 +1,8 @@
 """Simulated encoders: what they make of a crop, and `prior-sg eval` with them on sequences and worlds."""
 
+import itertools
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,10 +10,11 @@ from msgspec.structs import replace as replace_struct
 
 from prior_sg.deploy.cli import main
 from prior_sg.deploy.evaluation import simulated
-from prior_sg.deploy.evaluation.datasets import WorldName, named_worlds, of_sequence, world_source
+from prior_sg.deploy.evaluation.datasets import WorldName, chosen_datasets, named_worlds, of_sequence, world_source
 from prior_sg.deploy.evaluation.errors import EvaluationError
-from prior_sg.deploy.evaluation.perception import simulated_perception
-from prior_sg.deploy.evaluation.simulated import SimulatedEncoder, look_of, simulated as encoder_of
+from prior_sg.deploy.evaluation.perception import Cache, Perceiver, simulated_perception
+from prior_sg.deploy.evaluation.simulated import SimulatedEncoder, look_of
+from prior_sg.deploy.evaluation.simulated import simulated as encoder_of
 from prior_sg.deploy.truth import GroundTruth, TrueObject
 from prior_sg.schemas.features import Pyramid
 from prior_sg.schemas.frames import Intrinsics
@@ -59,7 +62,8 @@ def layout(depth_m: float = WALL_M, y_m: float = 0.0, frame_id: int = 0, cells: 
 @pytest.fixture
 def noiseless(monkeypatch):
     monkeypatch.setattr(simulated, "NOISE", 0.0)
-    monkeypatch.setattr(simulated, "FRAME_NOISE", 0.0)
+    for name in ("FRAME_NOISE", "CROP_NOISE", "TINT"):
+        monkeypatch.setattr(simulated, name, 0.0)
 
 
 @pytest.mark.parametrize("choice", ["sim:0", "simlike:0"])
@@ -98,13 +102,13 @@ def test_a_share_of_the_surface_wears_another_label(share):
 
 
 def test_surface_wears_the_same_from_everywhere(noiseless):
-    """Crops of less than a metre: a wall that is all one region, from two places and distances."""
+    """Crops of less than a metre, of a wall in one region, from two places."""
     encoder = encoder_of("sim:0.5")
     worn = [encoder.worn(np.array([[3, y, 1]]), np.array([0]), 3)[0] for y in range(6)]
     assert len(set(worn)) > 1
     for y, label in enumerate(worn):
-        for beside_m, depth_m in ((0.0, WALL_M), (0.2, WALL_M)):
-            view = layout(depth_m, y + 0.5 + beside_m)
+        for beside_m in (0.0, 0.2):
+            view = layout(WALL_M, y + 0.5 + beside_m)
             small = replace_struct(view, sigmas_px=np.array([20.0], np.float32))
             seen = encoder.encode(small, truth()).embeddings[0].astype(float)
             assert seen @ look_of(LABELS[label]) > 0.99
@@ -116,12 +120,13 @@ def test_what_an_encoder_says_is_settled_by_its_seed():
         first, again, other = (encoder_of(choice, seed).encode(layout(cells=3), truth()) for seed in (0, 0, 1))
         np.testing.assert_array_equal(first.embeddings, again.embeddings)
         assert not np.array_equal(first.embeddings, other.embeddings)
-    assert look_of("kitchen")[:2].tolist() == pytest.approx([-0.0946045, 0.1082202], abs=1e-6)  # also in another process
+    in_any_process = [-0.0946045, 0.1082202]
+    assert look_of("kitchen")[:2].tolist() == pytest.approx(in_any_process, abs=1e-6)
 
 
 def test_crops_without_measured_surface_are_left_out():
     half = layout(cells=2)
-    half.surface_m[:30] = 0.0
+    half.surface_m[:40] = 0.0  # crops are square and overlap
     assert len(encoder_of("sim:0").encode(half, truth()).layers) == 2
     half.surface_m[:] = 0.0
     assert len(encoder_of("sim:0").encode(half, truth()).layers) == 0
@@ -153,15 +158,34 @@ def test_a_share_of_whole_regions_looks_more_like_another_label(share):
     assert np.mean(wrong) == pytest.approx(share, abs=0.06)
 
 
-def test_frames_share_noise_and_small_crops_have_more():
-    encoder, large = encoder_of("simlike:0"), layout(cells=1)
-    small = layout(cells=8)
+def test_frames_share_noise_and_small_crops_have_more(monkeypatch):
+    monkeypatch.setattr(simulated, "TINT", 0.0)
+    encoder, small = encoder_of("simlike:0"), layout(cells=8)
     frames = [encoder.encode(replace_struct(small, frame_id=frame), truth()).embeddings for frame in range(20)]
-    off = np.array(frames, float) - look_of("kitchen")
-    within = off - off.mean(axis=1, keepdims=True)
-    assert off.mean(axis=1).std() > 2 * (within.std() / 8)
-    one = encoder.encode(large, truth()).embeddings[0].astype(float) @ look_of("kitchen")
-    assert (frames[0].astype(float) @ look_of("kitchen")).mean() < one
+    off = np.array(frames, float) - np.mean(frames, axis=(0, 1), dtype=float)
+    apart = off - off.mean(axis=1, keepdims=True)
+    assert np.linalg.norm(off.mean(axis=1), axis=1).mean() > 2 * np.linalg.norm(apart, axis=2).mean() / 8
+    monkeypatch.setattr(simulated, "FRAME_NOISE", 0.0)
+    large, small = (encoder.encode(layout(cells=cells), truth()).embeddings for cells in (1, 8))
+    assert (small.astype(float) @ look_of("kitchen")).mean() < large[0].astype(float) @ look_of("kitchen")
+
+
+def test_an_encoder_favours_labels_everywhere(monkeypatch):
+    encoder = encoder_of("simlike:0")
+    tint = encoder.tint(LABELS)
+    favoured = int(np.argmax([tint @ look_of(name) for name in LABELS]))
+    layouts = [layout(cells=4, frame_id=frame) for frame in range(30)]
+    text = encoder.text([[name] for name in LABELS])
+
+    def standing() -> float:
+        """Of the favoured label above the others, mean over crops."""
+        seen = np.concatenate([encoder.encode(one, truth()).embeddings for one in layouts]).astype(float)
+        z = (seen @ text.embeddings.T - text.background_mean) / text.background_std
+        return float((z[:, favoured] - z.mean(axis=1)).mean())
+
+    tinted = standing()
+    monkeypatch.setattr(simulated, "TINT", 0.0)
+    assert tinted > standing() + 0.1
 
 
 def test_objects_look_like_themselves(noiseless):
@@ -180,7 +204,18 @@ def test_a_world_is_read_as_a_recording_is():
     frames = list(world_source(WorldName("home", 0)))
     assert len(frames) > 20
     assert [frame.index for frame in frames[:3]] == [0, 1, 2]
-    assert all(one.stamp_ns < other.stamp_ns for one, other in zip(frames, frames[1:], strict=False))
+    assert all(one.stamp_ns < other.stamp_ns for one, other in itertools.pairwise(frames))
+
+
+def test_worlds_out_of_doors_are_mapped_as_such(tmp_path):
+    (campus,) = chosen_datasets([Path("world:campus:0")], [], "tidy up")
+    (home,) = chosen_datasets([Path("world:home:0")], [], "tidy up")
+    told = {"place_graph": {"preset": "indoor"}}
+    presets = [
+        Perceiver(layers, Cache(tmp_path), lambda *_: None).mapping(dataset).preset
+        for layers, dataset in (({}, campus), ({}, home), (told, campus))
+    ]
+    assert presets == ["outdoor", "indoor", "indoor"]
 
 
 def test_sequences_under_a_simulated_encoder(tmp_path):
@@ -192,7 +227,9 @@ def test_sequences_under_a_simulated_encoder(tmp_path):
     for one, other in zip(seen.pyramids, again.pyramids, strict=True):
         np.testing.assert_array_equal(one.embeddings, other.embeddings)
     other = simulated_perception(sample, "sim:0.3", seed=1, folder=tmp_path)
-    assert any(not np.array_equal(a.embeddings, b.embeddings) for a, b in zip(seen.pyramids, other.pyramids))
+    assert any(
+        not np.array_equal(a.embeddings, b.embeddings) for a, b in zip(seen.pyramids, other.pyramids, strict=True)
+    )
     with pytest.raises(ValueError, match="no simulated encoder"):
         simulated_perception(sample, "conse", folder=tmp_path)
 

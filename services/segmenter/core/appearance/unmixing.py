@@ -41,8 +41,8 @@ class UnmixingConfig(msgspec.Struct, frozen=True, kw_only=True):
     steps: int = 4  # along the graph over which each round is smoothed
     mass: float = 5.0  # crops' worth of a place above which it counts no more in the smoothing
     ridge: float = 1.0  # crops' worth that each place is taken to have been seen as it is
-    least_information: float = 0.08  # below which looks are not told apart
-    full_information: float = 0.3  # from which they are in full
+    least_information: float = 0.2  # below which looks are not told apart
+    full_information: float = 0.6  # from which they are in full
 
     def __post_init__(self) -> None:
         if not (self.rounds >= 0 and self.steps >= 0 and self.mass > 0 and self.ridge > 0):
