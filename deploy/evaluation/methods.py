@@ -273,7 +273,7 @@ def _changed(name: str, tuned: Any, changes: Mapping[str, str]) -> Any:
         if field_name not in values:
             raise EvaluationError(f"{name} has no setting {field_name!r}: choose from {', '.join(values)}")
     try:
-        return msgspec.convert(values | changes, type(tuned), strict=False)
+        return msgspec.convert({**values, **changes}, type(tuned), strict=False)
     except msgspec.ValidationError as error:
         raise EvaluationError(f"{name}: {error}") from error
 
