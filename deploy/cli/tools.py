@@ -11,6 +11,7 @@ from rich.table import Table
 from prior_sg.deploy.cli.shared import Commands, add_bus, console, open_client
 from prior_sg.deploy.errors import UserError
 from prior_sg.deploy.evaluation import command as evaluation
+from prior_sg.deploy.evaluation import tune_command as tuning
 from prior_sg.deploy.terminal import Part, line
 
 if TYPE_CHECKING:
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
 
 
 def add_commands(commands: Commands) -> None:
-    """`export`, `explain`, `record`, `replay`, `topics`, `health`, `eval` and `bench`."""
+    """`export`, `explain`, `record`, `replay`, `topics`, `health`, `eval`, `tune` and `bench`."""
     _add_results(commands)
     _add_logs(commands)
     _add_system(commands)
@@ -93,6 +94,16 @@ def _add_system(commands: Commands) -> None:
             cmd_eval,
             "compare methods on datasets with ground truth",
             'prior-sg eval recordings/home --environment "residential home" --methods ours,clio --html',
+            needs="encode",
+        )
+    )
+
+    tuning.add_arguments(
+        commands.add(
+            "tune",
+            cmd_tune,
+            "choose settings on some datasets and score the choice on those left out",
+            "prior-sg tune world:home:0-4 --encoder sim:0.3 --values segmenter.region_cost=0,10,20",
             needs="encode",
         )
     )
@@ -312,3 +323,8 @@ def cmd_bench(arguments: argparse.Namespace) -> int:
 def cmd_eval(arguments: argparse.Namespace) -> int:
     """Compare methods on datasets with ground truth."""
     return evaluation.run(arguments, console)
+
+
+def cmd_tune(arguments: argparse.Namespace) -> int:
+    """Choose settings on some datasets and score the choice on those left out."""
+    return tuning.run(arguments, console)

@@ -4,11 +4,11 @@ import argparse
 import math
 import multiprocessing
 import os
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from rich.box import SIMPLE
 from rich.table import Table
@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     from prior_sg.deploy.evaluation.perception import Perceiver, Report
     from prior_sg.deploy.evaluation.runner import Part, Results
 
+Judged = TypeVar("Judged")
+
 CONSE = "conse"
 TABLE_COLUMNS = 100  # narrower terminals wrap lines, which is better than cells cut short
 SHOWN = {  # keys with their column titles
@@ -40,8 +42,8 @@ SHOWN = {  # keys with their column titles
 }
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """What `prior-sg eval` can be told."""
+def add_datasets(parser: argparse.ArgumentParser) -> None:
+    """What to judge on, and how it is seen."""
     parser.add_argument(
         "datasets",
         nargs="+",
@@ -67,6 +69,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--jobs", type=int, default=0, metavar="N", help="datasets at a time (default: the number of cores)"
     )
     parser.add_argument("--task", default=DEMO_TASK, help="what the robot is to do (default: %(default)s)")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """What `prior-sg eval` can be told."""
+    add_datasets(parser)
     parser.add_argument("--methods", default=OURS, help=f"of {', '.join((OURS, *BASELINES))} (default: %(default)s)")
     parser.add_argument("--ablate", action="store_true", help="ours with experts and parts taken away, too")
     parser.add_argument("--oracle", default="", help=f"ours with a part made perfect: {', '.join(ORACLES)}")
@@ -109,14 +116,14 @@ def run(arguments: argparse.Namespace, console: Terminal) -> int:
     layers = chosen_layers(arguments)
     methods = chosen_methods(arguments, layers)
     datasets = chosen_datasets(arguments.datasets, arguments.environment, arguments.task)
-    check_encoder(arguments, datasets)
+    check_encoder(arguments.encoder, datasets, arguments.sweep)
     arguments.out.mkdir(parents=True, exist_ok=True)
     if arguments.ahead:
         return judge_ahead(arguments, layers, datasets, console)
     jobs = min(arguments.jobs or os.cpu_count() or 1, len(datasets))
     with progress(Terminal(stderr=True)) as report:
         if jobs > 1:
-            results = runner.joined(datasets, methods, in_parallel(arguments, datasets, jobs, report))
+            results = runner.joined(datasets, methods, in_parallel(arguments, datasets, jobs, report, judge_one))
         else:
             perceive = perceiver_of(arguments, layers, report).perceive
             results = runner.run(
@@ -211,15 +218,15 @@ def chosen_layers(arguments: argparse.Namespace) -> Layers:
     return {**layers, "feature_pyramid": {**own, "space": DEFAULT_SPACE}}
 
 
-def check_encoder(arguments: argparse.Namespace, datasets: "Sequence[Dataset]") -> None:
+def check_encoder(encoder: str, datasets: "Sequence[Dataset]", sweep: str = "") -> None:
     """Raise EvaluationError where an encoder is asked what it cannot tell."""
     from prior_sg.deploy.evaluation.errors import EvaluationError
     from prior_sg.deploy.evaluation.simulated import simulated
 
-    if simulated(arguments.encoder) is None:
+    if simulated(encoder) is None:
         if any(dataset.world for dataset in datasets):
             raise EvaluationError("worlds have no colours for a real encoder: add --encoder sim:P or simlike:P")
-    elif "encoder" in _names(arguments.sweep):
+    elif "encoder" in names_in(sweep):
         raise EvaluationError("--sweep encoder compares real encoders: leave out --encoder, or that sweep")
 
 
@@ -231,12 +238,16 @@ def perceiver_of(arguments: argparse.Namespace, layers: Layers, report: "Report"
 
 
 def in_parallel(
-    arguments: argparse.Namespace, datasets: "Sequence[Dataset]", jobs: int, report: "Report"
-) -> "list[Part]":
+    arguments: argparse.Namespace,
+    datasets: "Sequence[Dataset]",
+    jobs: int,
+    report: "Report",
+    judge: "Callable[[argparse.Namespace, Dataset], Judged]",
+) -> "list[Judged]":
     """Each dataset judged in one of several processes, which start anew: compiled code and threads do not fork."""
     asked = argparse.Namespace(**{name: value for name, value in vars(arguments).items() if name != "run"})
     with ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")) as pool:
-        futures = [pool.submit(judge_one, asked, dataset) for dataset in datasets]
+        futures = [pool.submit(judge, asked, dataset) for dataset in datasets]
         for done, _ in enumerate(as_completed(futures)):
             report(f"{jobs} datasets at a time", done + 1, len(datasets))
         return [future.result() for future in futures]
@@ -261,7 +272,7 @@ def chosen_methods(arguments: argparse.Namespace, layers: Layers) -> "list[Metho
 
     config: Any = resolve(BY_NAME["segmenter"].config, "segmenter", layers)
     chosen = []
-    for name in _names(arguments.methods):
+    for name in names_in(arguments.methods):
         own = name == OURS
         chosen.append(methods.ours(config) if own else methods.baseline(name, config.object_phrases))
     chosen += methods.ablations(config) if arguments.ablate else []
@@ -355,14 +366,15 @@ def _cell_with_error(mean: float, error: float) -> str:
     return f"{100 * mean:.1f}" if math.isnan(error) else f"{100 * mean:.1f}±{100 * error:.1f}"
 
 
-def _names(text: str) -> list[str]:
+def names_in(text: str) -> list[str]:
+    """The parts of a list with commas, each once."""
     return list(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
 
 
 def _known(text: str, kinds: Collection[str], option: str) -> list[str]:
     from prior_sg.deploy.evaluation.errors import EvaluationError
 
-    unknown = [name for name in _names(text) if name not in kinds]
+    unknown = [name for name in names_in(text) if name not in kinds]
     if unknown:
         raise EvaluationError(f"{option} knows {', '.join(kinds)}, not {', '.join(unknown)}")
-    return _names(text)
+    return names_in(text)

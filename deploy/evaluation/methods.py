@@ -2,7 +2,7 @@
 
 import itertools
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from types import ModuleType
 from typing import Any
 
@@ -239,14 +239,15 @@ def sweep(config: Config, kind: str) -> list[Method]:
     return rows
 
 
-def baseline(name: str, object_phrases: int = 0) -> Method:
-    """A method of others, with its tuned settings, on the same places, crops and concepts.
+def baseline(name: str, object_phrases: int = 0, changes: Mapping[str, str] | None = None) -> Method:
+    """A method of others, with its tuned settings and `changes` to them, on the same places, crops and concepts.
 
     Baselines hold no beliefs, so their scenes have no posteriors. Raises EvaluationError for a name that is not known.
     """
     from prior_sg.deploy.evaluation.baselines import common
 
     module = _baseline_module(name)
+    config = _changed(name, module.TUNED, changes or {})
 
     def run(case: Case) -> Scene:
         perception, prior = case.perception, case.prior
@@ -258,11 +259,23 @@ def baseline(name: str, object_phrases: int = 0) -> Method:
             perception.voxels,
             query_radius_m=float(np.median([region.query_radius_m for region in prior.regions])),
         )
-        answer = module.segment(inputs, module.TUNED)
+        answer = module.segment(inputs, config)
         scene = common.to_scene(inputs, answer.labels, answer.regions)
         return msgspec.structs.replace(scene, posteriors=np.zeros((len(scene.place_ids), 0), np.float16))
 
     return Method(name, run, (module.__doc__ or "").strip().splitlines()[0])
+
+
+def _changed(name: str, tuned: Any, changes: Mapping[str, str]) -> Any:
+    """A baseline's settings with some others, read as their field's type. Raises EvaluationError."""
+    values = asdict(tuned)
+    for field_name in changes:
+        if field_name not in values:
+            raise EvaluationError(f"{name} has no setting {field_name!r}: choose from {', '.join(values)}")
+    try:
+        return msgspec.convert({**values, **changes}, type(tuned), strict=False)
+    except msgspec.ValidationError as error:
+        raise EvaluationError(f"{name}: {error}") from error
 
 
 def _baseline_module(name: str) -> ModuleType:

@@ -1,4 +1,4 @@
-"""Simulated encoders of graded quality: a crop's embedding is made from what the crop truly shows (pure).
+"""Simulated encoders of graded quality: a crop's embedding is made from what the crop truly shows.
 
 So methods can be compared where nobody tuned an encoder, on sequences and on worlds without colour. Both kinds look at
 the measured surface of a frame, nudged towards the camera so that a wall belongs to the room that it faces, and give
