@@ -236,6 +236,7 @@ def test_sequences_under_a_simulated_encoder(tmp_path):
 
 def test_eval_compares_methods_on_worlds_side_by_side(tmp_path, capsys):
     arguments = ["eval", "world:home:0-1", "--methods", "ours,argmax", "--encoder", "sim:0.3", "--out", str(tmp_path)]
+    arguments += ["--set", "place_graph.voxel_m=0.2"]  # coarse, for time
     assert main.main([*arguments, "--jobs", "2"]) == 0
     shown = capsys.readouterr().out
     assert "home, 2 datasets: percent, mean±standard error" in shown

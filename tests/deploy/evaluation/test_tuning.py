@@ -83,6 +83,7 @@ def test_settings_of_baselines_are_checked(changes, message):
 
 def test_tune_judges_ours_and_a_baseline_on_worlds(tmp_path, capsys):
     arguments = ["tune", "world:home:0-1", "--encoder", "sim:0.3", "--methods", "ours,argmax", "--out", str(tmp_path)]
+    arguments += ["--set", "place_graph.voxel_m=0.2"]  # coarse, for time
     values = ["--values", "segmenter.beta=0,1", "--values", "argmax.standardised=true,false"]
     assert main.main([*arguments, *values, "--jobs", "1"]) == 0
     shown = capsys.readouterr().out
