@@ -157,7 +157,7 @@ def brute_depth(world, pose, rays_camera):
     return np.array(depths_m)
 
 
-@pytest.mark.parametrize("kind", ["home", "tower"])
+@pytest.mark.parametrize("kind", ["home", "shop"])
 def test_rays_end_where_trying_every_voxel_says(kind):
     world, rng = world_of(kind, 1), np.random.default_rng(0)
     for pose in world.world_from_camera[:: len(world.stamps_ns) // 4]:
