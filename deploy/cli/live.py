@@ -74,6 +74,7 @@ def cmd_up(arguments: argparse.Namespace) -> int:
 
 
 def _stay_up(arguments: argparse.Namespace, names: list[str]) -> int:
+    from prior_sg.deploy.interrupts import insist
     from prior_sg.deploy.running.job import require_files
     from prior_sg.deploy.running.supervisor import Supervisor
     from prior_sg.deploy.settings import check_settings
@@ -96,6 +97,7 @@ def _stay_up(arguments: argparse.Namespace, names: list[str]) -> int:
             supervisor.start(name, arguments.workers if BY_NAME[name].job is not None else 1)
         console.print(f"router {arguments.connect}; logs in {supervisor.log_folder}; Ctrl-C stops")
         while True:
+            insist()
             for event in supervisor.check():
                 console.print(event)
             time.sleep(0.2)

@@ -25,8 +25,11 @@ def build_parser() -> argparse.ArgumentParser:
 
 def main(argv: list[str] | None = None) -> int:
     """Exit status of the command; faults of the user or the system are one sentence on standard error."""
+    from prior_sg.deploy.interrupts import remembered
+
     try:
-        return _told(argv)
+        with remembered():
+            return _told(argv)
     except BrokenPipeError:  # the reader of a pipe has left
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
@@ -53,6 +56,7 @@ def _told(argv: list[str] | None) -> int:
 def _run(argv: list[str] | None) -> int:
     from prior_sg.deploy.cli.shared import check_memory
     from prior_sg.deploy.edge import check_arguments, check_encoding
+    from prior_sg.deploy.interrupts import interrupt
     from prior_sg.deploy.terminal import forgive
     from prior_sg.services.runtime import extras
 
@@ -63,7 +67,7 @@ def _run(argv: list[str] | None) -> int:
     check_memory(arguments.needs)
     extras.require(arguments.needs, f"prior-sg {arguments.command}")
     if threading.current_thread() is threading.main_thread() and arguments.command != "serve":
-        signal.signal(signal.SIGTERM, signal.default_int_handler)  # ended by a supervisor: as tidy as Ctrl-C
+        signal.signal(signal.SIGTERM, interrupt)  # ended by a supervisor: as tidy as Ctrl-C
     return arguments.run(arguments)
 
 

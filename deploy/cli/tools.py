@@ -177,6 +177,7 @@ def cmd_explain(arguments: argparse.Namespace) -> int:
 
 def cmd_record(arguments: argparse.Namespace) -> int:
     """Record until Ctrl-C or the given time."""
+    from prior_sg.deploy.interrupts import insist
     from prior_sg.deploy.running.recorder import Recorder
 
     with open_client(arguments.connect) as client:
@@ -186,6 +187,7 @@ def cmd_record(arguments: argparse.Namespace) -> int:
             with console.status("recording; Ctrl-C stops") as status:
                 while time.monotonic() < end_s:
                     time.sleep(0.2)
+                    insist()
                     recorder.check()
                     total = sum(recorder.counts.values())
                     status.update(f"recording: {total} messages; Ctrl-C stops")

@@ -18,6 +18,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn
 
 from prior_sg.deploy.edge import check_robot, check_task
 from prior_sg.deploy.errors import UserError
+from prior_sg.deploy.interrupts import came
 from prior_sg.deploy.running.inprocess import InProcess
 from prior_sg.deploy.running.recorder import Recorder, Settling
 from prior_sg.deploy.running.supervisor import Supervisor
@@ -360,7 +361,8 @@ def _progress(console: Terminal) -> Progress:
 
 @contextmanager
 def _interrupt_sets(event: threading.Event) -> Iterator[None]:
-    """Ctrl-C or SIGTERM sets the event the first time and raises KeyboardInterrupt the second."""
+    """Ctrl-C or SIGTERM sets the event the first time and raises KeyboardInterrupt the second; one that came before and
+    was swallowed counts as the first."""
 
     def handle(number: int, frame: object) -> None:
         if event.is_set():
@@ -371,6 +373,8 @@ def _interrupt_sets(event: threading.Event) -> Iterator[None]:
         yield
         return
     previous = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
+    if came():
+        event.set()
     try:
         yield
     finally:

@@ -101,8 +101,10 @@ def _visual_labels(state: State, own: np.ndarray, rows: np.ndarray, cfg: Config)
 def tell_apart(state: State, cfg: Config) -> None:
     """What all crops together say of each place beyond its neighbours, and how much they tell at all."""
     graph, places, text = state.map.graph, state.map.places, state.aim.aligned.text
-    shown = unmixing.shown(state.seen.archive.frames, graph.positions_m, graph.radii_m)
-    looks = standardised(shown.embeddings.astype(np.float64), text)
+    frames = unmixing.sampled(state.seen.archive.frames)
+    if not frames:
+        return
+    looks = standardised(np.concatenate([frame.embeddings for frame in frames]).astype(np.float64), text)
     told = unmixing.told(text.temperature * looks)
     if abs(told - state.labelling.told) > TOLD_TOLERANCE * told:
         state.labelling.told = told
@@ -110,9 +112,8 @@ def tell_apart(state: State, cfg: Config) -> None:
     worth = unmixing.worth(told, cfg.unmixing)
     now = np.zeros_like(places.similarity)
     if cfg.unmixing.rounds and worth > 0:
-        apart = unmixing.unmixed(
-            places.similarity, looks, shown.shares, graph.arcs, state.map.weights, cfg=cfg.unmixing
-        )
+        shares = unmixing.shown(frames, graph.positions_m, graph.radii_m)
+        apart = unmixing.unmixed(places.similarity, looks, shares, graph.arcs, state.map.weights, cfg=cfg.unmixing)
         now = worth * (apart - places.similarity)
     moved = (np.abs(now - places.correction) > CORRECTION_TOLERANCE).any(axis=1)
     places.correction[moved] = now[moved]

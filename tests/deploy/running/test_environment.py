@@ -1,19 +1,23 @@
 """Odd places and times to start: limits, signals, folders and arguments."""
 
+import contextlib
 import errno
 import os
 import resource
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
 import pytest
 
 import prior_sg
+from prior_sg.deploy import interrupts
 from prior_sg.deploy.cli.faults import sentence_of
 from prior_sg.deploy.cli.main import main
+from prior_sg.deploy.running import job
 from prior_sg.deploy.running.job import RunError, claimed_folder
 from prior_sg.deploy.running.supervisor import Child, ChildFailed, Supervisor
 from prior_sg.services.runtime.endpoints import free_endpoint
@@ -44,6 +48,19 @@ def test_an_interrupt_at_any_moment_is_told_in_a_line(tmp_path, delay_s):
     said, _ = process.communicate(timeout=60)
     assert "Traceback" not in said
     assert process.returncode in (0, 130, -signal.SIGINT)
+
+
+def test_an_interrupt_that_an_import_swallowed_still_ends_the_run():
+    stopping = threading.Event()
+    with interrupts.remembered():
+        with contextlib.suppress(BaseException):  # as some libraries do while they are imported
+            signal.raise_signal(signal.SIGINT)
+        with pytest.raises(KeyboardInterrupt):
+            interrupts.insist()
+        with job._interrupt_sets(stopping):
+            assert stopping.is_set()
+    with interrupts.remembered():  # another command in this process
+        assert not interrupts.came()
 
 
 @pytest.mark.parametrize(

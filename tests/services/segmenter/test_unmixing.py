@@ -78,18 +78,24 @@ def test_a_crop_shows_the_places_before_its_surface_on_the_camera_s_side():
     """A wall 3 m away: the left half of the picture shows the place on the left, nothing the one behind the wall."""
     positions_m = np.array([(-1.5, 0.0, 2.0), (1.5, 0.0, 2.0), (0.0, 0.0, 4.5)])
     view = frame(np.full((60, 80), 3.0), [(160, 240), (480, 240)], [150, 150])
-    seen = shown([view], positions_m, np.array([0.9, 0.9, 0.9]))
-    shares = seen.shares.toarray()
+    shares = shown([view], positions_m, np.array([0.9, 0.9, 0.9])).toarray()
     assert shares[0, 0] > 0.7 and shares[1, 1] > 0.7
     assert (shares[:, 2] < 0.1).all() and (shares.sum(axis=1) <= 1 + 1e-9).all()
-    assert seen.embeddings.shape == (2, 3)
 
 
 def test_a_frame_without_depth_and_a_map_without_frames_show_nothing():
     positions_m, radii_m = np.array([(0.0, 0.0, 2.0)]), np.array([1.0])
-    assert shown([], positions_m, radii_m).shares.shape == (0, 1)
+    assert shown([], positions_m, radii_m).shape == (0, 1)
     nothing = shown([frame(np.zeros((60, 80)), [(320, 240)], [200])], positions_m, radii_m)
-    assert nothing.shares.shape == (1, 1) and nothing.shares.nnz == 0
+    assert nothing.shape == (1, 1) and nothing.nnz == 0
+
+
+def test_many_frames_are_stood_for_by_a_regular_sample_and_those_without_crops_by_none():
+    wall = np.full((60, 80), 3.0)
+    full, empty = frame(wall, [(320, 240)], [200]), frame(wall, [], [])
+    assert unmixing.sampled([full, empty, full]) == [full, full] and unmixing.sampled([empty]) == []
+    many = [full] * (unmixing.FRAMES + 1)
+    assert unmixing.FRAMES / 2 <= len(unmixing.sampled(many)) <= unmixing.FRAMES
 
 
 def test_crops_tell_what_their_beliefs_share_with_the_labels():

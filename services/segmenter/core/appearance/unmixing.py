@@ -11,8 +11,6 @@ Reconstruction sharpens errors as it sharpens looks, so it counts by what the lo
 crop's belief over the labels gives beyond that of all crops, as a share of all there is to know.
 """
 
-from typing import NamedTuple
-
 import msgspec
 import numpy as np
 from scipy import sparse
@@ -51,21 +49,17 @@ class UnmixingConfig(msgspec.Struct, frozen=True, kw_only=True):
             raise ValueError("least_information must be below full_information")
 
 
-class Shown(NamedTuple):
-    """What crops show of the places, and what they look like."""
+def sampled(frames: list[Frame]) -> list[Frame]:
+    """All frames that hold crops, or a regular sample of them."""
+    kept = [frame for frame in frames if len(frame.sigmas_px)]
+    return kept[:: max(-(-len(kept) // FRAMES), 1)]
 
-    shares: sparse.csr_matrix  # (crop, place) of the crop's measured surface that is the place's
-    embeddings: np.ndarray  # (crop, dim) float16
 
-
-def shown(frames: list[Frame], positions_m: np.ndarray, radii_m: np.ndarray) -> Shown:
-    """The crops of all frames, or of a regular sample of them, on places (place, 3)."""
-    sample = frames[:: max(-(-len(frames) // FRAMES), 1)]
+def shown(frames: list[Frame], positions_m: np.ndarray, radii_m: np.ndarray) -> sparse.csr_matrix:
+    """Shares (crop, place) of each crop's measured surface that is each place's; places are (place, 3)."""
     positions_m, radii_m = positions_m.astype(np.float64), radii_m.astype(np.float64)
-    rows = [_shares(frame, positions_m, radii_m) for frame in sample]
-    dim = max((frame.embeddings.shape[1] for frame in sample), default=0)
-    embeddings = np.concatenate([np.zeros((0, dim), np.float16), *(frame.embeddings for frame in sample)])
-    return Shown(sparse.vstack(rows).tocsr() if rows else sparse.csr_matrix((0, len(radii_m))), embeddings)
+    rows = [_shares(frame, positions_m, radii_m) for frame in frames]
+    return sparse.vstack(rows).tocsr() if rows else sparse.csr_matrix((0, len(radii_m)))
 
 
 def told(scores: np.ndarray) -> float:
@@ -97,7 +91,7 @@ def unmixed(
 ) -> np.ndarray:  # fmt: skip
     """Similarities (place, label) that explain those of the crops, `looks` (crop, label), starting from `similarity`.
 
-    `shares` (crop, place) as in Shown; `near` and `weights` (edge,) are the place graph.
+    `shares` (crop, place) as in `shown`; `near` and `weights` (edge,) are the place graph.
     """
     covered = np.asarray(shares.sum(axis=1)).reshape(-1)
     kept = np.flatnonzero(covered > LEAST_SHOWN)
