@@ -21,6 +21,11 @@ MODULES = {  # by extra; what the build file lists there, by the names that code
     "export": ("sentencepiece",),
     "dsg": ("spark_dsg",),
     "fast-cut": ("maxflow",),
+    "postgres": ("psycopg", "pgvector"),
+    "api": ("litestar", "uvicorn"),
+    "mcp": ("mcp",),
+    "view": ("viser",),
+    "rerun": ("rerun",),
 }
 CONTAINS = {"encode": ("map",), "clip": ("encode", "map"), "export": ("clip", "encode", "map")}
 
