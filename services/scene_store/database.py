@@ -165,6 +165,10 @@ class Database:
                 f"{self.storage.location} holds an event that cannot be read ({error}); choose another path."
             ) from error
 
+    def forget(self) -> None:
+        """Let go of the graph that was asked for last, from which later ones are reached faster."""
+        self._past = None
+
     def history(self, robot: str, limit: int = 1000, before: int | None = None) -> list[StoredRevision]:
         """The newest revisions of a robot that are kept, of those below `before`, oldest first."""
         key = self.storage.robots().get(robot)
