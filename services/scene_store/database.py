@@ -102,8 +102,8 @@ class Database:
 
     def put_prior(self, prior: Prior) -> None:
         """Keep a prior under its digest."""
-        told = (prior.digest(), prior.environment, prior.task, prior.provenance.source)
-        self.storage.put_prior((*told, encode(prior)))
+        told = (prior.environment, prior.task, prior.provenance.source)
+        self.storage.put_prior(prior.digest(), told, encode(prior))
 
     def rest(self, graphs: Iterable[core.Graph]) -> None:
         """Between deltas: take the snapshots that are due, thin out old history, tidy up."""
