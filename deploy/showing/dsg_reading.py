@@ -46,6 +46,7 @@ def scene_of_graph(graph: Graph) -> Scene:
     about = dict(graph.metadata.get())
     places = _items(graph, LAYERS.PLACES) or _items(graph, MESH_PLACES)
     rooms, objects = _items(graph, LAYERS.ROOMS), _items(graph, LAYERS.OBJECTS)
+    layers = {"places": places, "rooms": rooms, "objects": objects}
     names = {room.id: _name(graph, room.node) for room in rooms}
     labels = _labels(graph, rooms, names)
     columns = _columns(places, rooms, labels)
@@ -57,7 +58,7 @@ def scene_of_graph(graph: Graph) -> Scene:
         prior_digest=about.get("prior_digest", ""),
         space=about.get("embedding_space", ""),
         labels=labels,
-        regions=[_region(room, names[room.id], columns, rooms, places, objects) for room in rooms],
+        regions=[_region(room, names, columns, layers) for room in layers["rooms"]],
         objects=[_object(graph, item) for item in objects],
         trajectory=np.array(about.get("trajectory_m", ()), np.float32).reshape(-1, 3),
         origin_m=tuple(about.get("origin_m", (0.0, 0.0, 0.0))),
@@ -175,27 +176,27 @@ def _edges(graph: Graph, places: list[Item]) -> dict[str, np.ndarray]:
     }
 
 
-def _region(
-    room: Item, name: str, columns: dict[str, np.ndarray], rooms: list[Item], places: list[Item], objects: list[Item]
-) -> Region:
+def _region(room: Item, names: dict[int, str], columns: dict[str, np.ndarray], layers: dict[str, list[Item]]) -> Region:
     """As we wrote it, or put together from the places and objects below the room and the rooms beside it."""
     if "place_count" in room.told:
         return msgspec.convert(room.told, Region)
     rows = np.flatnonzero(columns["place_regions"] == room.id)
     centers_m, radii_m = columns["positions_m"][rows], columns["radii_m"][rows]
-    above = {room.node.id.value, *(places[row].node.id.value for row in rows)}
+    above = {room.node.id.value, *(layers["places"][row].node.id.value for row in rows)}
     beside = room.node.siblings()
     return Region(
         id=room.id,
-        label=name,
+        label=names[room.id],
         place_count=len(rows),
-        probability=float(room.node.attributes.semantic_class_probabilities.get(name, 1.0)),
+        probability=float(room.node.attributes.semantic_class_probabilities.get(names[room.id], 1.0)),
         position_m=tuple(np.asarray(room.node.attributes.position, float).tolist()),
         area_m2=footprint_m2(centers_m, radii_m, CELL_M) if len(rows) else 0.0,
         predicted=room.node.attributes.is_predicted,
         hull_m=hull_m(centers_m, radii_m) if len(rows) else [],
-        neighbour_ids=[other.id for other in rooms if other.node.id.value in beside],
-        object_ids=[item.id for item in objects if item.node.has_parent() and item.node.get_parent() in above],
+        neighbour_ids=[other.id for other in layers["rooms"] if other.node.id.value in beside],
+        object_ids=[
+            item.id for item in layers["objects"] if item.node.has_parent() and item.node.get_parent() in above
+        ],
     )
 
 
