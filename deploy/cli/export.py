@@ -25,7 +25,12 @@ def add_commands(commands: Commands) -> None:
         needs="map",
     )
     export.epilog = "\n".join(
-        ["formats:", *(f"  {one.name:<11} {one.file:<14} {one.summary}" for one in FORMATS.values()), "", export.epilog]
+        [
+            "formats:",
+            *(f"  {one.name:<11} {one.file:<14} {one.summary}" for one in FORMATS.values()),
+            "",
+            str(export.epilog),
+        ]
     )
     export.add_argument(
         "source",

@@ -15,7 +15,6 @@ from prior_sg.services.segmenter.core.regions.components import footprint_m2, hu
 
 CELL_M = 0.1  # of the grid that footprints of foreign rooms are counted on
 LAYERS = spark_dsg.DsgLayers
-Graph = spark_dsg.DynamicSceneGraph
 
 
 class Item(NamedTuple):
@@ -30,13 +29,13 @@ def load_spark_dsg(path: str | Path) -> Scene:
     """The scene in a file of Spark-DSG, JSON or binary. Raises OSError, or ValueError for a file that is none."""
     Path(path).open("rb").close()  # a missing file is told as such
     try:
-        graph = Graph.load(str(path))
+        graph = spark_dsg.DynamicSceneGraph.load(str(path))
     except Exception as error:  # whatever the bindings raise on foreign bytes
         raise ValueError(f"{path} cannot be read as a Spark-DSG graph: {str(error).splitlines()[0]}") from error
     return scene_of_graph(graph)
 
 
-def scene_of_graph(graph: Graph) -> Scene:
+def scene_of_graph(graph: spark_dsg.DynamicSceneGraph) -> Scene:
     """The scene that a graph tells; positions stay as they are.
 
     Places are those of the layer PLACES, else of MESH_PLACES; a room is a region of the places below it. A name is the
@@ -67,7 +66,7 @@ def scene_of_graph(graph: Graph) -> Scene:
     )
 
 
-def _items(graph: Graph, layer: str) -> list[Item]:
+def _items(graph: spark_dsg.DynamicSceneGraph, layer: str) -> list[Item]:
     """Nodes of a layer, sorted by id: the number of their symbol, or their whole value where numbers repeat."""
     if layer not in graph.layer_names:
         return []
@@ -78,12 +77,12 @@ def _items(graph: Graph, layer: str) -> list[Item]:
     return sorted(items, key=lambda item: item.id)
 
 
-def _name(graph: Graph, node: spark_dsg.SceneGraphNode) -> str:
+def _name(graph: spark_dsg.DynamicSceneGraph, node: spark_dsg.SceneGraphNode) -> str:
     space = graph.get_labelspace(node.layer.layer, node.layer.partition)
     return node.attributes.name or space.labels_to_names.get(node.attributes.semantic_label) or node.id.str()
 
 
-def _environment(graph: Graph) -> str:
+def _environment(graph: spark_dsg.DynamicSceneGraph) -> str:
     return next((_name(graph, building.node) for building in _items(graph, LAYERS.BUILDINGS)), "")
 
 
@@ -91,7 +90,7 @@ def _stamp_ns(item: Item) -> int:
     return int(item.node.attributes.last_update_time_ns)
 
 
-def _labels(graph: Graph, rooms: list[Item], names: dict[int, str]) -> list[str]:
+def _labels(graph: spark_dsg.DynamicSceneGraph, rooms: list[Item], names: dict[int, str]) -> list[str]:
     """Those of the rooms' labelspace in its order, then whatever else rooms are called or believed to be."""
     key = graph.get_layer_key(LAYERS.ROOMS)
     known = [name for _, name in sorted(graph.get_labelspace(key.layer, key.partition).labels_to_names.items())]
@@ -164,7 +163,7 @@ def _axes(attributes: spark_dsg.Place2dNodeAttributes) -> tuple[float, float, fl
     return float(np.linalg.norm(long_axis)), float(np.linalg.norm(short_axis)), angle_rad
 
 
-def _edges(graph: Graph, places: list[Item]) -> dict[str, np.ndarray]:
+def _edges(graph: spark_dsg.DynamicSceneGraph, places: list[Item]) -> dict[str, np.ndarray]:
     ids = {place.node.id.value: place.id for place in places}
     ways = [way for way in graph.edges if way.source in ids and way.target in ids]
     found = sorted(
@@ -200,7 +199,7 @@ def _region(room: Item, names: dict[int, str], columns: dict[str, np.ndarray], l
     )
 
 
-def _object(graph: Graph, item: Item) -> SceneObject:
+def _object(graph: spark_dsg.DynamicSceneGraph, item: Item) -> SceneObject:
     """An object without a valid box is as small as its position."""
     attributes = item.node.attributes
     middle_m = tuple(np.asarray(attributes.position, float).tolist())
