@@ -53,7 +53,7 @@ def spark_dsg_graph(scene: Scene) -> spark_dsg.DynamicSceneGraph:
         _add(graph, spark_dsg.DsgLayers.BUILDINGS, BUILDING, 0, _building_node(scene))
         for region in scene.regions:
             graph.insert_edge(_symbol(BUILDING, 0), _symbol(ROOM, region.id), enforce_single_parent=True)
-    about = {"robot": scene.robot, "environment": scene.environment, "task": scene.task}
+    about: dict[str, Any] = {"robot": scene.robot, "environment": scene.environment, "task": scene.task}
     about |= {"prior_digest": scene.prior_digest, "embedding_space": scene.space}
     about |= {"stamp_ns": scene.stamp_ns, "trajectory_m": scene.trajectory.tolist()}
     graph.metadata.set(about | {"origin_m": list(scene.origin_m)})

@@ -104,7 +104,7 @@ def _columns(places: list[Item], rooms: list[Item], labels: list[str]) -> dict[s
     posteriors = [[place.told.get("posterior", {}).get(label, 0.0) for label in labels] for place in places]
     parents = [regions.get(item.node.get_parent(), NO_REGION) if item.node.has_parent() else -1 for item in places]
     openings = [(place.id, *found) for place in places if (found := _opening(place)) is not None]
-    surfaces = [(place.id, *found) for place in places if (found := _ground(place)) is not None]
+    surfaces = [(place.id, *flat) for place in places if (flat := _ground(place)) is not None]
     return {
         "place_ids": np.array([place.id for place in places], np.int64),
         "positions_m": np.array([place.node.attributes.position for place in places], np.float32).reshape(-1, 3),

@@ -1,7 +1,7 @@
 """One self-contained page of a run: map, regions, objects, beliefs, the way there, scores and settings.
 
-Nothing is fetched: style, script, pictures and data lie in the file, and its content policy forbids all else. Labels and
-tasks come from models and users, so data is JSON without a `<`, and the script makes text nodes of it.
+Nothing is fetched: style, script, pictures and data lie in the file, and its content policy forbids all else. Labels
+and tasks come from models and users: data is JSON without a `<`, and the script makes text nodes of it.
 """
 
 import base64
@@ -28,8 +28,10 @@ from prior_sg.services.losses import line as loss_line
 
 MAX_BYTES = 8_000_000  # of the steps; more are thinned
 MAX_PLACES = 20_000  # drawn; of more, an even part
-MAX_CELLS = 1_500_000  # of the pictures below the map
-FLAT_CELL_M = 0.05  # of the floor where there is no map of walls
+MAX_CELLS, FINEST_M = 600_000, 0.025  # of the floor's grid
+WALLS = "Walls are those of the end of the run, whatever moment is shown; stripes are predicted from the surroundings."
+NO_WALLS = "Without a map of walls: the floor is what places cover; stripes are predicted from the surroundings."
+FURNITURE_OPACITY = 0.35
 MAX_SETTING = 120  # characters of one that are shown
 
 
@@ -77,7 +79,7 @@ def _data(material: Material) -> dict[str, Any]:
         "path": np.round(scene.trajectory[:, :2].astype(float), 2).tolist(),
         "steps": steps,
         "tables": _tables(material),
-        "notes": [*notes, *([] if material.voxels else ["Without a map of walls: the floor is what places cover."])],
+        "notes": [*notes, WALLS if material.voxels else NO_WALLS],
     }
 
 
@@ -99,21 +101,22 @@ def _grid(scene: Scene, voxels: VoxelMap | None) -> dict[str, Any]:
     opacity is what counts, north up.
     """
     layers = layers_of(scene, voxels, False)
-    stride = max(1, int(np.ceil((layers.free.size / MAX_CELLS) ** 0.5)))
-    width, height = (-(-count // stride) for count in layers.free.shape)
+    cell_m = max(FINEST_M, layers.cell_m * (layers.free.size / MAX_CELLS) ** 0.5)
+    width, height = (max(1, round(count * layers.cell_m / cell_m)) for count in layers.free.shape)
     x_m, y_m = (layers.origin * layers.cell_m).tolist()
-    told = {"x": x_m, "y": y_m, "cell": layers.cell_m * stride, "width": width, "height": height}
+    told = {"x": x_m, "y": y_m, "cell": cell_m, "width": width, "height": height}
     if voxels is None:
         return told
-    solid = np.where(layers.walls >= WALL_SHARE, 1.0, np.where(layers.walls >= FURNITURE_SHARE, 0.45, 0.0))
+    solid = np.where(layers.walls >= WALL_SHARE, 1.0, np.where(layers.walls >= FURNITURE_SHARE, FURNITURE_OPACITY, 0.0))
     return told | {"free": _picture(layers.free, (width, height)), "walls": _picture(solid, (width, height))}
 
 
 def _picture(opacity: np.ndarray, size: tuple[int, int]) -> str:
-    """A PNG file as an address; `opacity` (i, j) in [0, 1]."""
-    rows = (255 * np.asarray(opacity, np.float32)).astype(np.uint8).T[::-1]
-    alpha = cv2.resize(rows, size, interpolation=cv2.INTER_AREA)
-    encoded, data = cv2.imencode(".png", np.dstack((np.zeros((*alpha.shape, 3), np.uint8), alpha)))
+    """A PNG file as an address; `opacity` (i, j) in [0, 1], with rounded corners where the picture is finer."""
+    rows = np.ascontiguousarray(255 * np.asarray(opacity, np.float32).T[::-1])
+    finer = size[0] > rows.shape[1]
+    alpha = cv2.resize(rows, size, interpolation=cv2.INTER_CUBIC if finer else cv2.INTER_AREA).clip(0, 255)
+    encoded, data = cv2.imencode(".png", np.dstack((np.zeros((*alpha.shape, 3), np.uint8), alpha.astype(np.uint8))))
     if not encoded:
         raise OSError("the map could not be encoded as PNG")
     return "data:image/png;base64," + base64.b64encode(data.tobytes()).decode()
@@ -122,14 +125,14 @@ def _picture(opacity: np.ndarray, size: tuple[int, int]) -> str:
 def _tables(material: Material) -> list[tuple[str, list[tuple[str, str | None]]]]:
     """Title and rows of what can be unfolded; a row without a value is a heading."""
     scene = material.scene
-    scores = [(name.replace("_", " "), "–" if v is None else f"{v:.4g}") for name, v in material.scores.items()]
+    scores = [(name, "–" if v is None else f"{v:.4g}") for name, v in material.scores.items()]
     losses = [(loss_text, "") for loss_text in _losses(material)]
     settings: list[tuple[str, str | None]] = []
     for service, fields in material.settings.items():
         settings += [(service, None), *((name, str(value)[:MAX_SETTING]) for name, value in fields.items())]
     about = [("prior", scene.prior_digest), ("embedding space", scene.space)]
     about += [
-        ("origin of the world, m", ", ".join(f"{axis:g}" for axis in scene.origin_m)),
+        ("origin of the world, m", ", ".join(f"{axis:.3f}" for axis in scene.origin_m)),
         ("stamp, ns", str(scene.stamp_ns)),
     ]
     return [

@@ -1,8 +1,8 @@
 """How a scene came about, as steps that each hold what differs from the one before (pure).
 
 A step: `places` [[id, x, y, z, radius, region, unknown %, flags, % of each label]], `gone` [place id], `edges`
-[[a, b, clearance]], `cut` [[a, b]], `regions`, `objects` and `labels` (whole, absent where nothing changed), `path` (how
-many points of the trajectory), `revision` and `seconds` since the first. Flags: 1 predicted, 2 beside unseen space.
+[[a, b, clearance]], `cut` [[a, b]], `regions`, `objects` and `labels` (whole, absent where nothing changed), `path`
+(how many points of the trajectory), `revision` and `seconds` since the first. Flags: 1 predicted, 2 a frontier.
 """
 
 from collections.abc import Iterator, Sequence
