@@ -107,16 +107,26 @@ def _grid(scene: Scene, voxels: VoxelMap | None) -> dict[str, Any]:
     told = {"x": x_m, "y": y_m, "cell": cell_m, "width": width, "height": height}
     if voxels is None:
         return told
-    solid = np.where(layers.walls >= WALL_SHARE, 1.0, np.where(layers.walls >= FURNITURE_SHARE, FURNITURE_OPACITY, 0.0))
-    return told | {"free": _picture(layers.free, (width, height)), "walls": _picture(solid, (width, height))}
+    size = (width, height)
+    walls, furniture = (_resized(layers.walls >= share, size) for share in (WALL_SHARE, FURNITURE_SHARE))
+    solid = np.maximum(walls, FURNITURE_OPACITY * furniture)
+    return told | {"free": _picture(_resized(layers.free, size)), "walls": _picture(solid)}
 
 
-def _picture(opacity: np.ndarray, size: tuple[int, int]) -> str:
-    """A PNG file as an address; `opacity` (i, j) in [0, 1], with rounded corners where the picture is finer."""
-    rows = np.ascontiguousarray(255 * np.asarray(opacity, np.float32).T[::-1])
-    finer = size[0] > rows.shape[1]
-    alpha = cv2.resize(rows, size, interpolation=cv2.INTER_CUBIC if finer else cv2.INTER_AREA).clip(0, 255)
-    encoded, data = cv2.imencode(".png", np.dstack((np.zeros((*alpha.shape, 3), np.uint8), alpha.astype(np.uint8))))
+def _resized(mask: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """Opacity (row, column) of a mask (i, j), north up; finer than the mask its outline is smooth and sharp."""
+    rows = np.ascontiguousarray(mask.T[::-1], np.float32)
+    if size[0] <= rows.shape[1]:
+        return cv2.resize(rows, size, interpolation=cv2.INTER_AREA)
+    finer = cv2.resize(rows, size, interpolation=cv2.INTER_CUBIC)
+    blurred = cv2.GaussianBlur(finer, (0, 0), size[0] / rows.shape[1] / 2)
+    return ((blurred - 0.5) * 5 + 0.5).clip(0, 1)
+
+
+def _picture(opacity: np.ndarray) -> str:
+    """A PNG file as an address; `opacity` (row, column) in [0, 1]."""
+    alpha = np.round(255 * opacity).astype(np.uint8)
+    encoded, data = cv2.imencode(".png", np.dstack((np.zeros((*alpha.shape, 3), np.uint8), alpha)))
     if not encoded:
         raise OSError("the map could not be encoded as PNG")
     return "data:image/png;base64," + base64.b64encode(data.tobytes()).decode()
