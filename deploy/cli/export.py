@@ -56,7 +56,7 @@ def cmd_export(arguments: argparse.Namespace) -> int:
 
     chosen = formats.named(arguments.format, arguments.out)
     out = arguments.out or _usual_place(arguments.source, chosen)
-    if arguments.source is not None and out.exists() and out.samefile(arguments.source):
+    if arguments.source is not None and out.resolve() == arguments.source.resolve():
         raise UserError(f"{out} is what is read; name another file with --out")
     with console.status(f"reading {arguments.source or arguments.connect}"):
         material = replace(_material(arguments, chosen), crs=arguments.crs)

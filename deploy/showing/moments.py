@@ -27,7 +27,7 @@ def moments_of(log: Path, robot: str, count: int) -> list[Moment]:
     """The scene of a robot after evenly many deltas of a log, at most `count`, the last included. Raises LogError."""
     deltas: list[Any] = [decode(logged.topic.type, logged.payload) for logged in read_log(log, DELTAS)]
     deltas = [delta for delta in deltas if delta.robot == robot]
-    wanted = set(np.linspace(0, len(deltas) - 1, min(count, len(deltas))).round().astype(int).tolist())
+    wanted = set(np.linspace(len(deltas) - 1, 0, min(count, len(deltas))).round().astype(int).tolist())
     graph = store.Graph(robot)
     followers: dict[type, Follower[Any]] = {kind: Follower() for kind in (PlaceDelta, RegionDelta, ObjectDelta)}
     found = []

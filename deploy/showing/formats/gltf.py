@@ -110,7 +110,8 @@ def write_gltf(material: Material, path: Path) -> None:
         model.node("places", mesh=model.mesh(POINTS, scene.positions_m, (255, 255, 255), colors=hues))
     if len(scene.edges):
         rows = np.searchsorted(scene.place_ids, scene.edges)
-        model.node("edges", mesh=model.mesh(LINES, scene.positions_m, EDGE_COLOR, indices=rows))
+        ends_m = scene.positions_m[rows].reshape(-1, 3)  # without an index, which trimesh does not heed for lines
+        model.node("edges", mesh=model.mesh(LINES, ends_m, EDGE_COLOR))
     if len(scene.trajectory) > 1:
         model.node("trajectory", mesh=model.mesh(LINE_STRIP, scene.trajectory, PATH_COLOR))
     floor_m = float(scene.positions_m[:, 2].min()) if len(scene.place_ids) else 0.0
