@@ -43,7 +43,7 @@ class Format:
 
 
 _ALL = (
-    Format("json", "scene.json", "formats.plain:write_json", "ours: everything, as in the table of api.md"),
+    Format("json", "scene.json", "formats.plain:write_json", "ours: everything in plain JSON"),
     Format("dsg", "dsg.json", "formats.plain:write_dsg", "Spark-DSG as JSON, for Hydra's tools", "dsg"),
     Format("dsg-binary", "dsg.sparkdsg", "formats.plain:write_dsg", "Spark-DSG, binary", "dsg"),
     Format("node-link", "graph.json", "formats.graphs:write_node_link", "networkx and D3: nodes, links", "graph"),

@@ -18,6 +18,7 @@ from prior_sg.deploy.showing.scene_reading import scene_of_json
 from prior_sg.schemas.objects import SceneObject
 from prior_sg.schemas.regions import Transition
 from tests.deploy.showing.test_export import changed, flat, flat_map, region, with_details
+from tests.help.paths import ROOT
 
 HOSTILE = '</script><img src=x onerror=alert(1)>"&\x01\ud7ff'
 FORMULA = "=cmd|' /C calc'!A0"
@@ -157,6 +158,8 @@ def test_one_registry_says_what_there_is(capsys):
         main(["export", "--help"])
     help_text = capsys.readouterr().out
     assert all(entry.name in help_text and entry.summary in help_text for entry in FORMATS.values())
+    document = (ROOT / "docs" / "exports.md").read_text()
+    assert all(f"| `{entry.name}` | `{entry.file}` | {entry.summary}" in document for entry in FORMATS.values())
 
 
 @pytest.mark.parametrize(
