@@ -4,10 +4,13 @@ import importlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from prior_sg.deploy.errors import UserError
-from prior_sg.deploy.showing.material import Material
 from prior_sg.services.runtime import extras
+
+if TYPE_CHECKING:
+    from prior_sg.deploy.showing.material import Material
 
 HERE = "prior_sg.deploy.showing"
 MOMENTS = 60  # of a run, at most, in formats that tell how the scene came about
@@ -35,7 +38,7 @@ class Format:
         return Path(self.file).suffix
 
     @property
-    def write(self) -> Callable[[Material, Path], None]:
+    def write(self) -> Callable[["Material", Path], None]:
         """The function that writes it."""
         module, _, function = self.writer.partition(":")
         found: Callable[[Material, Path], None] = getattr(importlib.import_module(f"{HERE}.{module}"), function)
@@ -73,7 +76,7 @@ def named(name: str, path: Path | None) -> Format:
     return found
 
 
-def save(material: Material, path: Path, name: str = "") -> None:
+def save(material: "Material", path: Path, name: str = "") -> None:
     """Write a scene; the format follows from the path's ending unless named. Raises ExportError or ExtraMissing."""
     chosen = named(name, path)
     if path.suffix != chosen.suffix:

@@ -1,4 +1,4 @@
-"""How a scene came about, as steps that each hold what differs from the one before (pure).
+"""How a scene came about, as steps that each hold what differs from the one before.
 
 A step: `places` [[id, x, y, z, radius, region, unknown %, flags, % of each label]], `gone` [place id], `edges`
 [[a, b, clearance]], `cut` [[a, b]], `regions`, `objects` and `labels` (whole, absent where nothing changed), `path`
