@@ -70,7 +70,7 @@ def test_names_cannot_leave_their_element():
 
 def test_a_large_scene_is_thinned_with_a_note(monkeypatch):
     monkeypatch.setattr(page, "MAX_PLACES", 3)
-    assert "Every 2th of 5 places is drawn." in page.page(material())
+    assert "Of 5 places one in 2 is drawn." in page.page(material())
     monkeypatch.setattr(page, "MAX_BYTES", 500)
     text = page.page(material())
     assert '"revision": 9' in text and '"revision": 3' not in text

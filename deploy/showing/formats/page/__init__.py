@@ -88,7 +88,7 @@ def _bounded_steps(moments: Sequence[Moment]) -> tuple[list[dict[str, Any]], lis
     total, notes = len(moments[-1].scene.place_ids), list[str]()
     every = -(-total // MAX_PLACES)
     if every > 1:
-        notes.append(f"Every {every}th of {total} places is drawn.")
+        notes.append(f"Of {total} places one in {every} is drawn.")
     steps = list(steps_of(moments, max(1, every)))
     while len(json_text(steps, indent=None)) > MAX_BYTES and len(moments) > 1:
         moments = moments[-1::-2][::-1]
