@@ -109,6 +109,11 @@ def test_without_an_encoder_words_are_compared_and_that_is_said():
         Scene(message(space="")).find("in the kitchen")
 
 
+def test_without_its_prior_names_stand_alone_and_that_is_said():
+    with pytest.warns(UserWarning, match="not at hand"):
+        assert Told(message()).find("kitchen", what="region")[0].label == "kitchen"
+
+
 def test_a_running_system_gives_the_same_answers(scene):
     hub = Hub()
     bus = LocalBus(hub)
