@@ -139,8 +139,8 @@ class Asking(ABC):
         return list(ranking.things)
 
     def likeness(self, text: str) -> tuple[dict[str, float], dict[str, float], str]:
-        """How probably regions and objects of each label answer a text, by label, and in one sentence what is missing for
-        that; both are empty where nothing can embed it."""
+        """How probably regions and objects of each label answer a text, by label, both empty where nothing embeds it;
+        and in one sentence what is missing."""
         from prior_sg.services.scene_store.core.queries import likeness as core
 
         words: Any
