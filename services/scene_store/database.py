@@ -4,6 +4,7 @@ A graph is the nearest snapshot and the events after it; nothing else is the tru
 leaves the state before or after an event, never between.
 """
 
+import contextlib
 import logging
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -104,6 +105,14 @@ class Database:
         """Keep a prior under its digest."""
         told = (prior.environment, prior.task, prior.provenance.source)
         self.storage.put_prior(prior.digest(), told, encode(prior))
+
+    def prior(self, digest: str) -> Prior | None:
+        """The prior of a digest; None where it is not kept, or not in a form that this version reads."""
+        message = self.storage.prior(digest)
+        if message is not None:
+            with contextlib.suppress(DecodeError):
+                return decode(Prior, message)
+        return None
 
     def rest(self, graphs: Iterable[core.Graph]) -> None:
         """Between deltas: take the snapshots that are due, thin out old history, tidy up."""
