@@ -15,6 +15,7 @@ from prior_sg.deploy.benches.encoder_swap import encoder_swap
 from prior_sg.deploy.benches.kernel import kernel
 from prior_sg.deploy.benches.learning import learning_bench
 from prior_sg.deploy.benches.places import place_bench
+from prior_sg.deploy.benches.queries import query_bench
 from prior_sg.deploy.benches.store import store_bench
 from prior_sg.deploy.benches.swap import swap_bench
 from prior_sg.deploy.sample import SAMPLE
@@ -106,6 +107,7 @@ BENCHES: dict[str, Callable[[], tuple[dict, dict]]] = {
     "task": segmenter.switch,
     "learning": learning_bench,
     "encoder_swap": exchanged_encoder,
+    "queries": query_bench,
     "e2e": e2e,
     "store": store_bench,
 }

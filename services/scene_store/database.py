@@ -4,10 +4,10 @@ A graph is the nearest snapshot and the events after it; nothing else is the tru
 leaves the state before or after an event, never between.
 """
 
+import contextlib
 import gc
 import logging
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 
 import zstandard
@@ -106,6 +106,14 @@ class Database:
         """Keep a prior under its digest."""
         told = (prior.environment, prior.task, prior.provenance.source)
         self.storage.put_prior(prior.digest(), told, encode(prior))
+
+    def prior(self, digest: str) -> Prior | None:
+        """The prior of a digest; None where it is not kept, or not in a form that this version reads."""
+        message = self.storage.prior(digest)
+        if message is not None:
+            with contextlib.suppress(DecodeError):
+                return decode(Prior, message)
+        return None
 
     def rest(self, graphs: Iterable[core.Graph]) -> None:
         """Between deltas: take the snapshots that are due, thin out old history, tidy up."""
@@ -222,7 +230,7 @@ class Database:
         standing.snapshot, standing.snapshot_bytes, standing.weight = mark, len(payload), 0
 
 
-@contextmanager
+@contextlib.contextmanager
 def _many_made() -> Iterator[None]:
     """No search for garbage: among so many new objects that all stay it takes three times as long as making them."""
     searching = gc.isenabled()

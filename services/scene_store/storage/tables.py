@@ -202,6 +202,11 @@ class Storage(ABC):
         with self.transaction():
             self.run("INSERT INTO priors VALUES (?, ?, ?, ?, ?) ON CONFLICT DO NOTHING", row)
 
+    def prior(self, digest: str) -> bytes | None:
+        """The message of a prior."""
+        rows = self.run("SELECT message FROM priors WHERE digest = ?", (digest,))
+        return bytes(rows[0][0]) if rows else None
+
 
 def _marks(columns: Sequence[str]) -> str:
     return ", ".join("?" * len(columns))

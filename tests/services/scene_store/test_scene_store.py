@@ -375,6 +375,8 @@ def test_tasks_priors_and_robots(tmp_path):
     assert in_force == {ROBOT: tasks[1], "nobody": None}
     rows = sqlite3.connect(store.cfg.path).execute("SELECT digest, message FROM priors").fetchall()
     assert [(digest, decode(Prior, blob)) for digest, blob in rows] == [(prior.digest(), prior)]
+    database = store.state.database
+    assert encode(database.prior(prior.digest())) == encode(prior) and database.prior("another") is None
     assert asked(store.feed(Tick(stamp_ns=1))) == [PLACE_SNAPSHOT, REGION_SNAPSHOT, OBJECT_SNAPSHOT] * 2
 
 
