@@ -19,12 +19,14 @@ from prior_sg.schemas.codec import DecodeError, decode
 from prior_sg.schemas.names import fault_of_robot, normal
 from prior_sg.schemas.priors import Prior, fault_of_task
 from prior_sg.schemas.queries import MOST_RANKED, AnswersTo, Question, SceneAnswer, What
+from prior_sg.schemas.scene import Scene as SceneMessage
 from prior_sg.schemas.scene import SceneRevision
 from prior_sg.schemas.topics import SCENE_REVISION
 from prior_sg.services.errors import PriorSgError
 from prior_sg.services.runtime.bus import Bus, Sample
 
 MOST_ROBOTS = 64  # whose clients are kept
+MOST_WRITTEN = 8  # forms of scenes that are kept
 READERS, WRITERS = 16, 4  # threads
 MOST_QUESTIONS, MOST_POSES, MOST_LIMIT = 64, 10_000, 10_000
 LONGEST_SEARCH = 500  # characters
@@ -56,6 +58,7 @@ class System:
         self.robot = robot
         self._open_bus, self._bus = open_bus, open_bus()
         self._clients: OrderedDict[str, Client] = OrderedDict()
+        self._written: OrderedDict[tuple[str, str, str], bytes] = OrderedDict()
         self._lock = threading.Lock()
         self._seen = {robot}
         self._changing: set[str] = set()
@@ -94,9 +97,19 @@ class System:
         question = AnswersTo(text=text, regions=regions, objects=objects, what=what, limit=limit)
         return await self.answers(robot, question)
 
-    async def scene(self, robot: str) -> Scene:
-        """The scene as stored now. Raises as `answers`."""
-        return await self._read(robot, lambda client: client.scene())
+    async def tag(self, robot: str) -> str:
+        """Another one whenever the scene is another. Raises as `answers`."""
+        now = await self.answers(robot)
+        return f"{now.revision}-{now.stamp_ns}"
+
+    async def written(self, robot: str, tag: str, form: str, write: Callable[[SceneMessage], bytes]) -> bytes:
+        """The scene as `write` puts it, once for each tag and form. Raises as `answers`."""
+        key = (robot, tag, form)
+        if key not in self._written:
+            self._written[key] = await self._read(robot, lambda client: write(client.scene().message))
+            while len(self._written) > MOST_WRITTEN:
+                self._written.popitem(last=False)
+        return self._written[key]
 
     async def health(self) -> Health:
         """What every process says of itself. Raises BusError."""
