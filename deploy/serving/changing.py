@@ -7,8 +7,9 @@ import numpy as np
 from litestar import Response, post, put
 from litestar.datastructures import State
 
+from prior_sg.deploy.serving.errors import FaultyRequestError
 from prior_sg.deploy.serving.reading import FAULTS, Robot
-from prior_sg.deploy.serving.system import MOST_POSES, FaultyRequestError, System
+from prior_sg.deploy.serving.system import MOST_POSES, System
 from prior_sg.schemas.names import LONGEST_TEXT
 
 Seconds = Annotated[float, msgspec.Meta(ge=0.1, le=300.0)]

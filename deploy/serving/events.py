@@ -9,7 +9,8 @@ from typing import Any
 
 import msgspec
 
-from prior_sg.deploy.serving.system import BusyError, System
+from prior_sg.deploy.serving.errors import BusyError
+from prior_sg.deploy.serving.system import System
 from prior_sg.schemas.queries import ChangedSince, Difference, SceneAnswer, WordsInUse
 from prior_sg.schemas.scene import SceneRevision
 from prior_sg.services.errors import PriorSgError

@@ -12,10 +12,11 @@ from litestar.openapi.spec import Components, SecurityScheme
 
 from prior_sg.deploy.api.errors import NotInSceneError, PosesError, TaskError
 from prior_sg.deploy.serving.changing import CHANGING
+from prior_sg.deploy.serving.errors import BusyError, FaultyRequestError
 from prior_sg.deploy.serving.events import Feeds
 from prior_sg.deploy.serving.gate import PROBLEM, App, Entrance, Gate, problem
 from prior_sg.deploy.serving.reading import READING
-from prior_sg.deploy.serving.system import BusyError, FaultyRequestError, System
+from prior_sg.deploy.serving.system import System
 from prior_sg.schemas.names import shown
 from prior_sg.services.errors import PriorSgError
 from prior_sg.services.runtime.bus import BusError

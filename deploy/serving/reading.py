@@ -1,8 +1,7 @@
 """What can be read over HTTP. Each handler asks the store; `revision` in an answer is the scene's that it is about."""
 
-import math
 from collections.abc import AsyncIterator, Callable
-from typing import Annotated, Any, TypeVar, get_args
+from typing import Annotated, Any, TypeVar
 
 import msgspec
 from litestar import Request, Response, get, post
@@ -13,9 +12,11 @@ from litestar.response import ServerSentEvent, ServerSentEventMessage
 
 from prior_sg.deploy.api.errors import NotInSceneError
 from prior_sg.deploy.json_text import json_text
+from prior_sg.deploy.serving.errors import FaultyRequestError
 from prior_sg.deploy.serving.events import Event
 from prior_sg.deploy.serving.gate import PROBLEM
-from prior_sg.deploy.serving.system import LONGEST_SEARCH, MOST_LIMIT, MOST_QUESTIONS, FaultyRequestError, System
+from prior_sg.deploy.serving.spots import ENDS, spot_in
+from prior_sg.deploy.serving.system import LONGEST_SEARCH, MOST_LIMIT, MOST_QUESTIONS, System
 from prior_sg.deploy.showing.export import scene_json
 from prior_sg.deploy.showing.text import LEAST_TOKENS, MOST_TOKENS, USUAL_TOKENS, scene_text
 from prior_sg.schemas.codec import encode
@@ -37,7 +38,6 @@ from prior_sg.schemas.queries import (
     RegionBeliefs,
     RouteBetween,
     SceneAnswer,
-    Spot,
     Things,
     What,
     Words,
@@ -54,7 +54,6 @@ Label = Annotated[str, Parameter(max_length=80)]
 Distance = Annotated[float, Parameter(ge=0, le=1e9, description="Metres.")]
 Tokens = Annotated[int, Parameter(ge=LEAST_TOKENS, le=MOST_TOKENS)]
 Plain = Request[Any, Any, Any]
-ENDS = "a label; or `place:ID`, `region:ID`, `object:ID`; or a point `X,Y,Z`"
 LOWEST, HIGHEST = (-1e9,) * 3, (1e9,) * 3
 EVERY_REGION = InBox(min_m=LOWEST, max_m=HIGHEST, what="region", limit=MOST_LIMIT)
 Q = TypeVar("Q")
@@ -320,23 +319,6 @@ def _message(event: Event | None) -> ServerSentEventMessage:
     if event is None:
         return ServerSentEventMessage(data=None, comment="nothing new")
     return ServerSentEventMessage(json_text(event.data, indent=None), event=event.name, id=event.revision)
-
-
-def spot_in(text: str) -> Spot:
-    """An end of a route as it is written in an address. Raises FaultyRequestError."""
-    kind, _, number = text.partition(":")
-    if kind in get_args(What) and number.isascii() and number.removeprefix("-").isdigit() and len(number) < 19:
-        return Spot(what=kind, id=int(number))  # type: ignore[arg-type]
-    parts = text.split(",")
-    try:
-        point = tuple(map(float, parts))
-    except ValueError:
-        point = ()
-    if len(point) == 3 and all(map(math.isfinite, point)):
-        return Spot(point_m=point)
-    if not text.strip() or point:
-        raise FaultyRequestError(f"an end of a route is {ENDS}")
-    return Spot(label=text)
 
 
 def _system(state: State) -> System:

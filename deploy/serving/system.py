@@ -15,6 +15,7 @@ import numpy as np
 from prior_sg.deploy.api.client import Client, Health
 from prior_sg.deploy.api.errors import NotInSceneError, TaskError
 from prior_sg.deploy.api.scene import Scene
+from prior_sg.deploy.serving.errors import BusyError, FaultyRequestError
 from prior_sg.schemas.codec import DecodeError, decode
 from prior_sg.schemas.names import fault_of_robot, normal
 from prior_sg.schemas.priors import Prior, fault_of_task
@@ -22,7 +23,6 @@ from prior_sg.schemas.queries import MOST_RANKED, AnswersTo, Question, SceneAnsw
 from prior_sg.schemas.scene import Scene as SceneMessage
 from prior_sg.schemas.scene import SceneRevision
 from prior_sg.schemas.topics import SCENE_REVISION
-from prior_sg.services.errors import PriorSgError
 from prior_sg.services.runtime.bus import Bus, Sample
 
 MOST_ROBOTS = 64  # whose clients are kept
@@ -31,14 +31,6 @@ READERS, WRITERS = 16, 4  # threads
 MOST_QUESTIONS, MOST_POSES, MOST_LIMIT = 64, 10_000, 10_000
 LONGEST_SEARCH = 500  # characters
 T = TypeVar("T")
-
-
-class FaultyRequestError(PriorSgError):
-    """What was asked can never be answered; the message says why."""
-
-
-class BusyError(PriorSgError):
-    """Too much of this kind goes on at the moment."""
 
 
 @dataclass(frozen=True)
