@@ -116,7 +116,8 @@ def _add_system(commands: Commands) -> None:
         needs="encode",
     )
     bench.add_argument(
-        "name", help="bus, places, features, kernel, swap, segmenter, task, learning, e2e, all of these, or pool"
+        "name",
+        help="bus, places, features, kernel, swap, segmenter, task, learning, queries, e2e, all of these, or pool",
     )
     bench.add_argument("--seconds", type=float, default=300.0, help="how long pool lasts (default: %(default)s)")
     bench.add_argument("--json", action="store_true", help="print one JSON object per measurement")
