@@ -111,7 +111,7 @@ def near(system: System) -> Tool:
 
     @told
     async def near(
-        x: Coordinate, y: Coordinate, z: Coordinate, what: What = "object", label: Label = "", k: Count = 5
+        *, x: Coordinate, y: Coordinate, z: Coordinate, what: What = "object", label: Label = "", k: Count = 5
     ) -> str:
         """The nearest places, regions or objects to a point, of a label where one is given."""
         return await _answer(system, lambda: Nearest(point_m=(x, y, z), what=what, label=label, limit=k))
@@ -124,6 +124,7 @@ def within(system: System) -> Tool:
 
     @told
     async def within(
+        *,
         x: Coordinate,
         y: Coordinate,
         z: Coordinate,
@@ -132,7 +133,7 @@ def within(system: System) -> Tool:
         label: Label = "",
         limit: Count = 20,
     ) -> str:
-        """What is no farther than a distance from a point, the nearest first; regions and objects unless `what` says."""
+        """What is no farther than a distance from a point, the nearest first; without `what`, regions and objects."""
         return await _answer(
             system, lambda: InRadius(point_m=(x, y, z), radius_m=radius_m, what=what, label=label, limit=limit)
         )

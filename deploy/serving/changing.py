@@ -8,8 +8,8 @@ from litestar import Response, post, put
 from litestar.datastructures import State
 
 from prior_sg.deploy.serving.errors import FaultyRequestError
-from prior_sg.deploy.serving.reading import FAULTS, Robot
-from prior_sg.deploy.serving.system import MOST_POSES, System
+from prior_sg.deploy.serving.parameters import FAULTS, Robot, system_of
+from prior_sg.deploy.serving.system import MOST_POSES
 from prior_sg.schemas.names import LONGEST_TEXT
 
 Seconds = Annotated[float, msgspec.Meta(ge=0.1, le=300.0)]
@@ -63,8 +63,7 @@ class PosesTaken(msgspec.Struct, frozen=True):
 async def switch_task(state: State, robot: Robot, data: NewTask) -> Response[TaskTaken]:
     """Give the robot another task and wait, `wait_s` at most, for regions that follow it: 200 when they are there, 202
     when only the prior is."""
-    system: System = state["system"]
-    given = await system.give_task(robot, data.task, data.environment, data.regions, data.wait_s)
+    given = await system_of(state).give_task(robot, data.task, data.environment, data.regions, data.wait_s)
     prior, note = given.prior, given.prior.provenance.note
     if given.scene is None:
         waiting = TaskTaken(robot, prior.digest(), note, given.seconds, note=given.note)
@@ -76,11 +75,10 @@ async def switch_task(state: State, robot: Robot, data: NewTask) -> Response[Tas
 @post("/v1/{robot:str}/poses", status_code=200, responses=FAULTS)
 async def correct_poses(state: State, robot: Robot, data: Poses) -> PosesTaken:
     """Give keyframes other poses and wait until the map has taken them."""
-    system: System = state["system"]
     poses = {one.frame: np.array(one.world_from_camera) for one in data.poses}
     if len(poses) < len(data.poses):
         raise FaultyRequestError("a keyframe is given two poses: give one")
-    return PosesTaken(robot, len(poses), await system.correct_poses(robot, poses, data.wait_s))
+    return PosesTaken(robot, len(poses), await system_of(state).correct_poses(robot, poses, data.wait_s))
 
 
 CHANGING = [switch_task, correct_poses]

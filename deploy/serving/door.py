@@ -21,7 +21,7 @@ def joined(connect: str, robot: str) -> Iterator[System]:
         system.close()
 
 
-def serve_api(connect: str, robot: str, entrance: Entrance, port: int, say: Say, parent: int = 0) -> None:
+def serve_api(connect: str, robot: str, entrance: Entrance, port: int, say: Say, *, parent: int = 0) -> None:
     """HTTP until a signal. Raises BusError, UserError, KeyboardInterrupt."""
     from prior_sg.deploy.serving.events import Feeds
     from prior_sg.deploy.serving.http import http_app

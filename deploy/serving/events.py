@@ -68,19 +68,14 @@ class Feed:
                 self._told = (await self._system.answers(self._robot)).revision
                 self._pump = asyncio.create_task(self._tell())
             missed, seen = await self._missed(last_revision), -1
-            for event in missed or [None]:
-                seen = event.revision if event is not None else seen
+            if not missed:
+                yield None
+            for event in missed:
+                seen = event.revision
                 yield event
-            while True:
-                try:
-                    event = await asyncio.wait_for(queue.get(), SILENCE_S)
-                except TimeoutError:
-                    yield None
-                    continue
-                if event is None:
-                    return
-                if event.revision > seen:
-                    yield event
+            async for news in _arriving(queue):
+                if news is None or news.revision > seen:
+                    yield news
         finally:
             self._followers.discard(queue)
 
@@ -121,6 +116,20 @@ class Feed:
         found = await self._system.answers(self._robot, WordsInUse())
         data = _where(found) | {"scene": msgspec.to_builtins(found.answers[0])}
         return Event("snapshot", -1, found.revision, data | ({"reason": reason} if reason else {}))
+
+
+async def _arriving(queue: asyncio.Queue[Event | None]) -> AsyncIterator[Event | None]:
+    """Events as they come, None after a silence; ends where the queue holds None."""
+    while True:
+        try:
+            async with asyncio.timeout(SILENCE_S):
+                event = await queue.get()
+        except TimeoutError:
+            yield None
+            continue
+        if event is None:
+            return
+        yield event
 
 
 class Feeds:

@@ -8,7 +8,7 @@ from litestar.datastructures import State
 from litestar.exceptions import HTTPException
 from litestar.openapi import OpenAPIConfig
 from litestar.openapi.plugins import JsonRenderPlugin
-from litestar.openapi.spec import Components, SecurityScheme
+from litestar.openapi.spec import Components, Reference, SecurityScheme
 
 from prior_sg.deploy.api.errors import NotInSceneError, PosesError, TaskError
 from prior_sg.deploy.serving.changing import CHANGING
@@ -17,6 +17,7 @@ from prior_sg.deploy.serving.events import Feeds
 from prior_sg.deploy.serving.gate import PROBLEM, App, Entrance, Gate, problem
 from prior_sg.deploy.serving.reading import READING
 from prior_sg.deploy.serving.system import System
+from prior_sg.deploy.serving.wholes import WHOLES
 from prior_sg.schemas.names import shown
 from prior_sg.services.errors import PriorSgError
 from prior_sg.services.runtime.bus import BusError
@@ -39,7 +40,7 @@ STATUS_OF: dict[type[Exception], int] = {  # the first that fits
 def http_app(system: System, feeds: Feeds, entrance: Entrance) -> App:
     """The application behind its gate."""
     app = Litestar(
-        route_handlers=[*READING, *CHANGING],
+        route_handlers=[*READING, *WHOLES, *CHANGING],
         state=State({"system": system, "feeds": feeds}),
         openapi_config=_openapi(entrance),
         exception_handlers={HTTPException: _told, Exception: _told},
@@ -50,7 +51,7 @@ def http_app(system: System, feeds: Feeds, entrance: Entrance) -> App:
 
 
 def _openapi(entrance: Entrance) -> OpenAPIConfig:
-    bearer = {"bearer": SecurityScheme(type="http", scheme="bearer")}
+    bearer: dict[str, SecurityScheme | Reference] = {"bearer": SecurityScheme(type="http", scheme="bearer")}
     return OpenAPIConfig(
         title="Prior-SG",
         version="1",
@@ -58,7 +59,7 @@ def _openapi(entrance: Entrance) -> OpenAPIConfig:
         path="/openapi",
         render_plugins=[JsonRenderPlugin(path="/openapi.json")],
         use_handler_docstrings=True,
-        components=Components(security_schemes=bearer if entrance.token else {}),
+        components=Components(security_schemes=bearer if entrance.token else None),
         security=[{"bearer": []}] if entrance.token else None,
     )
 
@@ -80,5 +81,3 @@ def _detail(error: HTTPException) -> str:
     named = error.extra if isinstance(error.extra, list) else []
     fields = [f"{one.get('key') or 'the body'}: {one.get('message', '')}" for one in named if isinstance(one, dict)]
     return "; ".join(fields) or error.detail
-
-

@@ -32,7 +32,7 @@ def main() -> int:
     try:
         entry = entrance(arguments.host, arguments.token_file)
         with contextlib.suppress(KeyboardInterrupt):
-            door.serve_api(arguments.connect, arguments.robot, entry, arguments.port, log.info, arguments.parent)
+            door.serve_api(arguments.connect, arguments.robot, entry, arguments.port, log.info, parent=arguments.parent)
     except (UserError, BusError) as error:
         log.error(str(error))
         return EXIT_HOPELESS

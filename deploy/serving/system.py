@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, TypeVar
 
+import msgspec
 import numpy as np
 
 from prior_sg.deploy.api.client import Client, Health
@@ -30,6 +31,7 @@ MOST_WRITTEN = 8  # forms of scenes that are kept
 READERS, WRITERS = 16, 4  # threads
 MOST_QUESTIONS, MOST_POSES, MOST_LIMIT = 64, 10_000, 10_000
 LONGEST_SEARCH = 500  # characters
+EVERYWHERE: dict[str, Any] = {"min_m": (-1e9,) * 3, "max_m": (1e9,) * 3}
 T = TypeVar("T")
 
 
@@ -72,7 +74,9 @@ class System:
     async def answers(self, robot: str, *questions: Question) -> SceneAnswer:
         """Answers of the store. Raises FaultyRequestError, NotInSceneError, BusError."""
         if len(questions) > MOST_QUESTIONS:
-            raise FaultyRequestError(f"{len(questions)} questions are asked at once: at most {MOST_QUESTIONS} are taken")
+            raise FaultyRequestError(
+                f"{len(questions)} questions are asked at once: at most {MOST_QUESTIONS} are taken"
+            )
         for question in questions:
             if getattr(question, "limit", 0) > MOST_LIMIT:
                 raise FaultyRequestError(f"the limit is above {MOST_LIMIT}: ask for fewer")
@@ -87,7 +91,16 @@ class System:
             raise FaultyRequestError(f"a text to search for has 1 to {LONGEST_SEARCH} characters")
         regions, objects, missing = await self._read(robot, lambda client: client.likeness(text))
         question = AnswersTo(text=text, regions=regions, objects=objects, what=what, limit=limit)
-        return await self.answers(robot, question)
+        found = await self.answers(robot, question)
+        ranking: Any = found.answers[0]
+        if missing:
+            told = msgspec.structs.replace(ranking, note=f"{ranking.note}: {missing}".removeprefix(": "))
+            found = msgspec.structs.replace(found, answers=[told])
+        return found
+
+    async def scene(self, robot: str) -> Scene:
+        """The scene as stored now. Raises as `answers`."""
+        return await self._read(robot, lambda client: client.scene())
 
     async def tag(self, robot: str) -> str:
         """Another one whenever the scene is another. Raises as `answers`."""
