@@ -6,6 +6,7 @@ import msgspec
 import numpy as np
 from litestar import Response, post, put
 from litestar.datastructures import State
+from litestar.params import JSONBody
 
 from prior_sg.deploy.serving.errors import FaultyRequestError
 from prior_sg.deploy.serving.parameters import FAULTS, Robot, system_of
@@ -60,7 +61,7 @@ class PosesTaken(msgspec.Struct, frozen=True):
 
 
 @put("/v1/{robot:str}/task", responses=FAULTS)
-async def switch_task(state: State, robot: Robot, data: NewTask) -> Response[TaskTaken]:
+async def switch_task(state: State, robot: Robot, data: JSONBody[NewTask]) -> Response[TaskTaken]:
     """Give the robot another task and wait, `wait_s` at most, for regions that follow it: 200 when they are there, 202
     when only the prior is."""
     given = await system_of(state).give_task(robot, data.task, data.environment, data.regions, data.wait_s)
@@ -73,7 +74,7 @@ async def switch_task(state: State, robot: Robot, data: NewTask) -> Response[Tas
 
 
 @post("/v1/{robot:str}/poses", status_code=200, responses=FAULTS)
-async def correct_poses(state: State, robot: Robot, data: Poses) -> PosesTaken:
+async def correct_poses(state: State, robot: Robot, data: JSONBody[Poses]) -> PosesTaken:
     """Give keyframes other poses and wait until the map has taken them."""
     poses = {one.frame: np.array(one.world_from_camera) for one in data.poses}
     if len(poses) < len(data.poses):

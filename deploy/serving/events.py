@@ -43,7 +43,9 @@ class Feed:
         self._news = asyncio.Event()
         self._pump: asyncio.Task[None] | None = None
 
-    def __len__(self) -> int:
+    @property
+    def followers(self) -> int:
+        """How many follow it now."""
         return len(self._followers)
 
     def wake(self) -> None:
@@ -149,9 +151,9 @@ class Feeds:
     def follow(self, robot: str, last_revision: int | None) -> AsyncIterator[Event | None]:
         """As `Feed.follow`. Raises BusyError."""
         self._loop = asyncio.get_running_loop()
-        if sum(map(len, self._feeds.values())) >= MOST_FOLLOWERS:
+        if sum(feed.followers for feed in self._feeds.values()) >= MOST_FOLLOWERS:
             raise BusyError(f"{MOST_FOLLOWERS} connections follow changes already: close one, or try again later")
-        self._feeds = {name: feed for name, feed in self._feeds.items() if len(feed)} | {
+        self._feeds = {name: feed for name, feed in self._feeds.items() if feed.followers} | {
             robot: self._feeds.get(robot) or Feed(self._system, robot)
         }
         return self._feeds[robot].follow(last_revision)

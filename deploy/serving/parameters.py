@@ -4,18 +4,18 @@ from typing import Annotated, Any
 
 from litestar.datastructures import State
 from litestar.openapi.datastructures import ResponseSpec
-from litestar.params import Parameter
+from litestar.params import PathParameter, QueryParameter
 
 from prior_sg.deploy.serving.gate import PROBLEM
 from prior_sg.deploy.serving.system import MOST_LIMIT, System
 from prior_sg.deploy.showing.text import LEAST_TOKENS, MOST_TOKENS
 
-Robot = Annotated[str, Parameter(description="Name of the robot.", min_length=1, max_length=64)]
-Count = Annotated[int, Parameter(ge=1, le=MOST_LIMIT)]
-Coordinate = Annotated[float, Parameter(ge=-1e9, le=1e9, description="World, metres.")]
-Label = Annotated[str, Parameter(max_length=80)]
-Distance = Annotated[float, Parameter(ge=0, le=1e9, description="Metres.")]
-Tokens = Annotated[int, Parameter(ge=LEAST_TOKENS, le=MOST_TOKENS)]
+Robot = Annotated[str, PathParameter(description="Name of the robot.", min_length=1, max_length=64)]
+Count = Annotated[int, QueryParameter(ge=1, le=MOST_LIMIT)]
+Coordinate = Annotated[float, QueryParameter(ge=-1e9, le=1e9, description="World, metres.")]
+Label = Annotated[str, QueryParameter(max_length=80)]
+Distance = Annotated[float, QueryParameter(ge=0, le=1e9, description="Metres.")]
+Tokens = Annotated[int, QueryParameter(ge=LEAST_TOKENS, le=MOST_TOKENS)]
 FAULTS = {
     status: ResponseSpec(dict[str, Any], media_type=PROBLEM, description=why, generate_examples=False)
     for status, why in {

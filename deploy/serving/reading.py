@@ -6,7 +6,7 @@ from typing import Annotated, Any, TypeVar
 import msgspec
 from litestar import get, post
 from litestar.datastructures import State
-from litestar.params import Parameter
+from litestar.params import FromPath, FromQuery, JSONBody, QueryParameter
 
 from prior_sg.deploy.api.errors import NotInSceneError
 from prior_sg.deploy.serving.errors import FaultyRequestError
@@ -86,7 +86,7 @@ async def robots(state: State) -> list[str]:
 
 
 @post("/v1/{robot:str}/query", status_code=200, responses=FAULTS)
-async def query(state: State, robot: Robot, data: Questions) -> SceneAnswer:
+async def query(state: State, robot: Robot, data: JSONBody[Questions]) -> SceneAnswer:
     """Any questions, answered over one revision."""
     return await system_of(state).answers(robot, *data.questions)
 
@@ -104,7 +104,7 @@ async def objects(state: State, robot: Robot, label: Label = "", limit: Count = 
 
 
 @get("/v1/{robot:str}/regions/{number:int}", responses=FAULTS)
-async def region(state: State, robot: Robot, number: int) -> RegionInFull:
+async def region(state: State, robot: Robot, number: FromPath[int]) -> RegionInFull:
     """One region: its outline and ways out, what else it may be, and where one can go from it."""
     questions = (
         _asked(ById, what="region", id=number),
@@ -118,13 +118,13 @@ async def region(state: State, robot: Robot, number: int) -> RegionInFull:
 
 
 @get("/v1/{robot:str}/objects/{number:int}", responses=FAULTS)
-async def object_(state: State, robot: Robot, number: int) -> Answered:
+async def object_(state: State, robot: Robot, number: FromPath[int]) -> Answered:
     """One object."""
     return _there_in(await _one(state, robot, _asked(ById, what="object", id=number)))
 
 
 @get("/v1/{robot:str}/places/{number:int}", responses=FAULTS)
-async def place(state: State, robot: Robot, number: int) -> Answered:
+async def place(state: State, robot: Robot, number: FromPath[int]) -> Answered:
     """One place: its radius, its beliefs, its opening to unobserved space."""
     return _there_in(await _one(state, robot, _asked(ById, what="place", id=number)))
 
@@ -137,7 +137,7 @@ async def near(
     x: Coordinate,
     y: Coordinate,
     z: Coordinate,
-    what: What = "object",
+    what: FromQuery[What] = "object",
     label: Label = "",
     k: Count = 1,
 ) -> Answered:
@@ -154,7 +154,7 @@ async def within(
     y: Coordinate,
     z: Coordinate,
     radius_m: Distance,
-    what: What | None = None,
+    what: FromQuery[What | None] = None,
     label: Label = "",
     limit: Count = MOST_LISTED,
 ) -> Answered:
@@ -167,8 +167,8 @@ async def within(
 async def route(
     state: State,
     robot: Robot,
-    start: Annotated[str, Parameter(query="from", max_length=120, description=ENDS)],
-    goal: Annotated[str, Parameter(query="to", max_length=120, description=ENDS)],
+    start: Annotated[str, QueryParameter(name="from", max_length=120, description=ENDS)],
+    goal: Annotated[str, QueryParameter(name="to", max_length=120, description=ENDS)],
     clearance_m: Distance = 0.0,
 ) -> Answered:
     """The shortest way over the place graph on which nothing is closer than `clearance_m`."""
@@ -181,8 +181,8 @@ async def route(
 async def search(
     state: State,
     robot: Robot,
-    q: Annotated[str, Parameter(min_length=1, max_length=LONGEST_SEARCH)],
-    what: What | None = None,
+    q: Annotated[str, QueryParameter(min_length=1, max_length=LONGEST_SEARCH)],
+    what: FromQuery[What | None] = None,
     k: Count = MOST_RANKED,
 ) -> Answered:
     """What answers a text such as "somewhere to sit and eat", the best first; at a score of 0.5 it is as likely right
@@ -191,7 +191,7 @@ async def search(
 
 
 @get("/v1/{robot:str}/changes", responses=FAULTS)
-async def changes(state: State, robot: Robot, since: Annotated[int, Parameter(ge=-1)]) -> Answered:
+async def changes(state: State, robot: Robot, since: Annotated[int, QueryParameter(ge=-1)]) -> Answered:
     """What is new, gone and renamed since a revision; `reason` where that one is not kept."""
     return await _one(state, robot, _asked(ChangedSince, revision=since))
 

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 import msgspec
 from litestar import Request, Response, get
 from litestar.datastructures import State
-from litestar.params import Parameter
+from litestar.params import HeaderParameter
 from litestar.response import ServerSentEvent, ServerSentEventMessage
 
 from prior_sg.deploy.json_text import json_text
@@ -74,7 +74,7 @@ async def scene_told(
 
 @get("/v1/{robot:str}/events", responses=FAULTS, media_type="text/event-stream")
 async def events(
-    state: State, robot: Robot, last_event_id: Annotated[str | None, Parameter(header="Last-Event-ID")] = None
+    state: State, robot: Robot, last_event_id: Annotated[str | None, HeaderParameter(name="Last-Event-ID")] = None
 ) -> ServerSentEvent:
     """Server-sent events: `changes` with what is new, gone and renamed, `id` the revision. A connection that names the
     last one it has goes on from there; where that is not kept, and in the beginning, comes a `snapshot`."""
