@@ -9,7 +9,7 @@ from prior_sg.schemas.frames import PoseUpdate
 from prior_sg.schemas.priors import PriorList, Task
 from prior_sg.schemas.queries import SceneQuery
 from prior_sg.schemas.regions import RegionDelta
-from prior_sg.schemas.scene import SceneRevision
+from prior_sg.schemas.scene import SceneRequest, SceneRevision
 from prior_sg.schemas.status import Consumed
 from prior_sg.schemas.topics import (
     JOURNAL,
@@ -25,6 +25,7 @@ from prior_sg.schemas.topics import (
 )
 from prior_sg.services.runtime.bus import Hub, LocalBus
 from prior_sg.services.runtime.client import BusClient
+from prior_sg.services.scene_store.core import graph
 from prior_sg.services.scene_store.core.queries.answering import reply
 from prior_sg.services.scene_store.core.queries.index import Index
 from tests.help.world import prior
@@ -35,11 +36,11 @@ class StandIn:
 
     def __init__(self, scene, relabel=lambda scene, task, digest: scene):
         self.hub, self.robot, self.relabel = Hub(), scene.robot, relabel
-        self.scenes, self.tasks, self.poses, self.asked = [scene], [], [], 0
+        self.scenes, self.tasks, self.poses = [scene], [], []
         self.forgotten = set()
         self.bus = BusClient(LocalBus(self.hub))
         serve = self.bus.bus.serve
-        serve(SCENE.key.format(robot=self.robot), lambda request: request.reply(encode(self.scenes[-1])))
+        serve(SCENE.key.format(robot="*"), self.show)
         serve(SCENE_QUERY.key.format(robot="*"), self.answer)
         serve(PRIORS.key, lambda request: request.reply(encode(PriorList(priors=[], reason="no library"))))
         self.bus.bus.announce(alive_key("place_graph", "p-1"))
@@ -49,8 +50,11 @@ class StandIn:
     def open_bus(self):
         return LocalBus(self.hub)
 
+    def show(self, request):
+        robot = decode(SceneRequest, request.payload).robot
+        request.reply(encode(self.scenes[-1] if robot == self.robot else empty(robot)))
+
     def answer(self, request):
-        self.asked += 1
         query = decode(SceneQuery, request.payload)
         known = query.robot == self.robot
         scene, revision = (self.scenes[-1], len(self.scenes) - 1) if known else (empty(query.robot), -1)
@@ -113,6 +117,4 @@ def delta(robot, task, digest):
 
 
 def empty(robot):
-    from prior_sg.services.scene_store.core import graph
-
     return graph.scene(graph.Graph(robot))
