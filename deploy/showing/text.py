@@ -132,12 +132,12 @@ def _contents(region: Region, objects: dict[int, SceneObject]) -> str:
 def _by_label(items: list[SceneObject]) -> str:
     found: dict[str, list[int]] = {}
     for item in items:
-        found.setdefault(_short(item.label) or "unnamed object", []).append(item.id)
-    told = []
-    for label, numbers in sorted(found.items(), key=lambda entry: (entry[0] == "unnamed object", -len(entry[1]))):
+        found.setdefault(_short(item.label), []).append(item.id)
+    unnamed, told = found.pop("", []), []
+    for label, numbers in sorted(found.items(), key=lambda entry: -len(entry[1])):
         more = f" and {len(numbers) - MOST_IDS} more" if len(numbers) > MOST_IDS else ""
         told.append(f"{label} {' '.join(f'#{number}' for number in numbers[:MOST_IDS])}{more}")
-    return ", ".join(told)
+    return ", ".join(told + ([f"{len(unnamed)} unnamed objects"] if unnamed else []))
 
 
 def _candidates(scene: Scene, region: Region) -> str:
