@@ -25,12 +25,12 @@ async def measure(url: str, robot: str, followers: int, asking: int, seconds: fl
         found = await asyncio.gather(*following, *(_ask(client, end_s) for _ in range(asking)))
     events, asked = found[:followers], [one for requests in found[followers:] for one in requests]
     statuses = sorted({status for _, status, _ in asked})
-    per_address = {address: [1e3 * took for one, _, took in asked if one == address] for address in ADDRESSES}
+    spent_ms = {address: [1e3 * took for one, _, took in asked if one == address] for address in ADDRESSES}
     return {
         "requests_per_s": len(asked) / seconds,
         "statuses": statuses,
         "events_per_follower": {"least": min(events, default=0), "most": max(events, default=0)},
-        "ms_p50_p99": {address: np.percentile(took, [50, 99]).tolist() for address, took in per_address.items() if took},
+        "ms_p50_p99": {address: np.percentile(took, [50, 99]).tolist() for address, took in spent_ms.items() if took},
     }
 
 

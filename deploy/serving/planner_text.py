@@ -1,4 +1,4 @@
-"""Answers as a language model reads them: without what is empty, few digits, no control characters (pure)."""
+"""Answers as a language model reads them: without what is empty, few digits, no control characters."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""Ends of routes as people write them (pure)."""
+"""Ends of routes as people write them."""
 
 import math
 from typing import get_args

@@ -10,6 +10,8 @@ from hypothesis import strategies as st
 
 from prior_sg.deploy.api.scene import Scene
 from prior_sg.deploy.benches.queries import synthetic_scene
+from prior_sg.deploy.showing.formats import save
+from prior_sg.deploy.showing.material import Material
 from prior_sg.deploy.showing.text import LEAST_TOKENS, scene_text, tokens_of
 from prior_sg.schemas.regions import Transition
 from tests.deploy.api.test_scene import EMPTY, message, region
@@ -33,7 +35,7 @@ def house():
     return message(regions=[hall, kitchen], **frontier)
 
 
-def test_it_says_what_is_where_and_how_to_get_there():
+def test_it_says_what_is_where_and_how_to_get_there(tmp_path):
     assert scene_text(house()).splitlines() == [
         'Task: "tidy up" in "home".',
         "2 regions, 1 objects, 3 places; positions (x, y, z) in metres, z up; # is an id, p a probability.",
@@ -46,7 +48,8 @@ def test_it_says_what_is_where_and_how_to_get_there():
         "Openings to unobserved space:",
         "- 1.5 m2 in hall #7 at (1.0, 0.0, 1.0) towards (1.0, 0.0, 0.0)",
     ]
-    assert Scene(house()).to_text() == scene_text(house())
+    save(Material(house()), tmp_path / "scene.txt")
+    assert Scene(house()).to_text() == scene_text(house()) == (tmp_path / "scene.txt").read_text()
 
 
 def test_without_task_and_regions():
