@@ -3,10 +3,12 @@
 import argparse
 import contextlib
 import logging
+import signal
 import sys
 from pathlib import Path
 
 from prior_sg.deploy.errors import UserError
+from prior_sg.deploy.interrupts import interrupt
 from prior_sg.deploy.running.serve import EXIT_HOPELESS
 from prior_sg.deploy.serving import door
 from prior_sg.deploy.serving.gate import entrance
@@ -29,6 +31,7 @@ def main() -> int:
     parser.add_argument("--token-file", type=Path, default=None)
     arguments = parser.parse_args()
     start_logging("api", arguments.instance)
+    signal.signal(signal.SIGTERM, interrupt)
     try:
         entry = entrance(arguments.host, arguments.token_file)
         with contextlib.suppress(KeyboardInterrupt):
