@@ -38,6 +38,7 @@ from prior_sg.schemas.queries import (
 from prior_sg.schemas.regions import Region
 from prior_sg.services.errors import PriorSgError
 
+NO_PRIOR = "the prior of this scene is not at hand, so labels were compared with the text by their names alone"
 PointLike = Sequence[float] | np.ndarray[Any, Any]
 SpotLike = str | Spot | Thing | Region | SceneObject | PointLike
 
@@ -126,18 +127,20 @@ class Asking(ABC):
         """What answers a text such as "somewhere to sit and eat", the best first; at a score of 0.5 it is as likely
         right as not. Without `what`, regions, objects, and the best place of each region.
 
-        Where no embedding of the text can be had, labels are compared with it word by word, and a warning says so.
+        Where no embedding of the text can be had, labels are compared with it word by word; where the scene's prior is
+        not at hand, by their names alone. A warning says so.
         """
         regions, objects, missing = self.likeness(text)
         question = AnswersTo(text=text, regions=regions, objects=objects, what=what, limit=limit)
         ranking: Any
         (ranking,) = self.ask(question)
         if missing:
-            warnings.warn(f"{ranking.note or 'the text was not embedded'}: {missing}", stacklevel=2)
+            warnings.warn(f"{ranking.note}: {missing}" if ranking.note else missing, stacklevel=2)
         return list(ranking.things)
 
     def likeness(self, text: str) -> tuple[dict[str, float], dict[str, float], str]:
-        """How probably regions and objects of each label answer a text, by label; or why that is not known."""
+        """How probably regions and objects of each label answer a text, by label, both empty where nothing embeds it;
+        and in one sentence what is missing."""
         from prior_sg.services.scene_store.core.queries import likeness as core
 
         words: Any
@@ -145,12 +148,13 @@ class Asking(ABC):
         if not words.space:
             return {}, {}, "nothing has been seen in an embedding space yet"
         try:
-            meant = core.vocabulary(words, self.prior_of(words.prior_digest))
+            prior = self.prior_of(words.prior_digest)
+            meant = core.vocabulary(words, prior)
             said = self.embed(words.space, [text])[0]
             embedded = self._embedded(words.space, meant.phrases)
         except PriorSgError as error:
             return {}, {}, str(error)
-        return *core.likeness(said, embedded, meant), ""
+        return *core.likeness(said, embedded, meant), "" if prior is not None else NO_PRIOR
 
     def _embedded(self, space: str, phrases: Sequence[str]) -> Mapping[str, np.ndarray[Any, Any]]:
         """Vectors by phrase; those of a vocabulary are asked for once."""

@@ -107,9 +107,10 @@ class Scene(Asking):
     @classmethod
     def read(cls, path: str | Path, robot: str = DEFAULT_ROBOT) -> "Scene":
         """The scene in a run's folder, scene.json, scene.sqlite, log.mcap or a file of Spark-DSG. Raises Error."""
-        from prior_sg.deploy.showing.reading import read_scene
+        from prior_sg.deploy.showing.reading import read_material
 
-        return cls(read_scene(path, robot))
+        found = read_material(path, robot)
+        return cls(found.scene, found.prior)
 
     def save(self, path: str | Path, format: str = "") -> None:
         """Write it in a format of docs/exports.md, which the path's ending names unless `format` does. Raises Error."""

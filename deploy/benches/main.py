@@ -14,6 +14,7 @@ from prior_sg.deploy.benches.encoder_swap import encoder_swap
 from prior_sg.deploy.benches.kernel import kernel
 from prior_sg.deploy.benches.learning import learning_bench
 from prior_sg.deploy.benches.places import place_bench
+from prior_sg.deploy.benches.queries import query_bench
 from prior_sg.deploy.benches.swap import swap_bench
 from prior_sg.deploy.sample import SAMPLE
 from prior_sg.deploy.settings import DEMO_ENVIRONMENT, DEMO_TASK
@@ -104,6 +105,7 @@ BENCHES: dict[str, Callable[[], tuple[dict, dict]]] = {
     "task": segmenter.switch,
     "learning": learning_bench,
     "encoder_swap": exchanged_encoder,
+    "queries": query_bench,
     "e2e": e2e,
 }
 

@@ -45,7 +45,7 @@ def add_commands(commands: Commands) -> None:
     )
     parser.epilog = FORMS
     parser.add_argument("words", nargs="+", metavar="QUESTION", help="a sentence in quotes, or a form listed below")
-    parser.add_argument("--scene", type=Path, help="ask a saved scene: the folder of a run, a log or a .sqlite file")
+    parser.add_argument("--scene", type=Path, help="ask a saved scene: a run's folder or a file of docs/exports.md")
     parser.add_argument("--what", choices=WHATS, help="only these (default: what suits the question)")
     parser.add_argument("--label", default="", help="only what carries this label")
     parser.add_argument("--object", default="", metavar="LABEL", help="only objects of this label")
@@ -106,9 +106,9 @@ def _opened(arguments: argparse.Namespace) -> Any:
         from prior_sg.deploy.api.client import Client
 
         return Client(arguments.connect, arguments.robot)
-    from prior_sg.deploy.api.saved import open_scene
+    from prior_sg.deploy.api.scene import Scene
 
-    return _Saved(open_scene(arguments.scene, arguments.robot))
+    return _Saved(Scene.read(arguments.scene, arguments.robot))
 
 
 def _find(scene: "Asking", arguments: argparse.Namespace, words: Sequence[str]) -> "list[Thing]":

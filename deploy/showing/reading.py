@@ -1,5 +1,6 @@
 """Finds a scene, and what is known beside it, in what a run or another program left on disk."""
 
+import contextlib
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -11,11 +12,12 @@ from prior_sg.deploy.showing.material import Material
 from prior_sg.deploy.showing.scene_reading import scene_of_json
 from prior_sg.schemas.codec import DecodeError, decode
 from prior_sg.schemas.places import VoxelMap
+from prior_sg.schemas.priors import Prior
 from prior_sg.schemas.scene import Scene, SceneRequest
-from prior_sg.schemas.topics import SCENE
+from prior_sg.schemas.topics import PRIOR, SCENE
 from prior_sg.services.registry import BY_NAME
 from prior_sg.services.runtime import extras
-from prior_sg.services.runtime.record import attachments
+from prior_sg.services.runtime.record import attachments, read_log
 from prior_sg.services.runtime.runner import Runner
 
 IN_FOLDER = ("log.mcap", "scene.sqlite", "scene.json", "dsg.json")  # of a run; the first tells most
@@ -24,11 +26,6 @@ SCORES = ("scores.json", "metrics.json")
 
 class SourceUnreadable(UserError):
     """A source holds no scene; the message says what would."""
-
-
-def read_scene(path: str | Path, robot: str) -> Scene:
-    """The scene in a run's folder or one of its files, or in a file of Spark-DSG. Raises SourceUnreadable."""
-    return read_material(path, robot).scene
 
 
 def read_material(path: str | Path, robot: str, *, moments_wanted: int = 0, cloud_wanted: bool = False) -> Material:
@@ -106,14 +103,26 @@ def _read_log(path: Path, robot: str, moments_wanted: int, cloud_wanted: bool) -
     story = moments.moments_of(path, robot, max(1, moments_wanted)) if moments_wanted or not left else []
     if not left:
         scene, voxels = story[-1].scene if story else None, None
+    found = _some(scene, path, robot)
     return Material(
-        scene=_some(scene, path, robot),
+        scene=found,
+        prior=_prior_in(path, found.prior_digest),
         voxels=voxels,
         cloud=moments.cloud_of(path, robot) if cloud_wanted else None,
         moments=story if moments_wanted else [],
         settings=moments.settings_of(path),
         losses=json.loads(attached["losses.json"]) if "losses.json" in attached else None,
     )
+
+
+def _prior_in(path: Path, digest: str) -> Prior | None:
+    """The prior of a digest, where the log holds it; one that cannot be decoded was refused by everybody."""
+    for entry in read_log(path, [PRIOR]):
+        with contextlib.suppress(DecodeError):
+            prior = decode(Prior, entry.payload)
+            if prior.digest() == digest:
+                return prior
+    return None
 
 
 def _some(scene: Scene | None, path: Path, robot: str) -> Scene:

@@ -7,8 +7,7 @@
         print(mapper.scene.regions.labels)
 
 `Mapper` does everything in this process, `Client` talks to a running system, `open_source` reads recordings, `Scene` is
-what comes out, and `open_scene` reads one that a run has left. Whatever goes wrong for a user is an `Error`. Nothing is
-imported before it is used.
+what comes out. Whatever goes wrong for a user is an `Error`. Nothing is imported before it is used.
 """
 
 TYPE_CHECKING = False  # `typing` takes long to import, and nothing is before it is used
@@ -20,7 +19,6 @@ if TYPE_CHECKING:
     from prior_sg.deploy.api.errors import SaveError as SaveError
     from prior_sg.deploy.api.errors import TaskError as TaskError
     from prior_sg.deploy.api.mapper import Mapper as Mapper
-    from prior_sg.deploy.api.saved import open_scene as open_scene
     from prior_sg.deploy.api.scene import Scene as Scene
     from prior_sg.services.errors import PriorSgError as Error
     from prior_sg.services.ingest.sources import SourceError as SourceError
@@ -45,7 +43,6 @@ _HOMES = {
     "Scene": "deploy.api.scene",
     "SourceError": "services.ingest.sources",
     "TaskError": "deploy.api.errors",
-    "open_scene": "deploy.api.saved",
     "open_source": "services.ingest.sources",
 }
 __all__ = [
@@ -63,7 +60,6 @@ __all__ = [
     "SourceError",
     "TaskError",
     "__version__",
-    "open_scene",
     "open_source",
 ]
 

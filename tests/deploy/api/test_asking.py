@@ -109,6 +109,11 @@ def test_without_an_encoder_words_are_compared_and_that_is_said():
         Scene(message(space="")).find("in the kitchen")
 
 
+def test_without_its_prior_names_stand_alone_and_that_is_said():
+    with pytest.warns(UserWarning, match="not at hand"):
+        assert Told(message()).find("kitchen", what="region")[0].label == "kitchen"
+
+
 def test_a_running_system_gives_the_same_answers(scene):
     hub = Hub()
     bus = LocalBus(hub)
@@ -149,23 +154,13 @@ def saved(tmp_path_factory):
 
 def test_a_saved_scene_is_as_it_was_with_its_prior(saved):
     for path in (saved, saved / "log.mcap"):
-        found = prior_sg.open_scene(path)
+        found = prior_sg.Scene.read(path, ROBOT)
         assert found.message == message(prior_digest=PRIOR_OF_SCENE.digest())
         assert found.prior == PRIOR_OF_SCENE
 
 
-@pytest.mark.parametrize(
-    ("name", "reason"), [("scene.json", "rounded"), ("map.png", "holds no scene"), ("x", "no scene")]
-)
-def test_what_is_no_saved_scene_is_refused(tmp_path, name, reason):
-    if "." in name:
-        (tmp_path / name).write_text("{}")
-    with pytest.raises(prior_sg.NotInSceneError, match=reason):
-        prior_sg.open_scene(tmp_path / name)
-
-
 def asked(capsys, saved, *words):
-    status = main(["query", *words, "--scene", str(saved)])
+    status = main(["query", *words, "--scene", str(saved), "--robot", ROBOT])
     out, err = capsys.readouterr()
     return status, out, err
 

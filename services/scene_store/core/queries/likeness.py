@@ -5,8 +5,8 @@ phrases and takes the most similar. The other asks which of the prior's objects 
 expects those: "put the milk back into the fridge" names no room, but a refrigerator, which stands in kitchens. Labels
 share one probability, as of the labels one fits best.
 
-Chosen on the questions with odd numbers in deploy/evaluation/search_questions.py; all values within a factor of two of
-these, and any share of the say from 0.3 to 0.7, are as good there to within one question of twenty.
+Chosen on the questions with odd numbers in deploy/evaluation/search_questions.py; spreads from 0.03 to 0.1
+with a share of the say from 0.3 to 0.7 differ there by at most two questions of twenty, and with 0.5 by one.
 """
 
 from collections.abc import Mapping
