@@ -98,7 +98,7 @@ def _labels(graph: spark_dsg.DynamicSceneGraph, rooms: list[Item], names: dict[i
     return list(dict.fromkeys((*known, *believed, *names.values())))
 
 
-def _columns(places: list[Item], rooms: list[Item], labels: list[str]) -> dict[str, np.ndarray]:
+def _columns(places: list[Item], rooms: list[Item], labels: list[str]) -> dict[str, Any]:
     """The scene's columns of places, with frontiers and ground."""
     regions = {room.node.id.value: room.id for room in rooms}
     posteriors = [[place.told.get("posterior", {}).get(label, 0.0) for label in labels] for place in places]
@@ -163,7 +163,7 @@ def _axes(attributes: spark_dsg.Place2dNodeAttributes) -> tuple[float, float, fl
     return float(np.linalg.norm(long_axis)), float(np.linalg.norm(short_axis)), angle_rad
 
 
-def _edges(graph: spark_dsg.DynamicSceneGraph, places: list[Item]) -> dict[str, np.ndarray]:
+def _edges(graph: spark_dsg.DynamicSceneGraph, places: list[Item]) -> dict[str, Any]:
     ids = {place.node.id.value: place.id for place in places}
     ways = [way for way in graph.edges if way.source in ids and way.target in ids]
     found = sorted(
@@ -175,7 +175,7 @@ def _edges(graph: spark_dsg.DynamicSceneGraph, places: list[Item]) -> dict[str, 
     }
 
 
-def _region(room: Item, names: dict[int, str], columns: dict[str, np.ndarray], layers: dict[str, list[Item]]) -> Region:
+def _region(room: Item, names: dict[int, str], columns: dict[str, Any], layers: dict[str, list[Item]]) -> Region:
     """As we wrote it, or put together from the places and objects below the room and the rooms beside it."""
     if "place_count" in room.told:
         return msgspec.convert(room.told, Region)

@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from prior_sg.deploy.api.history import open_history
 from prior_sg.deploy.errors import UserError
 from prior_sg.deploy.showing import moments
 from prior_sg.deploy.showing.material import Material
@@ -13,12 +14,10 @@ from prior_sg.deploy.showing.scene_reading import scene_of_json
 from prior_sg.schemas.codec import DecodeError, decode
 from prior_sg.schemas.places import VoxelMap
 from prior_sg.schemas.priors import Prior
-from prior_sg.schemas.scene import Scene, SceneRequest
-from prior_sg.schemas.topics import PRIOR, SCENE
-from prior_sg.services.registry import BY_NAME
+from prior_sg.schemas.scene import Scene
+from prior_sg.schemas.topics import PRIOR
 from prior_sg.services.runtime import extras
 from prior_sg.services.runtime.record import attachments, read_log
-from prior_sg.services.runtime.runner import Runner
 
 IN_FOLDER = ("log.mcap", "scene.sqlite", "scene.json", "dsg.json")  # of a run; the first tells most
 SCORES = ("scores.json", "metrics.json")
@@ -57,7 +56,7 @@ def _read_file(path: Path, robot: str, moments_wanted: int, cloud_wanted: bool) 
             case ".mcap":
                 return _read_log(path, robot, moments_wanted, cloud_wanted)
             case ".sqlite":
-                return Material(_some(scene_in(path, robot), path, robot))
+                return _read_database(path, robot, moments_wanted)
             case ".json" | ".sparkdsg":
                 return _read_graph(path)
     except OSError as error:
@@ -100,7 +99,10 @@ def _read_log(path: Path, robot: str, moments_wanted: int, cloud_wanted: bool) -
     except DecodeError as error:
         raise SourceUnreadable(f"{path} holds a scene that this version cannot read: {error}") from error
     left = scene is not None and scene.robot == robot
-    story = moments.moments_of(path, robot, max(1, moments_wanted)) if moments_wanted or not left else []
+    story = []
+    if moments_wanted or not left:
+        with open_history(path) as history:
+            story = moments.moments_of(history, robot, max(1, moments_wanted))
     if not left:
         scene, voxels = story[-1].scene if story else None, None
     found = _some(scene, path, robot)
@@ -113,6 +115,16 @@ def _read_log(path: Path, robot: str, moments_wanted: int, cloud_wanted: bool) -
         settings=moments.settings_of(path),
         losses=json.loads(attached["losses.json"]) if "losses.json" in attached else None,
     )
+
+
+def _read_database(path: Path, robot: str, moments_wanted: int) -> Material:
+    with open_history(path) as history:
+        scene = history.scene(robot).message
+        return Material(
+            _some(scene, path, robot),
+            prior=history.prior(scene.prior_digest),
+            moments=moments.moments_of(history, robot, moments_wanted),
+        )
 
 
 def _prior_in(path: Path, digest: str) -> Prior | None:
@@ -129,11 +141,3 @@ def _some(scene: Scene | None, path: Path, robot: str) -> Scene:
     if scene is None or not len(scene.place_ids):
         raise SourceUnreadable(f"{path} holds no places of {robot}; name another with --robot")
     return scene
-
-
-def scene_in(database: Path, robot: str) -> Scene:
-    """The scene of one robot in a database file of the store, which may be in use."""
-    store = BY_NAME["scene_store"]
-    with Runner(store, store.config(path=str(database))) as runner:
-        scene: Scene = runner.answer(SCENE, SceneRequest(robot=robot))
-        return scene

@@ -50,7 +50,7 @@ def _object(told: dict[str, Any]) -> SceneObject:
     return msgspec.convert(told | {"label": told["label"] or ""}, SceneObject)
 
 
-def _openings(places: list[dict[str, Any]]) -> dict[str, np.ndarray]:
+def _openings(places: list[dict[str, Any]]) -> dict[str, Any]:
     return {
         "frontier_ids": np.array([place["id"] for place in places], np.int64),
         "frontier_directions": _rows([place["frontier"]["direction"] for place in places], 3),
@@ -58,7 +58,7 @@ def _openings(places: list[dict[str, Any]]) -> dict[str, np.ndarray]:
     }
 
 
-def _grounds(places: list[dict[str, Any]]) -> dict[str, np.ndarray]:
+def _grounds(places: list[dict[str, Any]]) -> dict[str, Any]:
     ellipses = [place["ellipse"] for place in places]
     return {
         "surface_ids": np.array([place["id"] for place in places], np.int64),
