@@ -21,9 +21,11 @@ async def measure(url: str, robot: str, followers: int, asking: int, seconds: fl
     end_s = time.monotonic() + seconds
     limits = httpx.Limits(max_connections=followers + asking)
     async with httpx.AsyncClient(base_url=f"{url}/v1/{robot}/", limits=limits, timeout=30.0) as client:
-        following = [_follow(client, end_s) for _ in range(followers)]
-        found = await asyncio.gather(*following, *(_ask(client, end_s) for _ in range(asking)))
-    events, asked = found[:followers], [one for requests in found[followers:] for one in requests]
+        events, requests = await asyncio.gather(
+            asyncio.gather(*(_follow(client, end_s) for _ in range(followers))),
+            asyncio.gather(*(_ask(client, end_s) for _ in range(asking))),
+        )
+    asked = list(itertools.chain.from_iterable(requests))
     statuses = sorted({status for _, status, _ in asked})
     spent_ms = {address: [1e3 * took for one, _, took in asked if one == address] for address in ADDRESSES}
     return {
@@ -49,7 +51,7 @@ async def _follow(client: httpx.AsyncClient, end_s: float) -> int:
 
 async def _ask(client: httpx.AsyncClient, end_s: float) -> list[tuple[str, int, float]]:
     """Address, status and seconds of each request."""
-    asked = []
+    asked: list[tuple[str, int, float]] = []
     for address in itertools.cycle(ADDRESSES):
         if time.monotonic() > end_s:
             return asked

@@ -14,7 +14,7 @@ from schemathesis.generation import GenerationMode
 from prior_sg.deploy.serving.gate import Entrance
 from tests.deploy.serving.test_http import opened
 
-EXAMPLES = int(os.environ.get("PSG_FUZZ_EXAMPLES", "3"))
+EXAMPLES = int(os.environ.get("PSG_FUZZ_EXAMPLES", "2"))
 OPERATIONS = 20  # all but the stream, which has no end
 
 
