@@ -190,11 +190,11 @@ class Client(Asking):
             regions=list(regions or ()),
         )
         arrivals = _Arrivals(task)
-        self._client.listen(REGION_DELTA, self.robot, arrivals.see)
-        prior = self._client.give_task(task, timeout_s, waiting)
-        on_prior(prior)
-        end_s = time.monotonic() + timeout_s
-        seconds = arrivals.wait(prior.digest(), end_s)
+        with self._client.listening(REGION_DELTA, self.robot, arrivals.see):
+            prior = self._client.give_task(task, timeout_s, waiting)
+            on_prior(prior)
+            end_s = time.monotonic() + timeout_s
+            seconds = arrivals.wait(prior.digest(), end_s)
         scene = self._stored(prior.digest(), end_s) if seconds is not None else None
         if seconds is None or scene is None:
             raise TaskError(f"no regions for the new task within {timeout_s:.0f} s; see `prior-sg health`")
@@ -215,19 +215,22 @@ class Client(Asking):
         update = self._pose_update(poses)
         if "place_graph" not in self._client.alive().values():
             raise PosesError("no place_graph is running to take the poses; start it with `prior-sg up`")
-        taken = threading.Event()
+        taken: queue.SimpleQueue[int] = queue.SimpleQueue()  # which of ours; the journal's history tells of older ones
 
         def see(sample: Sample) -> None:
             with contextlib.suppress(DecodeError):
                 entry = decode(Consumed, sample.payload)
                 if (entry.service, entry.topic, entry.writer) == ("place_graph", POSE_UPDATE.name, self._client.writer):
-                    taken.set()
+                    taken.put(entry.sequence)
 
-        self._client.listen(JOURNAL, self.robot, see)
-        started_s = time.monotonic()
-        self._client.publish(POSE_UPDATE, update)
-        if not taken.wait(timeout_s):
-            raise PosesError(f"the map took no poses within {timeout_s:.0f} s; see `prior-sg health`")
+        with self._client.listening(JOURNAL, self.robot, see):
+            started_s = time.monotonic()
+            number = self._client.publish(POSE_UPDATE, update)
+            try:
+                while taken.get(timeout=max(started_s + timeout_s - time.monotonic(), 0.0)) != number:
+                    pass
+            except queue.Empty:
+                raise PosesError(f"the map took no poses within {timeout_s:.0f} s; see `prior-sg health`") from None
         return time.monotonic() - started_s
 
     def _pose_update(self, poses: Mapping[int, np.ndarray[Any, Any]]) -> PoseUpdate:

@@ -71,8 +71,8 @@ class Bus(Protocol):
     def put(self, topic: Topic, key: str, payload: bytes, header: bytes) -> None:
         """Publish one sample with the topic's delivery."""
 
-    def subscribe(self, topic: Topic, pattern: str, on_sample: OnSample, on_missed: OnMissed) -> None:
-        """Receive samples; for `every`, also those published shortly before."""
+    def subscribe(self, topic: Topic, pattern: str, on_sample: OnSample, on_missed: OnMissed) -> Callable[[], None]:
+        """Receive samples; for `every`, also those published shortly before. Returns what ends it."""
 
     def serve(self, key: str, on_request: OnRequest) -> None:
         """Answer calls on a key."""
@@ -160,14 +160,21 @@ class LocalBus:
                 if wanted is topic and key_matches(pattern, key):
                     on_sample(sample)
 
-    def subscribe(self, topic: Topic, pattern: str, on_sample: OnSample, on_missed: OnMissed) -> None:
+    def subscribe(self, topic: Topic, pattern: str, on_sample: OnSample, on_missed: OnMissed) -> Callable[[], None]:
         """Receive samples and the kept history."""
+        entry = (self._id, topic, pattern, on_sample)
         with self._hub.lock:
             for key, kept in self._hub.history.items():
                 for sample in kept:
                     if sample.topic is topic and key_matches(pattern, key):
                         on_sample(sample)
-            self._hub.subscribers.append((self._id, topic, pattern, on_sample))
+            self._hub.subscribers.append(entry)
+        return lambda: self._unsubscribe(entry)
+
+    def _unsubscribe(self, entry: "tuple[int, Topic, str, OnSample]") -> None:
+        hub = self._hub
+        with hub.lock:
+            hub.subscribers = [one for one in hub.subscribers if one is not entry]
 
     def serve(self, key: str, on_request: OnRequest) -> None:
         """Answer calls on a key expression."""

@@ -4,7 +4,7 @@ import contextlib
 import threading
 import time
 import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from types import TracebackType
 from typing import Any, TypeVar
 
@@ -42,16 +42,26 @@ class BusClient:
     ) -> None:
         self.bus.close()
 
-    def publish(self, topic: Topic, message: Message) -> None:
-        """Publish one message."""
+    def publish(self, topic: Topic, message: Message) -> int:
+        """Publish one message; returns which of ours on its key it is, from 0."""
         key = topic.key_of(message)
         sequence = self._sequences.get(key, 0)
         self._sequences[key] = sequence + 1
         self.bus.put(topic, key, encode(message), pack_header(self.writer, sequence, time.time_ns()))
+        return sequence
 
-    def listen(self, topic: Topic, robot: str, on_sample: Callable[[Sample], None]) -> None:
-        """Receive samples on a foreign thread."""
-        self.bus.subscribe(topic, topic.pattern(robot), on_sample, lambda topic, number: None)
+    def listen(self, topic: Topic, robot: str, on_sample: Callable[[Sample], None]) -> Callable[[], None]:
+        """Receive samples on a foreign thread; returns what ends it."""
+        return self.bus.subscribe(topic, topic.pattern(robot), on_sample, lambda topic, number: None)
+
+    @contextlib.contextmanager
+    def listening(self, topic: Topic, robot: str, on_sample: Callable[[Sample], None]) -> Iterator[None]:
+        """The same for as long as the body takes."""
+        end = self.listen(topic, robot, on_sample)
+        try:
+            yield
+        finally:
+            end()
 
     def ask(self, query: Query, request: Message, timeout_s: float = 10.0) -> Any:
         """The reply, decoded. Raises BusError when nobody answers in time."""
@@ -90,8 +100,15 @@ class BusClient:
                     found.append(prior)
                     arrived.set()
 
-        self.listen(PRIOR, "*", see)
-        self.publish(TASK, task)
+        with self.listening(PRIOR, "*", see):
+            self.publish(TASK, task)
+            told = self._prior_told(task, arrived, timeout_s, waiting)
+        return found[0] if told is None else told
+
+    def _prior_told(
+        self, task: Task, arrived: threading.Event, timeout_s: float, waiting: Callable[[str], None]
+    ) -> Prior | None:
+        """Ask for the prior of a task until it has arrived by itself: then None. Raises NoPriorError, BusError."""
         request = PriorRequest(environment=task.environment, task=task.task, regions=task.regions)
         end_s, polls = time.monotonic() + timeout_s, 0
         while not arrived.wait(POLL_S):
@@ -99,11 +116,12 @@ class BusClient:
             if not reply.priors and not reply.pending:
                 raise NoPriorError(reply.reason)
             if reply.priors and not reply.pending and polls > PATIENT_POLLS:  # another clock may be behind ours
-                return reply.priors[0]
+                prior: Prior = reply.priors[0]
+                return prior
             if time.monotonic() > end_s:
                 raise NoPriorError(f"no prior within {timeout_s:.0f} s: {reply.reason or 'see `prior-sg health`'}")
             waiting(reply.reason)
-        return found[0]
+        return None
 
     def alive(self, settle_s: float = 0.3, patience_s: float = 2.0) -> dict[str, str]:
         """Instance to service of everything alive now; on a busy host the first to be seen may take `patience_s`."""

@@ -198,7 +198,7 @@ class ZenohBus:
             publisher_detection=True,
         )
 
-    def subscribe(self, topic: Topic, pattern: str, on_sample: OnSample, on_missed: OnMissed) -> None:
+    def subscribe(self, topic: Topic, pattern: str, on_sample: OnSample, on_missed: OnMissed) -> Callable[[], None]:
         """Receive samples of a topic."""
 
         def receive(sample: zenoh.Sample) -> None:
@@ -208,8 +208,7 @@ class ZenohBus:
                 on_sample(Sample(topic, str(sample.key_expr), payload, *unpack_header(header)))
 
         if topic.delivery == "latest":
-            self._entities.append(self._session.declare_subscriber(pattern, receive))
-            return
+            return self._kept(self._session.declare_subscriber(pattern, receive))
         subscriber = zx.declare_advanced_subscriber(
             self._session,
             pattern,
@@ -218,8 +217,18 @@ class ZenohBus:
             recovery=zx.RecoveryConfig(periodic_queries=None, heartbeat=True),
             subscriber_detection=True,
         )
-        self._entities.append(subscriber)
-        self._entities.append(subscriber.sample_miss_listener(lambda miss: on_missed(topic, miss.nb)))
+        return self._kept(subscriber.sample_miss_listener(lambda miss: on_missed(topic, miss.nb)), subscriber)
+
+    def _kept(self, *entities: Any) -> Callable[[], None]:
+        """Hold on to what is dropped with its last reference; returns what lets go of it."""
+        self._entities.extend(entities)
+
+        def end() -> None:
+            for entity in entities:
+                self._entities.remove(entity)
+                _quietly(entity.undeclare)
+
+        return end
 
     def serve(self, key: str, on_request: OnRequest) -> None:
         """Answer calls on a key expression."""

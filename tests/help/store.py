@@ -88,7 +88,13 @@ class StandIn:
     def correct(self, sample):
         self.poses.append(decode(PoseUpdate, sample.payload))
         entry = Consumed(
-            robot=self.robot, service="place_graph", instance="p", order=0, topic="POSE_UPDATE", writer=sample.writer
+            robot=self.robot,
+            service="place_graph",
+            instance="p",
+            order=0,
+            topic="POSE_UPDATE",
+            writer=sample.writer,
+            sequence=sample.sequence,
         )
         self.bus.publish(JOURNAL, entry)
 

@@ -70,7 +70,13 @@ class System:
         self.poses.append(decode(PoseUpdate, sample.payload))
         if "poses" not in self.mute:
             entry = Consumed(
-                robot=ROBOT, service="place_graph", instance="p", order=0, topic="POSE_UPDATE", writer=sample.writer
+                robot=ROBOT,
+                service="place_graph",
+                instance="p",
+                order=0,
+                topic="POSE_UPDATE",
+                writer=sample.writer,
+                sequence=sample.sequence,
             )
             self.bus.publish(JOURNAL, entry)
 
@@ -138,6 +144,21 @@ def test_poses_are_taken_or_not():
         client.correct_poses({3: pose}, timeout_s=0.2)
     with Client(bus=LocalBus(Hub())) as alone, pytest.raises(prior_sg.PosesError, match="no place_graph is running"):
         alone.correct_poses({3: pose})
+
+
+def test_changes_leave_no_subscription_behind_and_wait_for_their_own_poses():
+    system, client = joined()
+    with client:
+        before = len(system.hub.subscribers)
+        client.task("sweep")
+        client.correct_poses({3: np.eye(4)})
+        assert len(system.hub.subscribers) == before
+        system.mute = ["poses", "prior"]
+        with pytest.raises(prior_sg.PosesError, match="took no poses within"):  # the journal tells of the first ones
+            client.correct_poses({3: np.eye(4)}, timeout_s=0.1)
+        with pytest.raises(prior_sg.NoPriorError):
+            client.task("mop", timeout_s=0.1)
+        assert len(system.hub.subscribers) == before
 
 
 def test_explain_and_scene():

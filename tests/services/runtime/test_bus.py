@@ -104,6 +104,18 @@ def test_robots_do_not_see_each_other(new_bus):
     assert {s.key for s in mine} == {"psg/mine/task"}
 
 
+def test_a_subscription_ends(new_bus):
+    reader, writer, ended, all_of_them = new_bus(), new_bus(), [], []
+    end = reader.subscribe(TASK, TASK.pattern("end"), ended.append, lambda topic, number: None)
+    reader.subscribe(TASK, TASK.pattern("end"), all_of_them.append, lambda topic, number: None)
+    find_each_other(writer, "end", ended)
+    end()
+    all_of_them.clear()
+    put(writer, TASK, task("end", "last"), "w", 0)
+    eventually(lambda: [s.writer for s in all_of_them][-1:] == ["w"])
+    assert not ended
+
+
 def call(bus, key, payload, timeout_s=2.0):
     answers, arrived = [], threading.Event()
 
