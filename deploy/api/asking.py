@@ -2,12 +2,14 @@
 
 import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from prior_sg.deploy.api.errors import NotInSceneError
+from prior_sg.deploy.api.vectors import RecentVectors
 from prior_sg.schemas.objects import SceneObject
 from prior_sg.schemas.priors import Prior
 from prior_sg.schemas.queries import (
@@ -150,19 +152,15 @@ class Asking(ABC):
         try:
             prior = self.prior_of(words.prior_digest)
             meant = core.vocabulary(words, prior)
-            said = self.embed(words.space, [text])[0]
-            embedded = self._embedded(words.space, meant.phrases)
+            embedded = self.vectors.of(words.space, [text, *meant.phrases], self.embed)
         except PriorSgError as error:
             return {}, {}, str(error)
-        return *core.likeness(said, embedded, meant), "" if prior is not None else NO_PRIOR
+        return *core.likeness(embedded[text], embedded, meant), "" if prior is not None else NO_PRIOR
 
-    def _embedded(self, space: str, phrases: Sequence[str]) -> Mapping[str, np.ndarray[Any, Any]]:
-        """Vectors by phrase; those of a vocabulary are asked for once."""
-        known: dict[tuple[str, str], np.ndarray[Any, Any]] = self.__dict__.setdefault("_vectors", {})
-        missing = [phrase for phrase in phrases if (space, phrase) not in known]
-        if missing:
-            known |= zip(((space, phrase) for phrase in missing), self.embed(space, missing), strict=True)
-        return {phrase: known[space, phrase] for phrase in phrases}
+    @cached_property
+    def vectors(self) -> RecentVectors:
+        """What was embedded for searches so far."""
+        return RecentVectors()
 
     def _things(self, question: Question) -> list[Thing]:
         things: list[Thing] = self._understood(question).things

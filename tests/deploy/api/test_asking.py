@@ -10,6 +10,7 @@ import pytest
 import prior_sg
 from prior_sg.deploy.api.client import Client
 from prior_sg.deploy.api.scene import Scene
+from prior_sg.deploy.api.vectors import RecentVectors
 from prior_sg.deploy.cli.main import main
 from prior_sg.schemas.codec import decode, encode
 from prior_sg.schemas.features import TextEmbeddings
@@ -92,7 +93,25 @@ def test_texts_are_answered_by_what_regions_and_objects_mean(scene):
     assert cook[0].label in ("kitchen", "oven") and leave[0].label == "hall"
     assert {one.what for one in cook} == {"region", "place", "object"}
     assert all(0 < one.score < 1 for one in cook)
-    assert [len(asked) for asked in scene.asked][2:] == [1], "phrases of the prior are embedded once"
+    assert scene.find("cook") == cook
+    assert scene.asked[0][0] == "cook" and scene.asked[1:] == [["leave"]], "each phrase is embedded once"
+
+
+def test_of_vectors_those_used_last_are_kept():
+    asked = []
+
+    def embed(space, phrases):
+        asked.append((space, phrases))
+        return vectors(phrases)
+
+    kept = RecentVectors(2)
+    assert kept.of("s", ["oven", "hall", "oven"], embed).keys() == {"oven", "hall"}
+    kept.of("s", ["oven"], embed)
+    kept.of("s", ["leave"], embed)
+    assert kept.of("s", ["oven"], embed)["oven"].tolist() == vectors(["oven"])[0].tolist()
+    assert kept.of("s", ["hall", "a", "b"], embed).keys() == {"hall", "a", "b"}, "more than are kept"
+    kept.of("t", ["b"], embed)
+    assert asked == [("s", ["oven", "hall"]), ("s", ["leave"]), ("s", ["hall", "a", "b"]), ("t", ["b"])]
 
 
 def test_a_score_of_one_half_stands_where_it_was_fitted():

@@ -60,7 +60,7 @@ def likeness(
     if meant.objects and meant.expected is not None:
         regions = (1.0 - OBJECTS_SAY) * regions + OBJECTS_SAY * objects @ meant.expected
     return (
-        dict(zip(meant.regions, regions.tolist(), strict=True)),
+        dict(zip(meant.regions, np.minimum(regions, 1.0).tolist(), strict=True)),
         dict(zip(meant.objects, objects.tolist(), strict=True)),
     )
 
