@@ -12,12 +12,17 @@ from typing import Annotated, Literal
 import msgspec
 
 from prior_sg.schemas.codec import Message, Part
+from prior_sg.schemas.names import LONGEST_TEXT
 from prior_sg.schemas.objects import SceneObject
 from prior_sg.schemas.regions import NO_REGION, Region, Transition
 
 What = Literal["place", "region", "object"]
 Point = tuple[float, float, float]  # world, metres
-Metres = Annotated[float, msgspec.Meta(ge=0.0)]
+Coordinate = Annotated[float, msgspec.Meta(ge=-1e9, le=1e9)]
+AskedPoint = tuple[Coordinate, Coordinate, Coordinate]
+Metres = Annotated[float, msgspec.Meta(ge=0.0, le=1e9)]
+Text = Annotated[str, msgspec.Meta(max_length=LONGEST_TEXT)]
+Probability = Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
 Limit = Annotated[int, msgspec.Meta(ge=1, le=100_000)]  # at most so many come back
 MOST_LISTED, MOST_RANKED = 100, 10
 
@@ -33,7 +38,7 @@ class ByLabel(Part, frozen=True, kw_only=True, tag="by_label"):
     """All that carries a label, whatever its case → Things, the most probable first. Without `what`, regions and
     objects."""
 
-    label: str
+    label: Text
     what: What | None = None
     limit: Limit = MOST_LISTED
 
@@ -42,29 +47,29 @@ class InBox(Part, frozen=True, kw_only=True, tag="in_box"):
     """What lies in an axis-aligned box → Things, by id: places with their centre, objects with any part of theirs,
     regions with any place. Without `what`, regions and objects."""
 
-    min_m: Point
-    max_m: Point
+    min_m: AskedPoint
+    max_m: AskedPoint
     what: What | None = None
-    label: str = ""
+    label: Text = ""
     limit: Limit = MOST_LISTED
 
 
 class InRadius(Part, frozen=True, kw_only=True, tag="in_radius"):
     """What is no farther from a point → Things, the nearest first. Without `what`, regions and objects."""
 
-    point_m: Point
+    point_m: AskedPoint
     radius_m: Metres
     what: What | None = None
-    label: str = ""
+    label: Text = ""
     limit: Limit = MOST_LISTED
 
 
 class Nearest(Part, frozen=True, kw_only=True, tag="nearest"):
     """The nearest of a kind, of a label where one is given → Things, the nearest first."""
 
-    point_m: Point
+    point_m: AskedPoint
     what: What = "object"
-    label: str = ""
+    label: Text = ""
     limit: Limit = 1
 
 
@@ -78,8 +83,8 @@ class NeighboursOf(Part, frozen=True, kw_only=True, tag="neighbours_of"):
 class ObjectsInRegions(Part, frozen=True, kw_only=True, tag="objects_in_regions"):
     """Objects of a label that stand in regions of a label → Things, the most probable first; an empty label = any."""
 
-    object_label: str = ""
-    region_label: str = ""
+    object_label: Text = ""
+    region_label: Text = ""
     limit: Limit = MOST_LISTED
 
 
@@ -91,10 +96,10 @@ class Spot(Part, frozen=True, kw_only=True):
     one leads nowhere, a place stands for a point that it has free space around, or for an object, up to 1 m farther.
     """
 
-    point_m: Point | None = None
+    point_m: AskedPoint | None = None
     what: What | None = None
     id: int | None = None
-    label: str = ""
+    label: Text = ""
 
 
 class RouteBetween(Part, frozen=True, kw_only=True, tag="route_between"):
@@ -129,9 +134,9 @@ class AnswersTo(Part, frozen=True, kw_only=True, tag="answers_to"):
     found them out in an embedding space (`Client.find` does). With neither, words are compared, and the answer says so.
     """
 
-    text: str
-    regions: dict[str, float] = {}
-    objects: dict[str, float] = {}
+    text: Text
+    regions: dict[str, Probability] = {}
+    objects: dict[str, Probability] = {}
     what: What | None = None  # without it, all of them; at most one place of each region
     limit: Limit = MOST_RANKED
 

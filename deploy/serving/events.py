@@ -42,6 +42,7 @@ class Feed:
         self._told = -1  # the revision that followers have
         self._news = asyncio.Event()
         self._pump: asyncio.Task[None] | None = None
+        self._starting = asyncio.Lock()
 
     @property
     def followers(self) -> int:
@@ -66,9 +67,10 @@ class Feed:
         queue: asyncio.Queue[Event | None] = asyncio.Queue(MOST_WAITING)
         self._followers.add(queue)
         try:
-            if self._pump is None or self._pump.done():
-                self._told = (await self._system.answers(self._robot)).revision
-                self._pump = asyncio.create_task(self._tell())
+            async with self._starting:
+                if self._pump is None or self._pump.done():
+                    self._told = (await self._system.answers(self._robot)).revision
+                    self._pump = asyncio.create_task(self._tell())
             missed, seen = await self._missed(last_revision), -1
             if not missed:
                 yield None
@@ -86,9 +88,10 @@ class Feed:
         if last_revision is None:
             return [await self._snapshot("")]
         kept = list(itertools.dropwhile(lambda event: event.since != last_revision, self._recent))
-        if kept or last_revision == self._told:
-            return kept
-        return [await self._change(last_revision)]
+        known = kept[-1].revision if kept else last_revision
+        if known != self._told:  # what came while nobody followed is not among those that are kept
+            kept.append(await self._change(known))
+        return kept
 
     async def _tell(self) -> None:
         """Ask for changes whenever there are some, as long as anybody follows."""

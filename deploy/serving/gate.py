@@ -1,8 +1,10 @@
 """Who may come in: the names a server goes by, pages of other origins, and the token."""
 
+import asyncio
 import hmac
 import ipaddress
 import json
+import re
 import socket
 from collections.abc import Awaitable, Callable, Iterable, MutableMapping
 from dataclasses import dataclass
@@ -21,6 +23,8 @@ App = Callable[[Scope, Receive, Send], Awaitable[None]]
 LOOPBACK_NAMES = ("localhost", "127.0.0.1", "::1")
 SHORTEST_TOKEN, LONGEST_TOKEN = 16, 512  # characters
 PROBLEM = "application/problem+json"
+BODY_S = 30.0  # in which the body of a request has to arrive
+HOST = re.compile(rb"(\[[0-9a-f:.]+\]|[\w.-]+)(:\d{1,5})?", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -89,13 +93,15 @@ class Gate:
             return await send({"type": "websocket.close", "code": 1008})
         if (fault := self._fault(_headers(scope["headers"]))) is not None:
             return await refuse(send, *fault)
-        return await self._app(scope, receive, send)
+        return await self._app(scope, patiently(receive), send)
 
     def _fault(self, headers: dict[bytes, list[bytes]]) -> tuple[int, str] | None:
         hosts, origins = headers.get(b"host", []), headers.get(b"origin", [])
-        if len(hosts) != 1 or not self._is_ours(b"//" + hosts[0]):
+        if headers.keys() >= {b"content-length", b"transfer-encoding"}:
+            return 400, "the length of the body is given in two ways, which proxies may read differently: give it once"
+        if len(hosts) != 1 or not HOST.fullmatch(hosts[0]) or not self._is_ours(b"//" + hosts[0]):
             return 421, "this server does not go by that name: call it by the address that it was started with"
-        if not all(map(self._is_ours, origins)):
+        if not all(map(self._is_ours, origins)) or _from_elsewhere(headers):
             return 403, "pages of other sites may not ask this server"
         if self._token and not self._bears_token(headers.get(b"authorization", [])):
             return 401, "this server asks for a token: send `Authorization: Bearer TOKEN`"
@@ -115,10 +121,31 @@ class Gate:
 
 async def refuse(send: Send, status: int, detail: str) -> None:
     """Answer with a problem."""
-    headers = [(b"content-type", PROBLEM.encode())]
+    body = json.dumps(problem(status, detail)).encode()
+    headers = [(b"content-type", PROBLEM.encode()), (b"content-length", str(len(body)).encode())]
+    headers += [(b"connection", b"close")]  # whatever follows was meant for somebody else
     headers += [(b"www-authenticate", b"Bearer")] if status == 401 else []
     await send({"type": "http.response.start", "status": status, "headers": headers})
-    await send({"type": "http.response.body", "body": json.dumps(problem(status, detail)).encode()})
+    await send({"type": "http.response.body", "body": body})
+
+
+def patiently(receive: Receive) -> Receive:
+    """What waits for a body until it is over, and then for the end of a connection: as if one whose body does not
+    arrive in time had left."""
+    end_s = asyncio.get_running_loop().time() + BODY_S
+    whole = False
+
+    async def received() -> MutableMapping[str, Any]:
+        nonlocal whole
+        try:
+            async with asyncio.timeout_at(None if whole else end_s):
+                message = await receive()
+        except TimeoutError:
+            return {"type": "http.disconnect"}
+        whole = not message.get("more_body", False)
+        return message
+
+    return received
 
 
 def problem(status: int, detail: str) -> dict[str, Any]:
@@ -131,6 +158,12 @@ def _headers(pairs: Iterable[tuple[bytes, bytes]]) -> dict[bytes, list[bytes]]:
     for name, value in pairs:
         found.setdefault(name.lower(), []).append(value)
     return found
+
+
+def _from_elsewhere(headers: dict[bytes, list[bytes]]) -> bool:
+    """Whether a page of another site loads this into itself, as browsers say; a link that was followed is none."""
+    sites, uses = headers.get(b"sec-fetch-site", []), headers.get(b"sec-fetch-dest", [])
+    return b"cross-site" in sites and uses != [b"document"]
 
 
 def _is_address(name: str) -> bool:

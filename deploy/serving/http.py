@@ -25,7 +25,9 @@ from prior_sg.services.runtime.client import NoPriorError
 
 log = logging.getLogger(__name__)
 LARGEST_BODY_B = 4 * 2**20
+LEFT = "client disconnected prematurely"  # as the framework says it
 STATUS_OF: dict[type[Exception], int] = {  # the first that fits
+    RecursionError: 400,  # of a body that is nested too deeply
     FaultyRequestError: 400,
     NotInSceneError: 404,
     BusyError: 429,
@@ -66,7 +68,9 @@ def _openapi(entrance: Entrance) -> OpenAPIConfig:
 
 def _told(request: Request[Any, Any, Any], error: Exception) -> Response[dict[str, Any]]:
     """Any failure as a problem with one sentence."""
-    if isinstance(error, HTTPException):
+    if isinstance(error, HTTPException) and error.detail == LEFT:
+        status, detail, headers = 408, "the body of the request did not arrive", None
+    elif isinstance(error, HTTPException):
         status, detail, headers = error.status_code, _detail(error), error.headers
     else:
         status = next((code for kind, code in STATUS_OF.items() if isinstance(error, kind)), 500)

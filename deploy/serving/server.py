@@ -16,6 +16,7 @@ from prior_sg.deploy.serving.gate import App
 BACKLOG = 128
 GRACE_S = 2  # for answers that are under way at the end
 PARENT_CHECK_S = 1.0
+STUCK_MS = 30_000  # after which a connection is given up whose other end takes nothing
 
 
 @contextlib.contextmanager
@@ -25,6 +26,8 @@ def listening(host: str, port: int) -> Iterator[socket.socket]:
         family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
         with socket.socket(family, socket.SOCK_STREAM) as listener:
             listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            if hasattr(socket, "TCP_USER_TIMEOUT"):  # Linux; connections inherit it
+                listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, STUCK_MS)
             listener.bind(address)
             listener.listen(BACKLOG)
             yield listener
@@ -51,6 +54,7 @@ class Server(uvicorn.Server):
             access_log=False,
             log_config=None,
             server_header=False,
+            proxy_headers=False,
             timeout_graceful_shutdown=GRACE_S,
             ws="none",
         )

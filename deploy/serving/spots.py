@@ -1,6 +1,5 @@
 """Ends of routes as people write them."""
 
-import math
 from typing import get_args
 
 from prior_sg.deploy.serving.errors import FaultyRequestError
@@ -8,6 +7,7 @@ from prior_sg.schemas.queries import Spot, What
 
 ENDS = "a label; or `place:ID`, `region:ID`, `object:ID`; or a point `X,Y,Z`"
 MOST_DIGITS = 18
+FARTHEST_M = 1e9
 
 
 def spot_in(text: str) -> Spot:
@@ -16,7 +16,7 @@ def spot_in(text: str) -> Spot:
     if kind in get_args(What) and number.isascii() and number.isdigit() and len(number) <= MOST_DIGITS:
         return Spot(what=kind, id=int(number))  # type: ignore[arg-type]
     point = _numbers(text)
-    if len(point) == 3 and all(map(math.isfinite, point)):
+    if len(point) == 3 and all(abs(value) <= FARTHEST_M for value in point):
         x, y, z = point
         return Spot(point_m=(x, y, z))
     if not text.strip() or point:

@@ -20,7 +20,15 @@ from prior_sg.deploy.serving.errors import BusyError, FaultyRequestError
 from prior_sg.schemas.codec import DecodeError, decode
 from prior_sg.schemas.names import fault_of_robot, normal
 from prior_sg.schemas.priors import Prior, fault_of_task
-from prior_sg.schemas.queries import MOST_RANKED, AnswersTo, Question, SceneAnswer, What
+from prior_sg.schemas.queries import (
+    MOST_RANKED,
+    AnswersTo,
+    ChangedSince,
+    Question,
+    RouteBetween,
+    SceneAnswer,
+    What,
+)
 from prior_sg.schemas.scene import Scene as SceneMessage
 from prior_sg.schemas.scene import SceneRevision
 from prior_sg.schemas.topics import SCENE_REVISION
@@ -30,6 +38,7 @@ MOST_ROBOTS = 64  # whose clients are kept
 MOST_WRITTEN = 8  # forms of scenes that are kept
 READERS, WRITERS = 16, 4  # threads
 MOST_QUESTIONS, MOST_POSES, MOST_LIMIT = 64, 10_000, 10_000
+MOST_LABOUR = 8  # routes and comparisons of revisions at once: the store takes nothing else meanwhile
 LONGEST_SEARCH = 500  # characters
 EVERYWHERE: dict[str, Any] = {"min_m": (-1e9,) * 3, "max_m": (1e9,) * 3}
 T = TypeVar("T")
@@ -46,12 +55,14 @@ class TaskGiven:
 
 
 class System:
-    """Asks with one connection; what changes something gets one of its own, for as long as it takes."""
+    """Asks with one connection. What changes something gets one of its own, for as long as it takes: a publisher tells
+    late readers what it has sent as long as it lives, also when others have corrected that since."""
 
     def __init__(self, open_bus: Callable[[], Bus], robot: str) -> None:
         self.robot = robot
         self._open_bus, self._bus = open_bus, open_bus()
-        self._clients: OrderedDict[str, Client] = OrderedDict()
+        self._own = Client(robot=robot, bus=self._bus)
+        self._clients: OrderedDict[str, Client] = OrderedDict()  # of other robots
         self._written: OrderedDict[tuple[str, str, str], bytes] = OrderedDict()
         self._lock = threading.Lock()
         self._seen = {robot}
@@ -77,9 +88,10 @@ class System:
             raise FaultyRequestError(
                 f"{len(questions)} questions are asked at once: at most {MOST_QUESTIONS} are taken"
             )
-        for question in questions:
-            if getattr(question, "limit", 0) > MOST_LIMIT:
-                raise FaultyRequestError(f"the limit is above {MOST_LIMIT}: ask for fewer")
+        if sum(getattr(question, "limit", 0) for question in questions) > MOST_LIMIT:
+            raise FaultyRequestError(f"the limit is above {MOST_LIMIT}: ask for fewer")
+        if sum(isinstance(question, RouteBetween | ChangedSince) for question in questions) > MOST_LABOUR:
+            raise FaultyRequestError(f"more than {MOST_LABOUR} routes and changes are asked for at once: ask for fewer")
         found: SceneAnswer = await self._read(robot, lambda client: client.answers(*questions))
         if found.revision < 0:
             raise NotInSceneError(f"nothing is stored of a robot {robot!r}")
@@ -160,8 +172,11 @@ class System:
     def _client(self, robot: str) -> Client:
         """The client that asks for a robot; those asked for least recently are forgotten."""
         _check_robot(robot)
+        if robot == self.robot:
+            return self._own
         with self._lock:
             client = self._clients.pop(robot, None) or Client(robot=robot, bus=self._bus)
+            client.vectors = self._own.vectors
             self._clients[robot] = client
             while len(self._clients) > MOST_ROBOTS:
                 self._clients.popitem(last=False)

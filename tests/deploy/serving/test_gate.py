@@ -1,11 +1,15 @@
 """Who may come in."""
 
 import asyncio
+import socket
+import time
 
 import pytest
 
 from prior_sg.deploy.errors import UserError
+from prior_sg.deploy.serving import gate, server
 from prior_sg.deploy.serving.gate import Entrance, Gate, entrance
+from tests.help.served import served
 
 TOKEN = "a-long-secret-of-ours"
 BEARER = ("Authorization", f"Bearer {TOKEN}")
@@ -33,6 +37,9 @@ HOSTS = [
     ("127.0.0.1", "evil.example:8000", 421),
     ("127.0.0.1", "localhost.evil.example", 421),
     ("127.0.0.1", "user@evil.example", 421),
+    ("127.0.0.1", "evil.example@localhost", 421),
+    ("127.0.0.1", "localhost/evil.example", 421),
+    ("127.0.0.1", "localhost:8000x", 421),
     ("127.0.0.1", "192.168.1.7", 421),
     ("127.0.0.1", "[bad", 421),
     ("127.0.0.1", "\xff", 421),
@@ -58,6 +65,78 @@ def test_a_name_is_given_once():
 )
 def test_pages_of_other_sites(origin, expected):
     assert status(Entrance(), ("host", "localhost"), ("origin", origin)) == expected
+
+
+LOADS = [
+    ("cross-site", "image", 403),
+    ("cross-site", "iframe", 403),
+    ("cross-site", "empty", 403),
+    ("cross-site", "document", 200),
+    ("same-origin", "empty", 200),
+    ("none", "document", 200),
+]
+
+
+@pytest.mark.parametrize(("site", "use", "expected"), LOADS)
+def test_what_pages_of_other_sites_load_without_naming_their_origin(site, use, expected):
+    told = (("host", "localhost"), ("Sec-Fetch-Site", site), ("Sec-Fetch-Dest", use))
+    assert status(Entrance(), *told) == expected
+
+
+async def empty(scope, receive, send):
+    if scope["type"] == "http":
+        while (await receive()).get("more_body", False):
+            pass
+        await send({"type": "http.response.start", "status": 200, "headers": [(b"content-length", b"0")]})
+        await send({"type": "http.response.body", "body": b""})
+
+
+def exchanged(address, sent):
+    """All that comes back until the connection ends."""
+    host, port = address.removeprefix("http://").split(":")
+    with socket.create_connection((host, int(port)), timeout=10) as connection:
+        connection.sendall(sent)
+        return b"".join(iter(lambda: connection.recv(65536), b""))
+
+
+def test_a_request_within_another_is_not_taken():
+    head = b"POST / HTTP/1.1\r\nHost: localhost\r\nContent-Length: 4\r\nTransfer-Encoding: chunked\r\n\r\n"
+    with served(Gate(empty, Entrance())) as address:
+        answers = exchanged(address, head + b"0\r\n\r\nGET / HTTP/1.1\r\nHost: localhost\r\n\r\n")
+    assert answers.startswith(b"HTTP/1.1 400") and answers.count(b"HTTP/1.1") == 1
+
+
+def test_a_body_that_does_not_arrive_is_not_waited_for(monkeypatch):
+    monkeypatch.setattr(gate, "BODY_S", 0.2)
+    with served(Gate(empty, Entrance())) as address:
+        host, port = address.removeprefix("http://").split(":")
+        with socket.create_connection((host, int(port)), timeout=3) as connection:
+            connection.sendall(b"POST / HTTP/1.1\r\nHost: localhost\r\nContent-Length: 4\r\n\r\nab")
+            assert connection.recv(65536).startswith(b"HTTP/1.1")
+
+
+@pytest.mark.skipif(not hasattr(socket, "TCP_USER_TIMEOUT"), reason="Linux ends such connections")
+def test_who_takes_nothing_is_given_up(monkeypatch):
+    monkeypatch.setattr(server, "STUCK_MS", 500)
+    ended = []
+
+    async def endless(scope, receive, send):
+        if scope["type"] == "http":
+            await receive()
+            gone = asyncio.ensure_future(receive())
+            await send({"type": "http.response.start", "status": 200, "headers": []})
+            while not gone.done():
+                await send({"type": "http.response.body", "body": b"x" * 2**18, "more_body": True})
+            ended.append(gone.result()["type"])
+
+    with served(Gate(endless, Entrance())) as address:
+        host, port = address.removeprefix("http://").split(":")
+        with socket.create_connection((host, int(port)), timeout=10) as connection:
+            connection.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n")
+            end_s = time.monotonic() + 20
+            while not ended and time.monotonic() < end_s:
+                time.sleep(0.05)
+            assert ended == ["http.disconnect"]
 
 
 TOKENS = [

@@ -1,7 +1,9 @@
 """The scene over HTTP, over a stand-in for a running system."""
 
+import asyncio
 import contextlib
 import json
+import socket
 
 import httpx
 import msgspec
@@ -11,7 +13,8 @@ from litestar.testing import TestClient
 
 from prior_sg.deploy.benches.queries import synthetic_scene
 from prior_sg.deploy.serving import events
-from prior_sg.deploy.serving.events import Feeds
+from prior_sg.deploy.serving import system as module
+from prior_sg.deploy.serving.events import Feed, Feeds
 from prior_sg.deploy.serving.gate import Entrance
 from prior_sg.deploy.serving.http import http_app
 from prior_sg.deploy.serving.system import System
@@ -137,6 +140,7 @@ FAULTY = [
     (f"{V1}/near?x=1&y=1&z=1&what=house", 400, "what: "),
     (f"{V1}/route?from=1,1&to=room", 400, "an end of a route"),
     (f"{V1}/route?from=nan,1,1&to=room", 400, "an end of a route"),
+    (f"{V1}/route?from=1e308,1,1&to=room", 400, "an end of a route"),
     (f"{V1}/search?q=%20", 400, "a text to search for"),
     (f"{V1}/scene.txt?budget_tokens=1", 400, "budget_tokens"),
 ]
@@ -161,6 +165,13 @@ def test_any_questions_over_one_revision():
             b'{"questions": [{"type": "by_id", "what": "place", "id": 99999999999999999999999}]}',
             json.dumps({"questions": [{"type": "words_in_use"}] * 65}).encode(),
             json.dumps({"questions": [{"type": "by_label", "label": "a", "limit": 10_001}]}).encode(),
+            json.dumps({"questions": [{"type": "by_label", "label": "a", "limit": 5_001}] * 2}).encode(),
+            json.dumps({"questions": [{"type": "changed_since", "revision": 0}] * 9}).encode(),
+            json.dumps({"questions": [{"type": "by_label", "label": "a" * 2001}]}).encode(),
+            b'{"questions": [{"type": "answers_to", "text": "a", "regions": {"room kind 1": 1e308}}]}',
+            b'{"questions": [{"type": "in_radius", "point_m": [1e308, 1, 1], "radius_m": 1, "what": "place"}]}',
+            b'{"questions": [{"type": "in_radius", "point_m": [1, 1, 1], "radius_m": 1e308, "what": "place"}]}',
+            b'{"questions": ' + b"[" * 200_000,
         ):
             assert client.post(f"{V1}/query", content=faulty).status_code == 400, faulty
         assert client.post(f"{V1}/query", content=b" " * (5 * 2**20)).status_code == 413
@@ -195,6 +206,15 @@ def test_poses_are_corrected():
         assert broken.status_code == 422 and "cannot be used" in broken.json()["detail"]
         twice = client.post(f"{V1}/poses", json={"poses": [{"frame": 3, "world_from_camera": pose}] * 2})
         assert twice.status_code == 400 and len(store.poses) == 1
+
+
+def test_asking_for_many_robots_leaves_nothing_on_the_bus(monkeypatch):
+    monkeypatch.setattr(module, "MOST_ROBOTS", 1)
+    with opened() as (store, app, _), client_of(app) as client:
+        for _ in range(3):
+            assert client.get("/health").status_code == 200
+            assert [client.get(f"/v1/{name}/task").status_code for name in ("nobody", "noone")] == [404, 404]
+        assert len(store.hub.watchers) == 1
 
 
 def test_without_a_system_it_says_so():
@@ -265,6 +285,47 @@ def test_changes_are_followed_and_resumed(monkeypatch):
         assert httpx.get(f"{address}/v1/nobody/events").status_code == 404
         with following(address) as lines:  # an open connection does not keep the server from ending
             assert events_of(lines, 1)
+
+
+def test_a_client_that_leaves_within_its_request_is_no_fault(caplog):
+    with opened() as (_, app, feeds), served(app, feeds.close) as address:
+        host, port = address.removeprefix("http://").split(":")
+        with socket.create_connection((host, int(port))) as connection:
+            connection.sendall(f"POST {V1}/query HTTP/1.1\r\nHost: localhost\r\nContent-Length: 9\r\n\r\n{{".encode())
+        assert httpx.get(f"{address}/v1/robots").status_code == 200
+    assert "a request failed" not in caplog.text
+
+
+def test_who_comes_at_once_shares_one_watcher():
+    async def followed():
+        feed = Feed(system, "bench")
+        both = [feed.follow(None) for _ in range(2)]
+        await asyncio.gather(*map(anext, both))
+        return len(asyncio.all_tasks()) - 1
+
+    with opened() as (store, _, _):
+        system = System(store.open_bus, store.robot)
+        assert asyncio.run(followed()) == 1
+
+
+def test_what_came_while_nobody_followed_is_told(monkeypatch):
+    monkeypatch.setattr(events, "PERIOD_S", 0.0)
+
+    async def followed():
+        feed = Feed(system, "bench")
+        first = feed.follow(None)
+        await anext(first)
+        store.store(renamed(SCENE))
+        feed.wake()
+        await first.aclose()
+        await feed._pump
+        store.store(SCENE)
+        resumed = feed.follow(0)
+        return [(await anext(resumed)).revision for _ in range(2)]
+
+    with opened() as (store, _, _):
+        system = System(store.open_bus, store.robot)
+        assert asyncio.run(asyncio.wait_for(followed(), 10)) == [1, 2]
 
 
 def test_followers_are_bounded(monkeypatch):
