@@ -91,8 +91,12 @@ class Svg:
             f"{html.escape(shown(text))}</text>"
         )
 
+    def document(self) -> str:
+        """The whole picture."""
+        return self._head + "".join(self._parts) + "</svg>\n"
+
     def save(self, path: Path) -> None:
-        path.write_text(self._head + "".join(self._parts) + "</svg>\n", encoding="utf-8")
+        path.write_text(self.document(), encoding="utf-8")
 
 
 class Png:
@@ -170,6 +174,13 @@ def draw(prior: Prior, path: Path) -> None:
     things = [prior.objects[column].name for column in columns]
     _matrix(canvas, (MARGIN_PX, top + matrix_px), title, (names, things), prior.containment[:, columns])
     canvas.save(path)
+
+
+def graph_svg(prior: Prior) -> str:
+    """The graph alone, for a page."""
+    canvas = Svg(GRAPH_PX, GRAPH_PX)
+    _graph(canvas, prior, (0.0, 0.0))
+    return canvas.document()
 
 
 def merits(prior: Prior) -> np.ndarray:

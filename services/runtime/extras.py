@@ -27,7 +27,7 @@ MODULES = {  # by extra; what the build file lists there, by the names that code
     "view": ("viser",),
     "rerun": ("rerun",),
 }
-CONTAINS = {"encode": ("map",), "clip": ("encode", "map"), "export": ("clip", "encode", "map")}
+CONTAINS = {"view": ("map",), "encode": ("map",), "clip": ("encode", "map"), "export": ("clip", "encode", "map")}
 
 
 class ExtraMissing(ServiceError):

@@ -17,7 +17,8 @@ from prior_sg.deploy.showing.export import (
     scene_json,
     zones,
 )
-from prior_sg.deploy.showing.map import FREE, PALETTE, UNLABELLED, WALL, label_colors
+from prior_sg.deploy.showing.colors import PALETTE, UNLABELLED, label_colors
+from prior_sg.deploy.showing.map import FREE, WALL
 from prior_sg.deploy.showing.places import OPENING
 from prior_sg.deploy.truth import GroundTruth
 from prior_sg.schemas.objects import SceneObject

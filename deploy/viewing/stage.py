@@ -1,0 +1,231 @@
+"""The three-dimensional side of the page: pictures become viser's batched nodes, and only what differs is sent."""
+
+import contextlib
+import io
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import viser
+import viser.transforms
+
+from prior_sg.deploy.viewing.drawing import Theme
+from prior_sg.deploy.viewing.shapes import Arrows, Difference, Lines, Mesh, Name, Picture, Points, Shape, difference
+from prior_sg.deploy.viewing.sources import Camera
+
+FOV_RAD, ELEVATION_RAD = np.deg2rad(38.0), np.deg2rad(56.0)
+PANEL_PX, PHONE_PX = 360, 700  # width that the controls cover; below this width they lie at the bottom
+ROOM = 1.12  # around the map
+CAMERA_NODE = "/camera/last"
+
+
+@dataclass(frozen=True)
+class Layer:
+    """What can be switched on and off together."""
+
+    name: str  # first part of its nodes' names
+    title: str
+    shown: bool
+
+
+LAYERS = (
+    Layer("map", "Map points", True),
+    Layer("regions", "Regions", True),
+    Layer("places", "Places", True),
+    Layer("edges", "Edges", True),
+    Layer("objects", "Objects", True),
+    Layer("trajectory", "Trajectory", True),
+    Layer("camera", "Camera", True),
+    Layer("frontiers", "Openings", False),
+    Layer("answers", "Answers", True),
+)
+
+
+class SafeServer(viser.ViserServer):
+    """A server on this machine alone, for pages that come from it.
+
+    A browser lets any web page open a socket to this machine: one that another page opened is closed before anything is
+    said. Links through a third party cannot be asked for.
+    """
+
+    def __init__(self, host: str, port: int) -> None:
+        with contextlib.redirect_stdout(io.StringIO()):  # it prints a banner of its own
+            super().__init__(host=host, port=port, verbose=False)
+        self._websock_server.on_client_connect(self._check_origin)
+
+    async def _check_origin(self, client: Any) -> None:
+        connection = self._websock_server._live_connections[client.client_id]
+        headers = connection.request.headers
+        origin, host = headers.get("Origin"), headers.get("Host", "")
+        if (origin is not None and origin.split("://")[-1] != host) or not _is_local(host):
+            await connection.close(1008, "pages of other sites may not look at this map")
+
+    def request_share_url(self, verbose: bool = True) -> str | None:
+        return None
+
+
+def _is_local(host: str) -> bool:
+    """Whether a Host header names this machine: another name that leads here belongs to somebody else."""
+    return host.rsplit(":", 1)[0] in ("localhost", "127.0.0.1", "[::1]")
+
+
+class Stage:
+    """Shows pictures on a server."""
+
+    def __init__(self, server: viser.ViserServer, theme: Theme) -> None:
+        self._server, self._theme = server, theme
+        self._picture: Picture = {}
+        self._nodes: dict[str, Any] = {}
+        self._layers = {
+            layer.name: server.scene.add_frame(f"/{layer.name}", show_axes=False, visible=layer.shown)
+            for layer in LAYERS
+        }
+        self._camera: tuple[int, bytes] | None = None
+        self._bounds: tuple[np.ndarray, np.ndarray] | None = None
+        server.scene.world_axes.visible = False
+        server.scene.set_background_image(np.full((1, 1, 3), theme.background, np.uint8), format="png")
+        server.on_client_connect(self.frame)
+
+    def show(self, picture: Picture) -> Difference:
+        """Make the page show this picture; what was sent for it."""
+        found = difference(self._picture, picture)
+        with self._server.atomic():
+            for name in found.removed:
+                self._nodes.pop(name).remove()
+            for name, shape in found.changed.items():
+                self._put(name, shape)
+        self._picture = picture
+        return found
+
+    def _put(self, name: str, shape: Shape) -> None:
+        """Add a node or replace it. A name only changes its text, so that it does not blink."""
+        scene, old = self._server.scene, self._picture.get(name)
+        match shape:
+            case Name() if isinstance(old, Name):
+                node = self._nodes[name]
+                if node.text != shape.text:
+                    node.text = shape.text
+                node.position = shape.position_m
+                node.font_screen_scale = shape.scale
+            case Name():
+                self._nodes[name] = scene.add_label(
+                    name,
+                    shape.text,
+                    position=shape.position_m,
+                    font_screen_scale=shape.scale,
+                    anchor="center-center",
+                )
+            case Points():
+                self._nodes[name] = scene.add_point_cloud(
+                    name,
+                    shape.points_m,
+                    shape.colors,
+                    point_size=shape.size_m,
+                    point_shape="circle" if name.startswith(("/places", "/answers")) else "square",
+                    point_shading="flat",
+                    precision="float32",
+                )
+            case Lines():
+                self._nodes[name] = scene.add_line_segments(
+                    name, shape.points_m, shape.colors, thickness=shape.width_px, thickness_units="screen"
+                )
+            case Mesh():
+                self._nodes[name] = scene.add_mesh_simple(
+                    name,
+                    shape.vertices_m,
+                    shape.faces,
+                    color=shape.color,
+                    opacity=shape.opacity,
+                    side="double",
+                    cast_shadow=False,
+                    receive_shadow=False,
+                )
+            case Arrows():
+                self._nodes[name] = scene.add_arrows(
+                    name,
+                    shape.points_m,
+                    shape.color,
+                    shaft_radius=shape.shaft_m,
+                    head_radius=3 * shape.shaft_m,
+                    head_length=6 * shape.shaft_m,
+                )
+
+    def switch(self, layer: str, on: bool) -> None:
+        """Show or hide a layer."""
+        self._layers[layer].visible = on
+
+    def is_on(self, layer: str) -> bool:
+        """Whether a layer is shown."""
+        return bool(self._layers[layer].visible)
+
+    def look(self, camera: Camera | None) -> None:
+        """Show an image where it was taken."""
+        told = None if camera is None else (camera.frame_id, camera.world_from_camera.tobytes())
+        if told == self._camera:
+            return
+        self._camera = told
+        if camera is None:
+            self._server.scene.remove_by_name(CAMERA_NODE)
+            return
+        lens, pose = camera.intrinsics, camera.world_from_camera
+        self._server.scene.add_camera_frustum(
+            CAMERA_NODE,
+            fov=2 * float(np.arctan2(lens.height_px / 2, lens.fy_px)),
+            aspect=lens.width_px / lens.height_px,
+            scale=0.45,
+            thickness=2.0,
+            thickness_units="screen",
+            color=self._theme.path,
+            image=camera.image,
+            format="jpeg",
+            jpeg_quality=80,
+            wxyz=viser.transforms.SO3.from_matrix(pose[:3, :3]).wxyz,
+            position=pose[:3, 3],
+            cast_shadow=False,
+            receive_shadow=False,
+        )
+
+    def set_bounds(self, low_m: np.ndarray, high_m: np.ndarray) -> bool:
+        """Where the map is; whether this is the first time that anybody knows."""
+        first, self._bounds = self._bounds is None, (low_m, high_m)
+        eye, target = pose_for(low_m, high_m, 1.6)
+        with self._server.atomic():
+            self._server.initial_camera.fov = float(FOV_RAD)
+            self._server.initial_camera.look_at = target
+            self._server.initial_camera.position = eye
+        if first:
+            for client in self._server.get_clients().values():
+                self.frame(client)
+        return first
+
+    def frame(self, client: viser.ClientHandle) -> None:
+        """Turn one viewer's eye so that the whole map is seen beside the controls."""
+        if self._bounds is None:
+            return
+        width, height = client.camera.image_width, client.camera.image_height
+        wide = width > PHONE_PX
+        aspect = (width - PANEL_PX * wide) / max(height, 1)
+        eye, target = pose_for(*self._bounds, max(aspect, 0.3))
+        if wide:  # the middle of what is free lies left of the middle of the window
+            reach_m = float(np.linalg.norm(eye - target))
+            forward = (target - eye) / reach_m
+            right = np.cross(forward, (0, 0, 1))
+            shift_m = right / np.linalg.norm(right) * reach_m * np.tan(FOV_RAD / 2) * PANEL_PX / max(height, 1)
+            eye, target = eye + shift_m, target + shift_m
+        with client.atomic():
+            client.camera.fov = float(FOV_RAD)
+            client.camera.up_direction = (0.0, 0.0, 1.0)
+            client.camera.position = eye
+            client.camera.look_at = target
+
+
+def pose_for(low_m: np.ndarray, high_m: np.ndarray, aspect: float) -> tuple[np.ndarray, np.ndarray]:
+    """An eye (3,) and where it looks (3,) so that a box fits a window, its longer side along the window's."""
+    middle, size = (low_m + high_m) / 2, np.maximum(high_m - low_m, 1.0)
+    along_x = (size[0] >= size[1]) == (aspect >= 1)
+    across, deep = (size[0], size[1]) if along_x else (size[1], size[0])
+    tall = deep * np.sin(ELEVATION_RAD) + size[2] * np.cos(ELEVATION_RAD)
+    tangent = np.tan(FOV_RAD / 2)
+    reach_m = ROOM * max(across / 2 / (tangent * aspect), tall / 2 / tangent) + deep / 2 * np.cos(ELEVATION_RAD)
+    back = np.array((0.0, -1.0) if along_x else (1.0, 0.0)) * np.cos(ELEVATION_RAD)
+    return middle + reach_m * np.array((*back, np.sin(ELEVATION_RAD))), middle
