@@ -13,7 +13,7 @@ from prior_sg.deploy.viewing.shapes import Picture, Points
 from prior_sg.schemas.frames import Intrinsics, Keyframe
 from prior_sg.services.images import MAX_PRINCIPAL_OFFSET, color_of, depth_of
 
-CELL_M, MOST_POINTS = 0.04, 400_000
+CELL_M, MOST_POINTS = 0.05, 300_000
 MOST_PIXELS = 160 * 120  # of a depth image that are looked at
 NEAR_M, FAR_M = 0.2, 6.0  # farther depth is too noisy for a calm picture
 GROUP = 16  # keyframes whose points are one shape

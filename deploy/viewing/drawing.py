@@ -21,9 +21,10 @@ from prior_sg.schemas.scene import Scene
 BLOCK = 4096  # consecutive ids of places whose dots and edges are one shape
 OBJECT_BLOCK = 512
 MOST_NAMES = 60  # of objects: more cover each other
-PLACE_M, LIT_PLACE_M = 0.085, 0.2
-ABOVE_FLOOR_M = 0.05  # of regions, so that floor points do not shine through
-FLOOR_OPACITY, PREDICTED_OPACITY, DIMMED_OPACITY = 0.55, 0.16, 0.1
+PLACE_M, LIT_PLACE_M, EDGE_PX = 0.085, 0.2, 0.75
+FAINTER = 0.45  # edges than their places
+ABOVE_FLOOR_M = 0.14  # of regions, so that floor points do not shine through
+FLOOR_OPACITY, PREDICTED_OPACITY, DIMMED_OPACITY = 0.5, 0.16, 0.1
 DASH_M = 0.18
 SHORT_ARROW_M, LONG_ARROW_M = 0.25, 0.8
 CORNERS = np.array([(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)])
@@ -37,15 +38,14 @@ class Theme:
     dark: bool
     background: Color
     ink: Color
-    edge: Color
     object: Color
     path: Color
     opening: Color = (230, 120, 20)
     light: Color = (255, 196, 0)  # of what a search found
 
 
-DARK = Theme(True, (22, 25, 31), (236, 239, 244), (86, 94, 108), (196, 204, 216), (246, 248, 250))
-LIGHT = Theme(False, (246, 247, 249), (31, 35, 40), (168, 176, 187), (75, 82, 92), (20, 20, 24))
+DARK = Theme(True, (22, 25, 31), (236, 239, 244), (196, 204, 216), (246, 248, 250))
+LIGHT = Theme(False, (246, 247, 249), (31, 35, 40), (75, 82, 92), (20, 20, 24))
 
 
 @dataclass(frozen=True)
@@ -85,8 +85,9 @@ class Painter:
         for region in scene.regions:
             if region.id in ground:
                 picture |= _region(self.theme, region, ground[region.id], colors[region.label], lit)
-        picture |= _places(self.theme, scene, colors, lit)
-        picture |= _edges(self.theme, scene)
+        tints = _place_tints(self.theme, scene, colors)
+        picture |= _places(self.theme, scene, tints, lit)
+        picture |= _edges(self.theme, scene, tints)
         picture |= _objects(self.theme, scene, lit)
         picture |= _openings(self.theme, scene)
         picture |= _path(self.theme, scene)
@@ -109,7 +110,7 @@ def _region(theme: Theme, region: Region, ground: Footprint, color: Color, lit: 
     return {
         f"{root}/floor": Mesh(ground.vertices + lifted, ground.faces, color, opacity),
         f"{root}/outline": Lines(outline, np.array(tint, np.uint8), 4.0 if chosen else 2.0),
-        f"{root}/name": Name(title_of(region), (x, y, float(ground.vertices[0, 2]) + 1.2), 0.8 if dimmed else 1.1),
+        f"{root}/name": Name(title_of(region), (x, y, float(ground.vertices[0, 2]) + 1.2), 0.75 if dimmed else 1.0),
     }
 
 
@@ -119,8 +120,7 @@ def title_of(region: Region) -> str:
     return f"{told}, predicted" if region.predicted else told
 
 
-def _places(theme: Theme, scene: Scene, colors: dict[str, Color], lit: Lit) -> Picture:
-    tints = _place_tints(theme, scene, colors)
+def _places(theme: Theme, scene: Scene, tints: np.ndarray, lit: Lit) -> Picture:
     picture: Picture = {}
     for block, rows in blocks(scene.place_ids, BLOCK):
         picture[f"/places/{block}"] = Points(scene.positions_m[rows], tints[rows], PLACE_M)
@@ -145,15 +145,15 @@ def _place_tints(theme: Theme, scene: Scene, colors: dict[str, Color]) -> np.nda
     return (table[rows] * (1 - share) + grey * share).astype(np.uint8)
 
 
-def _edges(theme: Theme, scene: Scene) -> Picture:
-    """Between places that are there; an edge lies in the block of its larger id."""
+def _edges(theme: Theme, scene: Scene, tints: np.ndarray) -> Picture:
+    """Between places that are there, in their fainter colours; an edge lies in the block of its larger id."""
     if not len(scene.edges):
         return {}
     rows = np.searchsorted(scene.place_ids, scene.edges)
     inside = (rows < len(scene.place_ids)).all(axis=1)
-    color = np.array(theme.edge, np.uint8)
+    faint = (tints * (1 - FAINTER) + np.array(theme.background) * FAINTER).astype(np.uint8)
     return {
-        f"/edges/{block}": Lines(scene.positions_m[rows[inside][of]], color, 1.0)
+        f"/edges/{block}": Lines(scene.positions_m[rows[inside][of]], faint[rows[inside][of]], EDGE_PX)
         for block, of in blocks(scene.edges[inside].max(axis=1), BLOCK)
     }
 
@@ -173,12 +173,12 @@ def _objects(theme: Theme, scene: Scene, lit: Lit) -> Picture:
     """Boxes, darker with a name; names of those that are most surely something."""
     items = [item for item in scene.objects if is_furniture(item)]
     picture: Picture = {}
-    for kind, named in (("named", True), ("unnamed", False)):
+    for kind, named in (("objects", True), ("unnamed", False)):
         some = [item for item in items if bool(item.label) == named and item.id not in lit.objects]
         tint = theme.object if named else mixed(theme.object, theme.background, 0.7)
         for block, rows in blocks(np.array([item.id for item in some], np.int64), OBJECT_BLOCK):
             boxes = box_lines([some[row] for row in rows.tolist()])
-            picture[f"/objects/{kind}/{block}"] = Lines(boxes, np.array(tint, np.uint8), 1.5)
+            picture[f"/{kind}/boxes/{block}"] = Lines(boxes, np.array(tint, np.uint8), 1.5)
     found = [item for item in scene.objects if item.id in lit.objects]
     if found:
         picture["/answers/objects"] = Lines(box_lines(found), np.array(theme.light, np.uint8), 3.0)
@@ -186,7 +186,7 @@ def _objects(theme: Theme, scene: Scene, lit: Lit) -> Picture:
     for item in [*found, *(item for item in sure if item.id not in lit.objects)][:MOST_NAMES]:
         x, y, _ = item.position_m
         text, layer = shown(item.label) or "object", "answers" if item.id in lit.objects else "objects"
-        picture[f"/{layer}/names/{item.id}"] = Name(text, (x, y, item.max_m[2] + 0.1), 0.7)
+        picture[f"/{layer}/names/{item.id}"] = Name(text, (x, y, item.max_m[2] + 0.1), 0.65)
     return picture
 
 

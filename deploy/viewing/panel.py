@@ -9,7 +9,7 @@ import viser
 from prior_sg.deploy.viewing.stage import LAYERS
 from prior_sg.deploy.viewing.words import note
 
-LOWEST_CUT_M, HIGHEST_CUT_M, CUT_M = 0.4, 6.0, 2.0  # of map points over the floor: by default, ceilings are off
+LOWEST_CUT_M, HIGHEST_CUT_M, CUT_M = 0.4, 6.0, 1.6  # of map points over the floor: by default, ceilings are off
 
 
 @dataclass

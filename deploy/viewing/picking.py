@@ -41,7 +41,7 @@ def pick(
 
 def _below(scene: Scene, ground: dict[int, Footprint], origin_m: np.ndarray, direction: np.ndarray) -> int | None:
     """The place that owns the nearest ground the ray meets."""
-    floors = sorted({float(one.vertices[0, 2]) for one in ground.values()}, reverse=direction[2] < 0)
+    floors = sorted({float(one.vertices[0, 2]) for one in ground.values()}, reverse=bool(direction[2] < 0))
     for floor_m in floors if direction[2] else []:
         reach = (floor_m - origin_m[2]) / direction[2]
         if reach <= 0:

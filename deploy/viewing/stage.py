@@ -13,9 +13,10 @@ from prior_sg.deploy.viewing.drawing import Theme
 from prior_sg.deploy.viewing.shapes import Arrows, Difference, Lines, Mesh, Name, Picture, Points, Shape, difference
 from prior_sg.deploy.viewing.sources import Camera
 
-FOV_RAD, ELEVATION_RAD = np.deg2rad(38.0), np.deg2rad(56.0)
+FOV_RAD, ELEVATION_RAD = np.deg2rad(38.0), np.deg2rad(62.0)
 PANEL_PX, PHONE_PX = 360, 700  # width that the controls cover; below this width they lie at the bottom
-ROOM = 1.12  # around the map
+ROOM = 1.15  # around the map
+SLACK_M = 0.5  # by which the map may grow before it is framed otherwise
 CAMERA_NODE = "/camera/last"
 
 
@@ -34,6 +35,7 @@ LAYERS = (
     Layer("places", "Places", True),
     Layer("edges", "Edges", True),
     Layer("objects", "Objects", True),
+    Layer("unnamed", "Objects without a name", False),
     Layer("trajectory", "Trajectory", True),
     Layer("camera", "Camera", True),
     Layer("frontiers", "Openings", False),
@@ -187,6 +189,8 @@ class Stage:
 
     def set_bounds(self, low_m: np.ndarray, high_m: np.ndarray) -> bool:
         """Where the map is; whether this is the first time that anybody knows."""
+        if self._bounds is not None and np.allclose(self._bounds, (low_m, high_m), atol=SLACK_M):
+            return False
         first, self._bounds = self._bounds is None, (low_m, high_m)
         eye, target = pose_for(low_m, high_m, 1.6)
         with self._server.atomic():
