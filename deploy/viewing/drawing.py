@@ -15,7 +15,7 @@ from prior_sg.deploy.viewing.footprint import Footprint, footprints
 from prior_sg.deploy.viewing.shapes import Arrows, Lines, Mesh, Name, Picture, Points
 from prior_sg.schemas.names import shown
 from prior_sg.schemas.objects import SceneObject
-from prior_sg.schemas.regions import Region
+from prior_sg.schemas.regions import NO_REGION, Region
 from prior_sg.schemas.scene import Scene
 
 BLOCK = 4096  # consecutive ids of places whose dots and edges are one shape
@@ -55,6 +55,7 @@ class Lit:
     regions: frozenset[int] = frozenset()
     places: frozenset[int] = frozenset()
     objects: frozenset[int] = frozenset()
+    picked: int = NO_REGION  # the region that somebody asks about: outlined, and dims nothing
 
     def __bool__(self) -> bool:
         return bool(self.regions or self.places or self.objects)
@@ -98,18 +99,18 @@ def _region(theme: Theme, region: Region, ground: Footprint, color: Color, lit: 
     """Its ground, its outline and its name."""
     lifted = np.array((0, 0, ABOVE_FLOOR_M), np.float32)
     dimmed = bool(lit) and region.id not in lit.regions and not lit.objects.intersection(region.object_ids)
-    chosen = region.id in lit.regions
+    found, chosen = region.id in lit.regions, region.id == lit.picked
     opacity = DIMMED_OPACITY if dimmed else PREDICTED_OPACITY if region.predicted else FLOOR_OPACITY
     outline = ground.outline + 2 * lifted
     if region.predicted:
         middles = outline.mean(axis=1)
         outline = outline[np.floor((middles[:, 0] + 1.7 * middles[:, 1]) / DASH_M) % 2 == 0]
-    tint = theme.light if chosen else mixed(color, theme.background, 0.6 if dimmed else 0.0)
+    tint = theme.light if found else theme.ink if chosen else mixed(color, theme.background, 0.6 if dimmed else 0.0)
     root = f"/regions/{region.id}"
     x, y, _ = region.position_m
     return {
         f"{root}/floor": Mesh(ground.vertices + lifted, ground.faces, color, opacity),
-        f"{root}/outline": Lines(outline, np.array(tint, np.uint8), 4.0 if chosen else 2.0),
+        f"{root}/outline": Lines(outline, np.array(tint, np.uint8), 4.0 if found or chosen else 2.0),
         f"{root}/name": Name(title_of(region), (x, y, float(ground.vertices[0, 2]) + 1.2), 0.75 if dimmed else 1.0),
     }
 

@@ -1,9 +1,10 @@
 """The live page: one thread draws what has changed, no faster than the link and the machine follow."""
 
-import logging
+import contextlib
+import io
 import threading
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import viser
@@ -11,16 +12,16 @@ import viser
 from prior_sg.deploy.showing.colors import labels_of
 from prior_sg.deploy.showing.prior import graph_svg
 from prior_sg.deploy.viewing import search, words
-from prior_sg.deploy.viewing.drawing import DARK, LIGHT, Lit, Painter
+from prior_sg.deploy.viewing.drawing import DARK, LIGHT, Painter
 from prior_sg.deploy.viewing.footprint import floor_m
 from prior_sg.deploy.viewing.panel import CUT_M, Asked, Panel
 from prior_sg.deploy.viewing.picking import Picked, pick, typical_place
 from prior_sg.deploy.viewing.sources import Source
 from prior_sg.deploy.viewing.stage import SafeServer, Stage
+from prior_sg.schemas.regions import NO_REGION
 from prior_sg.schemas.scene import Scene
 from prior_sg.services.errors import PriorSgError
 
-logger = logging.getLogger(__name__)
 SHARE = 4.0  # drawing takes at most one part in so many of the time
 PLAY_S, FRAME_S = 20.0, 0.1  # a whole history, and one step of it
 HEALTH_S, POLL_S = 5.0, 0.5
@@ -86,7 +87,8 @@ class Page:
         self._wake.set()
         for thread in self._threads:
             thread.join(2 * MOST_CATCH_UP_S)
-        self.server.stop()
+        with contextlib.redirect_stdout(io.StringIO()):
+            self.server.stop()
 
     def _asked(self) -> Asked:
         return Asked(
@@ -135,7 +137,8 @@ class Page:
         self._scene = scene
         until_ns = scene.stamp_ns if wanted.moment is not None else np.inf
         found = search.by_name(scene, wanted.text)
-        picture = self._painter.draw(scene, found.lit)
+        picked = NO_REGION if wanted.picked is None else wanted.picked.region
+        picture = self._painter.draw(scene, replace(found.lit, picked=picked))
         ground_m = floor_m(scene, np.arange(len(scene.place_ids)))
         picture |= self._source.cloud.picture(ground_m + wanted.cut_m, until_ns)
         sent = self.stage.show(picture).nbytes

@@ -35,7 +35,7 @@ LAYERS = (
     Layer("places", "Places", True),
     Layer("edges", "Edges", True),
     Layer("objects", "Objects", True),
-    Layer("unnamed", "Objects without a name", False),
+    Layer("unnamed", "Unnamed objects", False),
     Layer("trajectory", "Trajectory", True),
     Layer("camera", "Camera", True),
     Layer("frontiers", "Openings", False),

@@ -1,5 +1,6 @@
 """What the page says, as HTML fragments. All text from outside is escaped: names come from models and files."""
 
+import base64
 import html
 from collections.abc import Iterable, Mapping, Sequence
 
@@ -37,7 +38,7 @@ def headline(scene: Scene, title: str) -> str:
     )
     where = " · ".join(part for part in (text_of(scene.environment), text_of(scene.robot), text_of(title)) if part)
     return (
-        f'<div style="{_BOX};padding-bottom:2px"><div style="font-size:19px;font-weight:650;line-height:1.25">{task}'
+        f'<div style="{_BOX};padding-bottom:8px"><div style="font-size:19px;font-weight:650;line-height:1.25">{task}'
         f'</div><div style="font-size:12px;{FAINT};margin-top:3px">{where}<br>{counts}</div></div>'
     )
 
@@ -201,8 +202,12 @@ def answers(found: Iterable[tuple[str, str, float | None]]) -> str:
 
 
 def card(svg: str) -> str:
-    """A picture on white, as wide as there is room."""
-    return f'<div style="margin:6px 12px;border-radius:8px;overflow:hidden;background:#fff">{svg}</div>'
+    """A picture on white, as wide as there is room; as an image, in which nothing runs."""
+    data = base64.b64encode(svg.encode()).decode()
+    return (
+        '<div style="margin:6px 12px;border-radius:8px;overflow:hidden;background:#fff">'
+        f'<img alt="the prior as a graph" style="display:block;width:100%" src="data:image/svg+xml;base64,{data}"></div>'
+    )
 
 
 def note(text: str) -> str:
