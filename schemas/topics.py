@@ -29,6 +29,7 @@ from prior_sg.schemas.priors import (
     TaskInForce,
     TaskRequest,
 )
+from prior_sg.schemas.queries import SceneAnswer, SceneQuery
 from prior_sg.schemas.regions import PosteriorReply, PosteriorRequest, RegionDelta
 from prior_sg.schemas.scene import Scene, SceneRequest, SceneRevision
 from prior_sg.schemas.status import Consumed, ServiceStatus, StatusRequest
@@ -140,6 +141,7 @@ OBJECT_SNAPSHOT = Query("OBJECT_SNAPSHOT", SnapshotRequest, ObjectDelta, f"{ROOT
 POSTERIOR = Query("POSTERIOR", PosteriorRequest, PosteriorReply, f"{ROOT}/{{robot}}/ask/posterior")
 TASK_IN_FORCE = Query("TASK_IN_FORCE", TaskRequest, TaskInForce, f"{ROOT}/{{robot}}/ask/task")
 SCENE = Query("SCENE", SceneRequest, Scene, f"{ROOT}/{{robot}}/ask/scene")
+SCENE_QUERY = Query("SCENE_QUERY", SceneQuery, SceneAnswer, f"{ROOT}/{{robot}}/ask/query")
 TEXT = Query("TEXT", TextRequest, TextEmbeddings, f"{ROOT}/encoder/{{space}}/text")
 PRIORS = Query("PRIORS", PriorRequest, PriorList, f"{ROOT}/fleet/ask/prior")
 
@@ -152,6 +154,7 @@ QUERIES = (
     POSTERIOR,
     TASK_IN_FORCE,
     SCENE,
+    SCENE_QUERY,
     TEXT,
     PRIORS,
 )

@@ -11,6 +11,7 @@ from prior_sg.schemas.codec import Message
 from prior_sg.schemas.objects import ObjectDelta
 from prior_sg.schemas.places import PlaceDelta, SnapshotRequest
 from prior_sg.schemas.priors import Prior, Task, TaskInForce, TaskRequest
+from prior_sg.schemas.queries import SceneAnswer, SceneQuery
 from prior_sg.schemas.regions import RegionDelta
 from prior_sg.schemas.scene import Scene, SceneRequest
 from prior_sg.schemas.status import Tick
@@ -23,6 +24,7 @@ from prior_sg.schemas.topics import (
     REGION_DELTA,
     REGION_SNAPSHOT,
     SCENE,
+    SCENE_QUERY,
     SCENE_REVISION,
     TASK,
     TASK_IN_FORCE,
@@ -31,6 +33,8 @@ from prior_sg.schemas.topics import (
 from prior_sg.services.deltas import Delta, Follower
 from prior_sg.services.runtime.service import Ask, Identity, Output, Service
 from prior_sg.services.scene_store.core import graph as core
+from prior_sg.services.scene_store.core.queries.answering import reply
+from prior_sg.services.scene_store.core.queries.index import Index
 from prior_sg.services.scene_store.database import Database
 
 CHECKPOINT_S = 1.0  # the write-ahead log is folded into the file between deltas, not within a commit
@@ -45,6 +49,7 @@ class Robot:
     places: Follower[PlaceDelta]
     regions: Follower[RegionDelta]
     objects: Follower[ObjectDelta]
+    index: Index | None = None  # of the revision that was last asked about
 
 
 @dataclass
@@ -148,6 +153,18 @@ def answer_scene(state: State, request: SceneRequest, cfg: core.Config) -> Scene
     return core.scene(robot.graph if robot else core.Graph(request.robot))
 
 
+def answer_query(state: State, request: SceneQuery, cfg: core.Config) -> SceneAnswer:
+    """Questions about one robot's scene; of one that the store has never heard of, it is empty."""
+    return reply(_index(state.robots.get(request.robot) or _robot(core.Graph(request.robot))), request)
+
+
+def _index(robot: Robot) -> Index:
+    """The graph as it is, prepared for questions; made once for each revision that somebody asks about."""
+    if robot.index is None or robot.index.revision != robot.graph.revision:
+        robot.index = Index(core.scene(robot.graph), robot.graph.revision)
+    return robot.index
+
+
 def answer_task(state: State, request: TaskRequest, cfg: core.Config) -> TaskInForce:
     """The newest task of one robot, for whoever was not there when it was given."""
     robot = state.robots.get(request.robot)
@@ -168,7 +185,7 @@ SERVICE = Service(
     step=step,
     reads=(PLACE_DELTA, REGION_DELTA, OBJECT_DELTA, TASK, PRIOR),
     writes=(SCENE_REVISION,),
-    answers={SCENE: answer_scene, TASK_IN_FORCE: answer_task},
+    answers={SCENE: answer_scene, SCENE_QUERY: answer_query, TASK_IN_FORCE: answer_task},
     asks=(PLACE_SNAPSHOT, REGION_SNAPSHOT, OBJECT_SNAPSHOT),
     tick_s=CHECKPOINT_S,
     close=close,

@@ -91,9 +91,15 @@ def array(code, data):
 
 def same(unpacked, value):
     if isinstance(value, msgspec.Struct):
+        config = value.__struct_config__
+        assert config.tag is None or unpacked.pop(config.tag_field) == config.tag
         assert list(unpacked) == list(value.__struct_fields__)
         for name, inner in unpacked.items():
             same(inner, getattr(value, name))
+    elif isinstance(value, dict):
+        assert list(unpacked) == list(value)
+        for name, inner in unpacked.items():
+            same(inner, value[name])
     elif isinstance(value, np.ndarray):
         assert unpacked.dtype == value.dtype
         np.testing.assert_array_equal(unpacked, value)
