@@ -32,28 +32,35 @@ PALETTE: tuple[Color, ...] = (
 
 
 class LabelColors:
-    """Gives each label a colour of its own and never another: labels that come later take what is free.
+    """Gives labels colours that they keep as long as they are asked for, and afterwards as long as nobody needs them.
 
-    A label asks for the same colour wherever it appears; where that is taken, it gets the next that is not.
+    A label asks for the same colour wherever it appears; where another has that one, it gets the next that is free.
     """
 
     def __init__(self) -> None:
         self._slots: dict[str, int] = {}
 
     def of(self, labels: Iterable[str]) -> dict[str, Color]:
-        """The colours of these labels, by label."""
+        """A colour per label, all different."""
         asked = sorted(set(labels))
-        new = [label for label in asked if label not in self._slots]
-        taken = set(self._slots.values())
-        slots = max(len(PALETTE), len(taken) + len(new))
-        for label in new:
-            digest = hashlib.blake2b(label.encode(), digest_size=4, salt=SALT).digest()
-            slot = int.from_bytes(digest, "little") % len(PALETTE)
-            while slot in taken:
-                slot = (slot + 1) % slots
+        known = {slot: label for label, slot in self._slots.items()}
+        taken = {self._slots[label] for label in asked if label in self._slots}
+        slots = max(len(PALETTE), len(asked))
+        for label in asked:
+            if label in self._slots:
+                continue
+            order = [(_wish(label) + step) % slots for step in range(slots)]
+            free = [slot for slot in order if slot not in taken]
+            slot = next((slot for slot in free if slot not in known), free[0])
+            self._slots.pop(known.get(slot, ""), None)
+            self._slots[label], known[slot] = slot, label
             taken.add(slot)
-            self._slots[label] = slot
         return {label: _palette(self._slots[label]) for label in asked}
+
+
+def _wish(label: str) -> int:
+    """The place in the palette that a label asks for."""
+    return int.from_bytes(hashlib.blake2b(label.encode(), digest_size=4, salt=SALT).digest(), "little") % len(PALETTE)
 
 
 def labels_of(scene: Scene) -> set[str]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from prior_sg.deploy.showing.colors import UNLABELLED, Color, LabelColors, labels_of
+from prior_sg.deploy.showing.colors import UNLABELLED, Color, LabelColors
 from prior_sg.deploy.showing.map import FURNITURE_M
 from prior_sg.deploy.showing.places import SHOWN_AREA_M2
 from prior_sg.deploy.viewing.footprint import Footprint, footprints
@@ -78,9 +78,13 @@ class Painter:
             self._ground, self._ground_of = footprints(scene), key
         return self._ground
 
+    def label_colors(self, scene: Scene) -> dict[str, Color]:
+        """The colour of each label that is on the map."""
+        return self.colors.of(region.label for region in scene.regions)
+
     def draw(self, scene: Scene, lit: Lit = Lit()) -> Picture:
         """All of the scene but its points and images."""
-        colors = self.colors.of(labels_of(scene))
+        colors = self.label_colors(scene)
         picture: Picture = {}
         ground = self.ground(scene)
         for region in scene.regions:

@@ -9,7 +9,6 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import viser
 
-from prior_sg.deploy.showing.colors import labels_of
 from prior_sg.deploy.showing.prior import graph_svg
 from prior_sg.deploy.viewing import search, words
 from prior_sg.deploy.viewing.drawing import DARK, LIGHT, Painter
@@ -136,7 +135,7 @@ class Page:
         scene = self._source.scene(wanted.moment)
         self._scene = scene
         until_ns = scene.stamp_ns if wanted.moment is not None else np.inf
-        found = search.by_name(scene, wanted.text)
+        found = search.find(scene, wanted.text)
         picked = NO_REGION if wanted.picked is None else wanted.picked.region
         picture = self._painter.draw(scene, replace(found.lit, picked=picked))
         ground_m = floor_m(scene, np.arange(len(scene.place_ids)))
@@ -159,7 +158,7 @@ class Page:
     def _write(self, scene: Scene, found: search.Found, count: int) -> None:
         panel, wanted = self.panel, self._wanted
         panel.write("headline", words.headline(scene, self._source.title))
-        panel.write("legend", words.legend(scene, self._painter.colors.of(labels_of(scene))))
+        panel.write("legend", words.legend(scene, self._painter.label_colors(scene)))
         panel.write("answers", words.answers(found.rows) + (words.note(found.said) if found.said else ""))
         panel.write("selected", self._selected(scene, wanted.picked))
         newest = max(count - 1, 0)

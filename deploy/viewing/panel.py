@@ -67,6 +67,7 @@ class Panel:
                 self._task = gui.add_text("Task", "", hint="What the robot is to do, in plain words")
                 self._environment = gui.add_text("Place", "", hint="What kind of place it is; empty = as it is")
                 self._give = gui.add_button("Divide the map anew", icon=viser.Icon.SPARKLES)
+            self._give.on_click(lambda _: form.submit())
             form.on_submit(lambda _: self.asked.task(self._task.value, self._environment.value))
         self._html["told"] = gui.add_html("", visible=False)
         self._html["legend"] = gui.add_html("")

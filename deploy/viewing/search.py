@@ -1,11 +1,15 @@
-"""What a search lights up: regions and objects whose names hold the words (pure)."""
+"""What a search lights up (pure)."""
 
 from dataclasses import dataclass
 
 from prior_sg.deploy.viewing.drawing import Lit
+from prior_sg.schemas.queries import AnswersTo, Ranking
 from prior_sg.schemas.scene import Scene
+from prior_sg.services.scene_store.core.queries.answering import answer
+from prior_sg.services.scene_store.core.queries.index import Index
 
 MOST_ANSWERS = 8
+AS_GOOD = 0.6  # of the best answer's score: what answers so well is lit, too
 
 
 @dataclass(frozen=True)
@@ -17,31 +21,48 @@ class Found:
     said: str  # a sentence; empty when there is nothing to say
 
 
-def by_name(scene: Scene, text: str) -> Found:
-    """Regions and objects named so, the most probable first."""
-    words = [_stem(word) for word in text.casefold().split()]
-    if not words:
-        return Found([], Lit(), "")
-    regions = [region for region in scene.regions if _holds(region.label, words)]
-    objects = [item for item in scene.objects if item.label and _holds(item.label, words)]
+def ranked(scene: Scene, text: str) -> Ranking:
+    """What answers a text in the words of its labels, without an embedding of it."""
+    found = answer(Index(scene, 0), AnswersTo(text=text, limit=2 * MOST_ANSWERS))
+    if not isinstance(found, Ranking):
+        raise TypeError(f"AnswersTo is answered by {type(found).__name__}")
+    return found
+
+
+def found_in(ranking: Ranking, scene: Scene, text: str) -> Found:
+    """Answers as the page shows them; where there are none, names that begin like the text, while it is being typed."""
+    things = [thing for thing in ranking.things if thing.what != "place" and thing.score]
+    if not things:
+        return begun(scene, text)
+    best = things[0].score or 0.0
+    bright = [thing for thing in things if (thing.score or 0.0) >= AS_GOOD * best]
+    lit = Lit(
+        regions=frozenset(thing.id for thing in bright if thing.what == "region"),
+        objects=frozenset(thing.id for thing in bright if thing.what == "object"),
+    )
+    return Found([(thing.what, thing.label, thing.score) for thing in things[:MOST_ANSWERS]], lit, ranking.note)
+
+
+def begun(scene: Scene, text: str) -> Found:
+    """Regions and objects with a word that begins so, the most probable first."""
+    start = text.strip().casefold()
     named = [
-        *((one.probability, "region", one.label, one.id) for one in regions),
-        *((one.probability * one.known, "object", one.label, one.id) for one in objects),
+        *((one.probability, "region", one.label, one.id) for one in scene.regions if _begins(one.label, start)),
+        *((one.probability * one.known, "object", one.label, one.id) for one in scene.objects if _begins(one.label, start)),
     ]
     best = sorted(named, key=lambda one: -one[0])[:MOST_ANSWERS]
     lit = Lit(
         regions=frozenset(number for _, kind, _, number in best if kind == "region"),
         objects=frozenset(number for _, kind, _, number in best if kind == "object"),
     )
-    said = "" if best else f"nothing here is called {text.strip()!r}"
+    said = "" if best else f"nothing here answers {text.strip()!r}"
     return Found([(kind, name, score) for score, kind, name, _ in best], lit, said)
 
 
-def _holds(name: str, words: list[str]) -> bool:
-    own = [_stem(word) for word in name.casefold().split()]
-    return any(word and any(part.startswith(word) for part in own) for word in words)
+def find(scene: Scene, text: str) -> Found:
+    """What of a scene answers a text; nothing where it is empty."""
+    return found_in(ranked(scene, text), scene, text) if text.strip() else Found([], Lit(), "")
 
 
-def _stem(word: str) -> str:
-    """Without the plural's s."""
-    return word[:-1] if len(word) > 3 and word.endswith("s") and not word.endswith("ss") else word
+def _begins(name: str, start: str) -> bool:
+    return bool(start) and any(word.startswith(start) for word in [name.casefold(), *name.casefold().split()])

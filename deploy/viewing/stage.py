@@ -16,7 +16,6 @@ from prior_sg.deploy.viewing.sources import Camera
 FOV_RAD, ELEVATION_RAD = np.deg2rad(38.0), np.deg2rad(62.0)
 PANEL_PX, PHONE_PX = 360, 700  # width that the controls cover; below this width they lie at the bottom
 ROOM = 1.15  # around the map
-SLACK_M = 0.5  # by which the map may grow before it is framed otherwise
 CAMERA_NODE = "/camera/last"
 
 
@@ -187,20 +186,12 @@ class Stage:
             receive_shadow=False,
         )
 
-    def set_bounds(self, low_m: np.ndarray, high_m: np.ndarray) -> bool:
-        """Where the map is; whether this is the first time that anybody knows."""
-        if self._bounds is not None and np.allclose(self._bounds, (low_m, high_m), atol=SLACK_M):
-            return False
+    def set_bounds(self, low_m: np.ndarray, high_m: np.ndarray) -> None:
+        """Where the map is. Whoever looks on when this is first known sees all of it; later, eyes stay where they are."""
         first, self._bounds = self._bounds is None, (low_m, high_m)
-        eye, target = pose_for(low_m, high_m, 1.6)
-        with self._server.atomic():
-            self._server.initial_camera.fov = float(FOV_RAD)
-            self._server.initial_camera.look_at = target
-            self._server.initial_camera.position = eye
         if first:
             for client in self._server.get_clients().values():
                 self.frame(client)
-        return first
 
     def frame(self, client: viser.ClientHandle) -> None:
         """Turn one viewer's eye so that the whole map is seen beside the controls."""
