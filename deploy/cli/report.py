@@ -1,6 +1,7 @@
 """What a run leaves for people: tables on the terminal, files in the output folder."""
 
 import math
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -88,6 +89,7 @@ def write(
         export(scene, result.voxels, kind, out / name, truth, losses=losses)
     names = ", ".join((*files, "map-3d.png", result.log_path.name))
     console.print(f"written to {out}: {names} ({result.seconds:.0f} s)")
+    console.print(f"look at it: prior-sg view {shlex.quote(str(out))}")
 
 
 def compare(

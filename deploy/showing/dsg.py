@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 import spark_dsg
 
-from prior_sg.deploy.showing.export import adjacent_regions, members_of, objects_with_places, surfaces_of
 from prior_sg.deploy.showing.colors import label_colors
+from prior_sg.deploy.showing.export import adjacent_regions, members_of, objects_with_places, surfaces_of
 from prior_sg.schemas.objects import SceneObject
 from prior_sg.schemas.regions import Region
 from prior_sg.schemas.scene import Scene

@@ -84,7 +84,9 @@ class Cloud:
         frames = sorted(frame for frame, part in self._parts.items() if part.stamp_ns <= until_ns)
         for group in sorted({frame // GROUP for frame in frames}):
             parts = [self._parts[frame] for frame in frames if frame // GROUP == group]
-            points_m, colors = (np.concatenate([getattr(part, name) for part in parts]) for name in ("points_m", "colors"))
+            points_m, colors = (
+                np.concatenate([getattr(part, name) for part in parts]) for name in ("points_m", "colors")
+            )
             low = points_m[:, 2] <= highest_m
             if low.any():
                 picture[f"/map/{group}"] = Points(points_m[low], colors[low], self._cell_m * 1.1)

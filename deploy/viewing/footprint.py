@@ -16,6 +16,7 @@ from prior_sg.schemas.scene import Scene
 PAD_M = 0.14  # spheres touch walls in single points: a little more covers the corners
 SMALLEST_CELL_M, CELLS = 0.06, 420  # cell size, and cells along the longer side of the map from which it grows
 SMOOTHING_CELLS = 1.6
+MARGIN_CELLS = 6  # around everything, so that smoothing meets no end of the grid
 STOREY_M = 1.6  # regions whose middles differ by more in height are on other storeys
 FAR = -9.0
 
@@ -80,7 +81,8 @@ def _of_storey(scene: Scene, rows: dict[int, np.ndarray]) -> dict[int, Footprint
     low_m = scene.positions_m[every, :2].min(axis=0) - reach_m
     extent_m = scene.positions_m[every, :2].max(axis=0) + reach_m - low_m
     cell_m = max(SMALLEST_CELL_M, float(extent_m.max()) / CELLS)
-    shape = tuple((np.ceil(extent_m / cell_m).astype(int) + 3).tolist())
+    low_m = low_m - MARGIN_CELLS * cell_m
+    shape = tuple((np.ceil(extent_m / cell_m).astype(int) + 2 * MARGIN_CELLS).tolist())
     ground_m = floor_m(scene, every)
     fields = {region: _field(scene, of, low_m, cell_m) for region, of in rows.items()}
     best, second, owner = _contest(fields, shape)
@@ -108,7 +110,7 @@ def _field(scene: Scene, rows: np.ndarray, low_m: np.ndarray, cell_m: float) -> 
     """The height field of some places on the window that holds their discs and a margin of one cell."""
     at = (scene.positions_m[rows, :2] - low_m) / cell_m  # in cells
     radii = (scene.radii_m[rows] + PAD_M) / cell_m
-    reach = int(np.ceil(radii.max())) + 1
+    reach = int(np.ceil(radii.max())) + MARGIN_CELLS - 1
     corner = np.maximum(np.floor(at.min(axis=0)).astype(int) - reach - 1, 0)
     size = np.ceil(at.max(axis=0)).astype(int) + reach + 2 - corner
     heights = np.full(size, FAR, np.float32)
@@ -130,7 +132,7 @@ def _by_place(heights: np.ndarray, at: np.ndarray, radii: np.ndarray, reach: int
 def _by_step(heights: np.ndarray, at: np.ndarray, radii: np.ndarray, reach: int) -> None:
     """The same for many places with small discs: one step from all of them at a time."""
     size = np.array(heights.shape)
-    for step in np.stack(np.mgrid[-reach : reach + 1, -reach : reach + 1], axis=-1).reshape(-1, 2):
+    for step in np.argwhere(np.ones((2 * reach + 1, 2 * reach + 1))) - reach:
         cells = np.round(at).astype(int) + step
         inside = ((cells >= 0) & (cells < size)).all(axis=1)
         away = at[inside] - cells[inside]

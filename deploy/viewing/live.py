@@ -82,7 +82,7 @@ class Live:
                     message = decode(arrived.topic.type, arrived.payload)
                     if isinstance(message, PoseUpdate):
                         self.cloud.move(self._poses.take(message) or {})
-                    else:
+                    elif isinstance(message, Keyframe):
                         self._take_image(message)
             self._changed.set()
 

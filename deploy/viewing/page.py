@@ -4,6 +4,7 @@ import contextlib
 import io
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -96,9 +97,9 @@ class Page:
             moment=lambda moment: self._want(moment=moment, playing=False),
             follow=lambda: self._want(moment=None, playing=False),
             play=self._start_playing,
-            layer=lambda name, on: self.stage.switch(name, on),
+            layer=self.stage.switch,
             cut=lambda height: self._want(cut_m=height),
-            frame=lambda client: self.stage.frame(client),
+            frame=self.stage.frame,
             forget=lambda: self._want(picked=None),
         )
 
@@ -107,7 +108,7 @@ class Page:
             setattr(self._wanted, name, value)
         self._wake.set()
 
-    def _later(self, work, *arguments: object) -> None:
+    def _later(self, work: Callable[..., None], *arguments: object) -> None:
         threading.Thread(target=work, args=arguments, daemon=True).start()
 
     def _draw(self) -> None:

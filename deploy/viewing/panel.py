@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import viser
@@ -85,14 +86,19 @@ class Panel:
         gui = self.server.gui
         for layer in LAYERS:
             box = gui.add_checkbox(layer.title, layer.shown)
-            box.on_update(lambda _, box=box, layer=layer: self.asked.layer(layer.name, box.value))
+            box.on_update(partial(self._switched, layer.name))
         cut = gui.add_slider(
             "Cut at", min=LOWEST_CUT_M, max=HIGHEST_CUT_M, step=0.1, initial_value=CUT_M, hint="metres over the floor"
         )
         cut.on_update(lambda _: self.asked.cut(cut.value))
-        gui.add_button("Show the whole map", icon=viser.Icon.FOCUS_CENTERED).on_click(
-            lambda event: event.client and self.asked.frame(event.client)
-        )
+        gui.add_button("Show the whole map", icon=viser.Icon.FOCUS_CENTERED).on_click(self._framed)
+
+    def _switched(self, layer: str, event: viser.GuiEvent) -> None:
+        self.asked.layer(layer, bool(event.target.value))
+
+    def _framed(self, event: viser.GuiEvent) -> None:
+        if event.client is not None:
+            self.asked.frame(event.client)
 
     def write(self, where: str, html: str) -> None:
         """Change one text; an empty one takes no room."""
@@ -113,7 +119,7 @@ class Panel:
             self._slider.max, self._slider.disabled = count - 1, False
             self._moment_count = count
         if self._slider.value != moment and count > 1:
-            self._slider.value = moment
+            self._slider.value = moment  # type: ignore[misc]  # its setter lies in a base class
         self._setting = False
 
     def busy(self, on: bool) -> None:

@@ -7,6 +7,7 @@ import dataclasses
 import logging
 import threading
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from prior_sg.deploy.errors import UserError
 from prior_sg.deploy.inspecting import replay
 from prior_sg.deploy.viewing.cloud import Cloud, small_image
 from prior_sg.deploy.viewing.sources import Camera, Say
-from prior_sg.schemas.codec import decode
+from prior_sg.schemas.codec import Message, decode
 from prior_sg.schemas.frames import Keyframe, PoseUpdate
 from prior_sg.schemas.objects import ObjectDelta
 from prior_sg.schemas.places import PlaceDelta
@@ -64,21 +65,22 @@ class LogHistory:
             if isinstance(message, Prior):
                 self.priors[message.digest()] = message
                 continue
-            robots.add(message.robot)
-            if message.robot == robot:
+            named = robot_of(message)
+            robots.add(named)
+            if named == robot:
                 self._take(message, followers.setdefault(logged.topic.name, Follower()))
         if not self._steps:
-            named = f"; name one of {', '.join(sorted(robots))} with --robot" if robots else ""
-            raise LogError(f"{path} holds no scene of {robot}{named}")
+            others = f"; name one of {', '.join(sorted(robots))} with --robot" if robots else ""
+            raise LogError(f"{path} holds no scene of {robot}{others}")
         self._remember()
 
     def _take(self, message: Any, follower: Follower[Any]) -> None:
         if isinstance(message, Task):
-            self._steps.append(lambda graph: core.set_task(graph, message))
+            self._steps.append(partial(core.set_task, task=message))
             self.stamps.append(self.stamps[-1] if self.stamps else 0)
             return
         for due in follower.take(message):
-            self._steps.append(lambda graph, due=due: _apply(graph, due))
+            self._steps.append(partial(_apply, delta=due))
             self.stamps.append(max(due.stamp_ns, self.stamps[-1] if self.stamps else 0))
 
     def _remember(self) -> None:
@@ -111,13 +113,12 @@ def _apply(graph: core.Graph, delta: Delta) -> None:
 
 def _copied(graph: core.Graph) -> core.Graph:
     """A graph that changes on its own; what its tables hold never changes in place."""
-    tables = {
-        item.name: dict(value)
-        for item in dataclasses.fields(graph)
-        if isinstance(value := getattr(graph, item.name), dict)
-    }
-    tables["neighbours"] = {place: set(others) for place, others in graph.neighbours.items()}
-    return dataclasses.replace(copy.copy(graph), **tables)
+    copied = copy.copy(graph)
+    for item in dataclasses.fields(graph):
+        if isinstance(value := getattr(graph, item.name), dict):
+            setattr(copied, item.name, dict(value))
+    copied.neighbours = {place: set(others) for place, others in graph.neighbours.items()}
+    return copied
 
 
 class Recorded:
@@ -149,17 +150,16 @@ class Recorded:
 
     def _take_image(self, logged: Logged, poses: PoseCorrections) -> None:
         message = decode(logged.topic.type, logged.payload)
-        if message.robot != self.robot:
+        if robot_of(message) != self.robot:
             return
         if isinstance(message, PoseUpdate):
             self.cloud.move(poses.take(message) or {})
-            return
-        with contextlib.suppress(ImageFault):  # the map has refused such a keyframe, too
-            frame: Keyframe = msgspec.structs.replace(
-                message, world_from_camera=poses.pose(message.frame_id, message.world_from_camera)
-            )
-            self.cloud.add(frame)
-            self._cameras.append(camera_of(frame))
+        elif isinstance(message, Keyframe):
+            with contextlib.suppress(ImageFault):  # the map has refused such a keyframe, too
+                pose = poses.pose(message.frame_id, message.world_from_camera)
+                frame = msgspec.structs.replace(message, world_from_camera=pose)
+                self.cloud.add(frame)
+                self._cameras.append(camera_of(frame))
 
     def stamps(self) -> list[int]:
         return self._history.stamps
@@ -244,6 +244,11 @@ class Stored:
         self._closed.set()
 
 
+def robot_of(message: Message) -> str:
+    """Whose message it is."""
+    return str(getattr(message, "robot", ""))
+
+
 def camera_of(frame: Keyframe) -> Camera:
     """What the page shows of a keyframe. Raises ImageFault."""
     image = small_image(frame, IMAGE_PX)
@@ -267,5 +272,3 @@ def open_recorded(path: Path, robot: str) -> Recorded | Stored:
     if not len(scene.place_ids) and not scene.regions:
         raise UserError(f"{path} holds no scene of {robot}; name another robot with --robot")
     return Stored(scene, f"file {path.name}")
-
-

@@ -48,7 +48,11 @@ def begun(scene: Scene, text: str) -> Found:
     start = text.strip().casefold()
     named = [
         *((one.probability, "region", one.label, one.id) for one in scene.regions if _begins(one.label, start)),
-        *((one.probability * one.known, "object", one.label, one.id) for one in scene.objects if _begins(one.label, start)),
+        *(
+            (one.probability * one.known, "object", one.label, one.id)
+            for one in scene.objects
+            if _begins(one.label, start)
+        ),
     ]
     best = sorted(named, key=lambda one: -one[0])[:MOST_ANSWERS]
     lit = Lit(

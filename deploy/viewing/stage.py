@@ -15,6 +15,7 @@ from prior_sg.deploy.viewing.sources import Camera
 
 FOV_RAD, ELEVATION_RAD = np.deg2rad(38.0), np.deg2rad(62.0)
 PANEL_PX, PHONE_PX = 360, 700  # width that the controls cover; below this width they lie at the bottom
+SHEET_SHARE = 0.58  # of the height that they cover there
 ROOM = 1.15  # around the map
 CAMERA_NODE = "/camera/last"
 
@@ -56,7 +57,7 @@ class SafeServer(viser.ViserServer):
 
     async def _check_origin(self, client: Any) -> None:
         connection = self._websock_server._live_connections[client.client_id]
-        headers = connection.request.headers
+        headers = connection.request.headers if connection.request is not None else {}
         origin, host = headers.get("Origin"), headers.get("Host", "")
         if (origin is not None and origin.split("://")[-1] != host) or not _is_local(host):
             await connection.close(1008, "pages of other sites may not look at this map")
@@ -187,7 +188,7 @@ class Stage:
         )
 
     def set_bounds(self, low_m: np.ndarray, high_m: np.ndarray) -> None:
-        """Where the map is. Whoever looks on when this is first known sees all of it; later, eyes stay where they are."""
+        """Where the map is. Who looks on when this is first known sees all of it; later, eyes stay where they are."""
         first, self._bounds = self._bounds is None, (low_m, high_m)
         if first:
             for client in self._server.get_clients().values():
@@ -197,16 +198,9 @@ class Stage:
         """Turn one viewer's eye so that the whole map is seen beside the controls."""
         if self._bounds is None:
             return
-        width, height = client.camera.image_width, client.camera.image_height
-        wide = width > PHONE_PX
-        aspect = (width - PANEL_PX * wide) / max(height, 1)
-        eye, target = pose_for(*self._bounds, max(aspect, 0.3))
-        if wide:  # the middle of what is free lies left of the middle of the window
-            reach_m = float(np.linalg.norm(eye - target))
-            forward = (target - eye) / reach_m
-            right = np.cross(forward, (0, 0, 1))
-            shift_m = right / np.linalg.norm(right) * reach_m * np.tan(FOV_RAD / 2) * PANEL_PX / max(height, 1)
-            eye, target = eye + shift_m, target + shift_m
+        width, height = max(client.camera.image_width, 1), max(client.camera.image_height, 1)
+        free = (max(1 - PANEL_PX / width, 0.3), 1.0) if width > PHONE_PX else (1.0, 1 - SHEET_SHARE)
+        eye, target = pose_for(*self._bounds, width / height, free)
         with client.atomic():
             client.camera.fov = float(FOV_RAD)
             client.camera.up_direction = (0.0, 0.0, 1.0)
@@ -214,13 +208,23 @@ class Stage:
             client.camera.look_at = target
 
 
-def pose_for(low_m: np.ndarray, high_m: np.ndarray, aspect: float) -> tuple[np.ndarray, np.ndarray]:
-    """An eye (3,) and where it looks (3,) so that a box fits a window, its longer side along the window's."""
+def pose_for(
+    low_m: np.ndarray, high_m: np.ndarray, aspect: float, free: tuple[float, float] = (1.0, 1.0)
+) -> tuple[np.ndarray, np.ndarray]:
+    """An eye (3,) and where it looks (3,) so that a box fits what is free of a window: shares of its width, from the
+    left, and of its height, from the top. The box's longer side lies along the longer side of that part.
+    """
     middle, size = (low_m + high_m) / 2, np.maximum(high_m - low_m, 1.0)
-    along_x = (size[0] >= size[1]) == (aspect >= 1)
+    along_x = (size[0] >= size[1]) == (aspect * free[0] >= free[1])
     across, deep = (size[0], size[1]) if along_x else (size[1], size[0])
     tall = deep * np.sin(ELEVATION_RAD) + size[2] * np.cos(ELEVATION_RAD)
-    tangent = np.tan(FOV_RAD / 2)
-    reach_m = ROOM * max(across / 2 / (tangent * aspect), tall / 2 / tangent) + deep / 2 * np.cos(ELEVATION_RAD)
-    back = np.array((0.0, -1.0) if along_x else (1.0, 0.0)) * np.cos(ELEVATION_RAD)
-    return middle + reach_m * np.array((*back, np.sin(ELEVATION_RAD))), middle
+    half_high = np.tan(FOV_RAD / 2)  # of the window, one metre away
+    half_wide = half_high * aspect
+    reach_m = ROOM * max(across / 2 / (half_wide * free[0]), tall / 2 / (half_high * free[1]))
+    reach_m += deep / 2 * np.cos(ELEVATION_RAD)
+    back = np.array((0.0, -1.0, 0.0) if along_x else (1.0, 0.0, 0.0))
+    to_eye = back * np.cos(ELEVATION_RAD) + np.array((0.0, 0.0, np.sin(ELEVATION_RAD)))
+    right = np.cross((0.0, 0.0, 1.0), back)
+    up = np.cross(to_eye, right)
+    target = middle + reach_m * (half_wide * (1 - free[0]) * right - half_high * (1 - free[1]) * up)
+    return target + reach_m * to_eye, target

@@ -15,7 +15,8 @@ from prior_sg.schemas.scene import Scene
 from prior_sg.schemas.status import ServiceStatus
 
 CANDIDATES, MOST_ROWS = 3, 40
-FAINT = "opacity:.62"
+FAINT, SMALL = "opacity:.62", "opacity:.62;font-size:11.5px"
+NUMBER = "flex:none;text-align:right;font-variant-numeric:tabular-nums"
 TRACK = "background:rgba(128,138,150,.22)"
 AGREES, DISAGREES = "#4E79A7", "#F28E2B"  # blue and orange: told apart by all eyes
 
@@ -68,9 +69,9 @@ def _legend_row(scene: Scene, region: Region, color: Color) -> str:
         '<div style="display:flex;gap:9px;align-items:baseline;padding:4px 0">'
         f'<span style="flex:none;width:10px;height:10px;border-radius:3px;{fill}"></span>'
         f'<span style="flex:1;min-width:0"><b style="font-weight:600">{text_of(region.label)}</b>{kind}'
-        f'<span style="font-size:11.5px;{FAINT};display:block">{f"or {others}" if others else "no other"}</span></span>'
-        f'<span style="flex:none;text-align:right;font-variant-numeric:tabular-nums">{_percent(region.probability)}'
-        f'<span style="font-size:11.5px;{FAINT};display:block">{region.area_m2:.0f} m²</span></span></div>'
+        f'<span style="{SMALL};display:block">{f"or {others}" if others else "no other"}</span></span>'
+        f'<span style="{NUMBER}">{_percent(region.probability)}'
+        f'<span style="{SMALL};display:block">{region.area_m2:.0f} m²</span></span></div>'
     )
 
 
@@ -110,7 +111,8 @@ def place_story(scene: Scene, place: int) -> str:
     ranked = sorted(zip(scene.labels, belief, strict=True), key=lambda pair: -pair[1])[: CANDIDATES + 2]
     label = next((region.label for region in scene.regions if region.id == scene.place_regions[row]), "")
     said = f"unknown {_percent(float(scene.unknown[row]))}, {2 * float(scene.radii_m[row]):.1f} m of free space around"
-    return f'{_title(label or "not labelled yet", f"place {place}")}<div style="{_BOX}">{said}{_bars(ranked, AGREES)}</div>'
+    title = _title(label or "not labelled yet", f"place {place}")
+    return f'{title}<div style="{_BOX}">{said}{_bars(ranked, AGREES)}</div>'
 
 
 def explanation(reply: PosteriorReply) -> str:
@@ -125,11 +127,11 @@ def explanation(reply: PosteriorReply) -> str:
     most = max((abs(gain) for _, gain in parts), default=1.0)
     rows = "".join(_gain_row(source, gain, most) for source, gain in parts)
     silent = [source for source, gain in ordered if abs(gain) < 0.005]
-    quiet = f'<div style="{FAINT};font-size:11.5px">no opinion: {", ".join(map(text_of, silent))}</div>' if silent else ""
+    quiet = f'<div style="{SMALL}">no opinion: {", ".join(map(text_of, silent))}</div>' if silent else ""
     who = f"place {reply.place_id}, {seen}" + (", predicted" if reply.predicted else "")
     return (
         f'<div style="{_BOX}"><div style="font-weight:600;margin-top:6px">Why {text_of(reply.label)} and not '
-        f'{text_of(rival)}?</div><div style="font-size:11.5px;{FAINT}">{who}; together {total:+.2f}, '
+        f'{text_of(rival)}?</div><div style="{SMALL}">{who}; together {total:+.2f}, '
         f"to the right speaks for it</div>{rows}{quiet}</div>"
     )
 
@@ -140,10 +142,10 @@ def _gain_row(source: str, gain: float, most: float) -> str:
     color = AGREES if gain > 0 else DISAGREES
     return (
         f'<div style="display:flex;gap:8px;align-items:center;padding:2px 0"><span style="flex:none;width:92px;'
-        f'overflow:hidden;text-overflow:ellipsis">{text_of(source)}</span><span style="flex:1;position:relative;height:9px;'
-        f'border-radius:5px;{TRACK}"><span style="position:absolute;top:0;bottom:0;{side};background:{color};'
-        f'border-radius:5px"></span></span><span style="flex:none;width:44px;text-align:right;'
-        f'font-variant-numeric:tabular-nums">{gain:+.2f}</span></div>'
+        f'overflow:hidden;text-overflow:ellipsis">{text_of(source)}</span>'
+        f'<span style="flex:1;position:relative;height:9px;border-radius:5px;{TRACK}">'
+        f'<span style="position:absolute;top:0;bottom:0;{side};background:{color};'
+        f'border-radius:5px"></span></span><span style="width:44px;{NUMBER}">{gain:+.2f}</span></div>'
     )
 
 
@@ -157,7 +159,7 @@ def _bar(name: str, share: float, color: str) -> str:
         f'overflow:hidden;text-overflow:ellipsis;white-space:nowrap">{text_of(name)}</span>'
         f'<span style="flex:1;height:9px;border-radius:5px;{TRACK}"><span style="display:block;height:100%;'
         f'border-radius:5px;width:{100 * min(max(share, 0.0), 1.0):.1f}%;background:{color}"></span></span>'
-        f'<span style="flex:none;width:44px;text-align:right;font-variant-numeric:tabular-nums">{_percent(share)}</span>'
+        f'<span style="width:44px;{NUMBER}">{_percent(share)}</span>'
         "</div>"
     )
 
@@ -178,22 +180,29 @@ def _state_of(process: ServiceStatus) -> tuple[bool, str]:
     faults = [f"{lost} messages lost"] if lost else []
     faults += [f"waits for {name}" for name in process.waiting_for]
     busy = f"{_percent(process.busy_share)} busy, {process.step_ms_p50:.0f} ms a step, {process.backlog} waiting"
-    told = [busy, f"{process.resident_mb:.0f} MB", *faults, *(f"{loss.count} {loss.what}" for loss in process.losses[:2])]
+    told = [
+        busy,
+        f"{process.resident_mb:.0f} MB",
+        *faults,
+        *(f"{loss.count} {loss.what}" for loss in process.losses[:2]),
+    ]
     return not faults, text_of(", ".join(told))
 
 
 def _process_row(name: str, well: bool, told: str) -> str:
     mark = ("●", "#59A14F", "runs") if well else ("▲", "#E15759", "has trouble")
     return (
-        f'<div style="padding:3px 0"><span style="color:{mark[1]}" title="{mark[2]}">{mark[0]}</span> <b>{text_of(name)}</b>'
-        f'<div style="font-size:11.5px;{FAINT};margin-left:17px">{told}</div></div>'
+        f'<div style="padding:3px 0"><span style="color:{mark[1]}" title="{mark[2]}">{mark[0]}</span>'
+        f" <b>{text_of(name)}</b>"
+        f'<div style="{SMALL};margin-left:17px">{told}</div></div>'
     )
 
 
 def answers(found: Iterable[tuple[str, str, float | None]]) -> str:
     """Results of a search, best first: kind, name and score."""
     rows = "".join(
-        f'<div style="display:flex;gap:8px;padding:2px 0"><span style="flex:1"><b style="font-weight:600">{text_of(name)}</b>'
+        f'<div style="display:flex;gap:8px;padding:2px 0"><span style="flex:1">'
+        f'<b style="font-weight:600">{text_of(name)}</b>'
         f' <span style="{FAINT}">{text_of(kind)}</span></span>'
         f'<span style="font-variant-numeric:tabular-nums">{"" if score is None else _percent(score)}</span></div>'
         for kind, name, score in found
@@ -206,7 +215,8 @@ def card(svg: str) -> str:
     data = base64.b64encode(svg.encode()).decode()
     return (
         '<div style="margin:6px 12px;border-radius:8px;overflow:hidden;background:#fff">'
-        f'<img alt="the prior as a graph" style="display:block;width:100%" src="data:image/svg+xml;base64,{data}"></div>'
+        f'<img alt="the prior as a graph" style="display:block;width:100%" '
+        f'src="data:image/svg+xml;base64,{data}"></div>'
     )
 
 
