@@ -31,7 +31,7 @@ from prior_sg.schemas.priors import (
 )
 from prior_sg.schemas.queries import SceneAnswer, SceneQuery
 from prior_sg.schemas.regions import PosteriorReply, PosteriorRequest, RegionDelta
-from prior_sg.schemas.scene import Scene, SceneRequest, SceneRevision
+from prior_sg.schemas.scene import HistoryRequest, RevisionList, Scene, SceneRequest, SceneRevision
 from prior_sg.schemas.status import Consumed, ServiceStatus, StatusRequest
 
 prepare()  # every process imports this table before it opens a bus, whose threads then find all decoders built
@@ -142,6 +142,7 @@ POSTERIOR = Query("POSTERIOR", PosteriorRequest, PosteriorReply, f"{ROOT}/{{robo
 TASK_IN_FORCE = Query("TASK_IN_FORCE", TaskRequest, TaskInForce, f"{ROOT}/{{robot}}/ask/task")
 SCENE = Query("SCENE", SceneRequest, Scene, f"{ROOT}/{{robot}}/ask/scene")
 SCENE_QUERY = Query("SCENE_QUERY", SceneQuery, SceneAnswer, f"{ROOT}/{{robot}}/ask/query")
+HISTORY = Query("HISTORY", HistoryRequest, RevisionList, f"{ROOT}/{{robot}}/ask/history")
 TEXT = Query("TEXT", TextRequest, TextEmbeddings, f"{ROOT}/encoder/{{space}}/text")
 PRIORS = Query("PRIORS", PriorRequest, PriorList, f"{ROOT}/fleet/ask/prior")
 
@@ -155,6 +156,7 @@ QUERIES = (
     TASK_IN_FORCE,
     SCENE,
     SCENE_QUERY,
+    HISTORY,
     TEXT,
     PRIORS,
 )

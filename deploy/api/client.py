@@ -12,16 +12,18 @@ from typing import Any, Self
 import numpy as np
 
 from prior_sg.deploy.api.errors import NotInSceneError, PosesError, TaskError
+from prior_sg.deploy.api.kept import kept
 from prior_sg.deploy.api.scene import Scene
 from prior_sg.deploy.settings import DEFAULT_CONNECT, DEFAULT_ROBOT
 from prior_sg.schemas.codec import DecodeError, Message, decode
 from prior_sg.schemas.frames import PoseUpdate
 from prior_sg.schemas.priors import Prior, Task
 from prior_sg.schemas.regions import PosteriorReply, PosteriorRequest, RegionDelta
+from prior_sg.schemas.scene import HistoryRequest, RevisionList, SceneRequest, StoredRevision
 from prior_sg.schemas.scene import Scene as SceneMessage
-from prior_sg.schemas.scene import SceneRequest
 from prior_sg.schemas.status import Consumed, ServiceStatus
 from prior_sg.schemas.topics import (
+    HISTORY,
     JOURNAL,
     OBJECT_DELTA,
     PLACE_DELTA,
@@ -101,10 +103,21 @@ class Client:
             for follower in {one for followers in self._followers.values() for one in followers}:
                 follower.close()
 
-    def scene(self) -> Scene:
-        """The scene graph as stored now. Raises BusError."""
-        message: SceneMessage = self._client.ask(SCENE, SceneRequest(robot=self.robot))
-        return Scene(message)
+    def scene(self, *, revision: int | None = None, stamp_ns: int | None = None) -> Scene:
+        """The scene graph as stored now, as it was at a revision, or as it was last at a time. Raises BusError,
+        NotInSceneError.
+        """
+        request = SceneRequest(robot=self.robot, revision=revision, stamp_ns=stamp_ns)
+        message: SceneMessage = self._client.ask(SCENE, request)
+        return kept(Scene(message), revision, stamp_ns)
+
+    def history(self, limit: int = 1000, before: int | None = None) -> list[StoredRevision]:
+        """The newest revisions that the store keeps, of those below `before`, oldest first; at most 10 000 at once.
+        Raises BusError.
+        """
+        request = HistoryRequest(robot=self.robot, limit=limit, before=before)
+        reply: RevisionList = self._client.ask(HISTORY, request)
+        return reply.revisions
 
     def explain(self, place: int) -> PosteriorReply:
         """Why a place carries its label. Raises NotInSceneError, BusError."""

@@ -119,6 +119,11 @@ class Scene:
         return self.message.stamp_ns
 
     @property
+    def revision(self) -> int:
+        """Which one of the store it is; -1 where nothing is stored."""
+        return self.message.revision
+
+    @property
     def labels(self) -> tuple[str, ...]:
         """The regions that the prior knows: the columns of all posteriors."""
         return tuple(self.message.labels)

@@ -385,7 +385,16 @@ EXAMPLES: list[Message] = [
         merged_ids=i8([5, 4]),
     ),
     scene.SceneRevision(robot="r", epoch=1, revision=2, stamp_ns=3, places=4, edges=5, regions=6),
-    scene.SceneRequest(robot="r"),
+    scene.SceneRequest(robot="r", revision=7, stamp_ns=8),
+    scene.HistoryRequest(robot="r", limit=5, before=9),
+    scene.RevisionList(
+        robot="r",
+        revisions=[
+            scene.StoredRevision(
+                revision=7, session=1, kind="place", stamp_ns=8, places=4, edges=5, regions=6, objects=3
+            )
+        ],
+    ),
     scene.Scene(
         robot="r",
         stamp_ns=1,
@@ -415,6 +424,7 @@ EXAMPLES: list[Message] = [
         hull_counts=i8(3),
         hulls_m=f4([0, 0], [1, 0], [0, 1]),
         origin_m=(512e3, 5.4e6, 312.0),
+        revision=9,
     ),
     queries.SceneQuery(robot="r", questions=QUESTIONS),
     queries.SceneAnswer(robot="r", revision=2, stamp_ns=3, answers=ANSWERS),

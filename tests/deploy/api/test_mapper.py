@@ -2,6 +2,7 @@
 
 import json
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -82,7 +83,8 @@ def test_save(mapper, tmp_path):
     assert json.loads(mapper.save(tmp_path / "one.json").read_text()) == mapper.scene.to_dict()
     for _ in range(2):  # over the former one
         database = mapper.save(tmp_path / "one.sqlite")
-    assert encode(scene_in(database, "robot1")) == encode(mapper.scene.message)
+    saved = msgspec.structs.replace(scene_in(database, "robot1"), revision=mapper.scene.revision)
+    assert encode(saved) == encode(mapper.scene.message)
     with pytest.raises(prior_sg.SaveError, match=r"ends in \.xml; name a folder, or a file"):
         mapper.save(tmp_path / "one.xml")
     with pytest.raises(prior_sg.SaveError, match="choose another place"):
