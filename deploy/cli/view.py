@@ -2,7 +2,6 @@
 
 import argparse
 import time
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from prior_sg.deploy.cli.shared import Commands, add_bus, console
@@ -24,7 +23,9 @@ def add_commands(commands: Commands) -> None:
         needs="view",
     )
     view.add_argument(
-        "source", nargs="?", type=Path, help="a run's folder, its log.mcap or its scene.sqlite; default: what runs now"
+        "source",
+        nargs="?",
+        help="a run's folder, its log.mcap, its scene.sqlite or a PostgreSQL address; default: what runs now",
     )
     view.add_argument("--host", default="127.0.0.1", help="address to serve on, of this machine (default: %(default)s)")
     view.add_argument("--port", type=int, default=8080, help="port, or the next free one (default: %(default)s)")

@@ -13,18 +13,18 @@ from prior_sg.deploy.api.client import Changes, Client, Health
 from prior_sg.deploy.viewing.cloud import Cloud
 from prior_sg.deploy.viewing.recorded import camera_of
 from prior_sg.deploy.viewing.sources import Camera, Say
-from prior_sg.schemas.codec import DecodeError, decode, encode
+from prior_sg.schemas.codec import DecodeError, decode
 from prior_sg.schemas.frames import ArchiveReply, ArchiveRequest, Keyframe, PoseUpdate
 from prior_sg.schemas.priors import Prior, PriorRequest
 from prior_sg.schemas.regions import PosteriorReply
-from prior_sg.schemas.scene import Scene
+from prior_sg.schemas.scene import Scene, StoredRevision
 from prior_sg.schemas.topics import ARCHIVE, KEYFRAME, POSE_UPDATE, PRIORS
 from prior_sg.services.deltas import PoseCorrections
 from prior_sg.services.images import ImageFault
 from prior_sg.services.runtime.bus import Bus, BusError, Sample
 from prior_sg.services.runtime.client import BusClient
 
-MOST_BYTES = 128_000_000  # of scenes kept to look back at; beyond, every second of the older half goes
+MOST_REVISIONS = 1000  # that the slider goes back
 MOST_CAMERAS = 2000
 TASK_WAIT_S = 300.0  # a language model may take minutes
 ROUTER_WAIT_S = 2.0
@@ -39,12 +39,11 @@ class Live:
         self.robot, self.title, self.cloud = robot, title, Cloud()
         self._client = Client(robot=robot, bus=bus)
         self._bus = BusClient(bus)
-        self._moments: list[tuple[int, bytes]] = []  # stamp and encoded scene
+        self._revisions: list[StoredRevision] = []
         self._cameras: deque[Camera] = deque(maxlen=MOST_CAMERAS)
         self._poses = PoseCorrections()
         self._samples: queue.SimpleQueue[Sample | ArchiveReply | None] = queue.SimpleQueue()
         self._changed = threading.Event()
-        self._lock = threading.Lock()
         changes = self._client.changes()
         threading.Thread(target=self._follow, args=(changes,), name="changes", daemon=True).start()
         threading.Thread(target=self._read_images, name="images", daemon=True).start()
@@ -96,21 +95,16 @@ class Live:
             self._cameras.append(camera_of(frame))
 
     def stamps(self) -> list[int]:
-        with self._lock:
-            return [stamp_ns for stamp_ns, _ in self._moments]
+        return [revision.stamp_ns for revision in self._revisions]
 
     def scene(self, moment: int | None = None) -> Scene:
-        if moment is not None:
-            with self._lock:
-                kept = self._moments[min(moment, len(self._moments) - 1)][1]
-            return decode(Scene, kept)
+        revisions = self._revisions
+        if moment is not None and revisions:
+            revision = revisions[min(moment, len(revisions) - 1)].revision
+            return self._client.scene(revision=revision).message
         scene = self._client.scene().message
-        with self._lock:
-            if not self._moments or encode(scene) != self._moments[-1][1]:
-                self._moments.append((scene.stamp_ns, encode(scene)))
-            while sum(len(kept) for _, kept in self._moments) > MOST_BYTES and len(self._moments) > 1:
-                half = len(self._moments) // 2
-                self._moments = self._moments[:half:2] + self._moments[half:]
+        if not revisions or revisions[-1].revision != scene.revision:
+            self._revisions = self._client.history(MOST_REVISIONS)
         return scene
 
     def camera(self, until_ns: float = np.inf) -> Camera | None:
