@@ -70,6 +70,13 @@ def bus() -> tuple[dict, dict]:
     return bus_bench(_sample_keyframes()[0])
 
 
+def view() -> tuple[dict, dict]:
+    """The live page; see `prior_sg.deploy.benches.view`."""
+    from prior_sg.deploy.benches.view import view_bench  # needs the extra `view`
+
+    return view_bench()
+
+
 def e2e() -> tuple[dict, dict]:
     """Keyframe in hand → region delta that follows from it, encoder time excluded, without transport."""
     keyframes = _sample_keyframes()
@@ -108,10 +115,11 @@ BENCHES: dict[str, Callable[[], tuple[dict, dict]]] = {
 }
 
 
+VIEW = "view"  # needs an extra and a browser, so it is no part of `all`
 POOL = "pool"  # lasts as long as it is told to, so it is no part of `all`
 
 
 def run(name: str, seconds: float) -> dict[str, Any]:
     """One measurement as the object that `--json` prints; `seconds` are those of the attacked pool."""
-    metrics, settings = attacked_pool(seconds) if name == POOL else BENCHES[name]()
+    metrics, settings = attacked_pool(seconds) if name == POOL else (view if name == VIEW else BENCHES[name])()
     return {"bench": name, "metrics": metrics, "machine": machine(), "settings": settings}

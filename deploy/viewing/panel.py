@@ -112,6 +112,10 @@ class Panel:
         if where == "selected" and self._close.visible != bool(html):
             self._close.visible = bool(html)
 
+    def text(self, where: str) -> str:
+        """What is written there, as HTML."""
+        return str(self._html[where].content)
+
     def set_moments(self, count: int, moment: int) -> None:
         """How far back the map can be shown, and where it is."""
         self._setting = True

@@ -16,7 +16,7 @@ from prior_sg.deploy.viewing.sources import Camera
 FOV_RAD, ELEVATION_RAD = np.deg2rad(38.0), np.deg2rad(62.0)
 PANEL_PX, PHONE_PX = 360, 700  # width that the controls cover; below this width they lie at the bottom
 SHEET_SHARE = 0.58  # of the height that they cover there
-ROOM = 1.15  # around the map
+ROOM = 1.06  # around the map
 CAMERA_NODE = "/camera/last"
 
 
@@ -76,7 +76,7 @@ class Stage:
 
     def __init__(self, server: viser.ViserServer, theme: Theme) -> None:
         self._server, self._theme = server, theme
-        self._picture: Picture = {}
+        self.picture: Picture = {}  # what the page shows
         self._nodes: dict[str, Any] = {}
         self._layers = {
             layer.name: server.scene.add_frame(f"/{layer.name}", show_axes=False, visible=layer.shown)
@@ -90,18 +90,18 @@ class Stage:
 
     def show(self, picture: Picture) -> Difference:
         """Make the page show this picture; what was sent for it."""
-        found = difference(self._picture, picture)
+        found = difference(self.picture, picture)
         with self._server.atomic():
             for name in found.removed:
                 self._nodes.pop(name).remove()
             for name, shape in found.changed.items():
                 self._put(name, shape)
-        self._picture = picture
+        self.picture = picture
         return found
 
     def _put(self, name: str, shape: Shape) -> None:
         """Add a node or replace it. A name only changes its text, so that it does not blink."""
-        scene, old = self._server.scene, self._picture.get(name)
+        scene, old = self._server.scene, self.picture.get(name)
         match shape:
             case Name() if isinstance(old, Name):
                 node = self._nodes[name]
@@ -214,17 +214,22 @@ def pose_for(
     """An eye (3,) and where it looks (3,) so that a box fits what is free of a window: shares of its width, from the
     left, and of its height, from the top. The box's longer side lies along the longer side of that part.
     """
-    middle, size = (low_m + high_m) / 2, np.maximum(high_m - low_m, 1.0)
+    middle, size = (low_m + high_m) / 2, high_m - low_m
     along_x = (size[0] >= size[1]) == (aspect * free[0] >= free[1])
-    across, deep = (size[0], size[1]) if along_x else (size[1], size[0])
-    tall = deep * np.sin(ELEVATION_RAD) + size[2] * np.cos(ELEVATION_RAD)
-    half_high = np.tan(FOV_RAD / 2)  # of the window, one metre away
-    half_wide = half_high * aspect
-    reach_m = ROOM * max(across / 2 / (half_wide * free[0]), tall / 2 / (half_high * free[1]))
-    reach_m += deep / 2 * np.cos(ELEVATION_RAD)
     back = np.array((0.0, -1.0, 0.0) if along_x else (1.0, 0.0, 0.0))
     to_eye = back * np.cos(ELEVATION_RAD) + np.array((0.0, 0.0, np.sin(ELEVATION_RAD)))
     right = np.cross((0.0, 0.0, 1.0), back)
     up = np.cross(to_eye, right)
-    target = middle + reach_m * (half_wide * (1 - free[0]) * right - half_high * (1 - free[1]) * up)
-    return target + reach_m * to_eye, target
+    half = np.tan(FOV_RAD / 2) * np.array((aspect, 1.0))  # of the window, one metre away
+    low, high = np.array((-1.0, 1 - 2 * free[1])) * half, np.array((2 * free[0] - 1, 1.0)) * half
+    center, room = (low + high) / 2, (high - low) / 2 / ROOM
+    corners = np.array([np.where([number >> axis & 1 for axis in range(3)], high_m, low_m) for number in range(8)])
+    reach_m = 1.0
+    while True:  # a little farther away, until every corner is in
+        target = middle - reach_m * (center @ np.stack((right, up)))
+        seen = corners - (target + reach_m * to_eye)
+        depths = seen @ -to_eye
+        plane = np.stack((seen @ right, seen @ up), axis=1) / np.maximum(depths, 1e-6)[:, None]
+        if (depths > 0).all() and (np.abs(plane - center) <= room).all():
+            return target + reach_m * to_eye, target
+        reach_m *= 1.03
