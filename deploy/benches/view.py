@@ -22,7 +22,7 @@ from prior_sg.schemas.scene import Scene
 
 SIZES = (10_000, 100_000)
 OBJECTS = 1000
-WINDOW = {"width": 800, "height": 500}
+WINDOW = (800, 500)  # pixels
 SOFTWARE = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-background-networking")
 COUNT_S, SETTLE_S, CHANGES, PATIENCE_S = 8.0, 60.0, 5, 60.0
 KEEP_PIXELS = """
@@ -134,7 +134,7 @@ def _tab(browser: str, address: str) -> Iterator[Any]:
 
     with sync_playwright() as driver:
         chromium = driver.chromium.launch(executable_path=browser, args=list(SOFTWARE))
-        tab = chromium.new_page(viewport=WINDOW)
+        tab = chromium.new_page(viewport={"width": WINDOW[0], "height": WINDOW[1]})
         tab.set_default_timeout(1e3 * PATIENCE_S)
         tab.add_init_script(KEEP_PIXELS)
         tab.goto(address)

@@ -305,10 +305,9 @@ def cmd_bench(arguments: argparse.Namespace) -> int:
     """Measure."""
     from prior_sg.deploy.benches import main as bench
 
-    if arguments.name not in (*bench.BENCHES, bench.POOL, bench.VIEW, "all"):
-        raise UserError(
-            f"there is no measurement {arguments.name!r}; known: {', '.join((*bench.BENCHES, bench.POOL, bench.VIEW))}, all"
-        )
+    known = (*bench.BENCHES, bench.POOL, bench.VIEW)
+    if arguments.name not in (*known, "all"):
+        raise UserError(f"there is no measurement {arguments.name!r}; known: {', '.join(known)}, all")
     for name in bench.BENCHES if arguments.name == "all" else [arguments.name]:
         with console.status(f"measuring {name}"):
             found = bench.run(name, arguments.seconds)

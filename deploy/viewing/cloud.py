@@ -1,4 +1,4 @@
-"""Coloured points of the map, from the depth and colour images of its keyframes.
+"""Coloured points of the map, from the depth and colour images of its keyframes (pure).
 
 Each keyframe adds the points that no earlier one has covered, so that what was sent stays as it is. A corrected pose
 moves the points of its keyframe. When there are too many, cells double and everything is thinned once.

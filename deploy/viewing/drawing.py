@@ -1,4 +1,4 @@
-"""A scene as a picture: pure, without the page that shows it.
+"""A scene as a picture, without the page that shows it (pure).
 
 Places and edges lie in blocks of consecutive ids, so that a change sends the blocks it touches. Predicted regions are
 faint and dashed; unknown places fade to grey; boxes larger than furniture stay out, as in the printed map.

@@ -1,4 +1,4 @@
-"""The ground that each region covers, as smooth meshes and outlines that touch and never overlap.
+"""The ground that each region covers, as smooth meshes and outlines that touch and never overlap (pure).
 
 A region's height field is the largest of its places' `radius - distance`, seen from above. A point belongs to the
 region whose field is highest there, and to none where all are below zero. Borders are the zero lines of what is left,

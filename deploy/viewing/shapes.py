@@ -1,4 +1,4 @@
-"""What pictures are made of: few large arrays by name, and how two pictures differ.
+"""What pictures are made of: few large arrays by name, and how two pictures differ (pure).
 
 Names are paths; the first part names the layer (`/places/0`). Arrays are compared by content, so that what has not
 changed is not sent again.

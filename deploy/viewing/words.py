@@ -1,4 +1,4 @@
-"""What the page says, as HTML fragments. All text from outside is escaped: names come from models and files."""
+"""What the page says, as HTML fragments (pure). All text from outside is escaped: names come from models and files."""
 
 import base64
 import html

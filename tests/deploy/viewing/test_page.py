@@ -41,13 +41,13 @@ def test_the_page_opens_without_errors_finds_things_and_keeps_colours(shown: tup
     errors: list[str] = []
     with sync_api.sync_playwright() as driver:
         browser = driver.chromium.launch(executable_path=CHROMIUM, args=list(SOFTWARE))
-        tab = browser.new_page(viewport={"width": 420, "height": 320})
-        tab.set_default_timeout(60_000)
+        tab = browser.new_page(viewport={"width": 360, "height": 240})
+        tab.set_default_timeout(30_000)
         tab.on("console", lambda said: errors.append(said.text) if said.type == "error" else None)
         tab.on("pageerror", lambda error: errors.append(str(error)))
         tab.goto(page.address)
         tab.get_by_text("serve drinks", exact=True).wait_for()
-        tab.locator('input[value=""]').first.fill("stove")
+        tab.locator('input.mantine-TextInput-input[value=""]').first.fill("stove")
         tab.get_by_text("stove", exact=True).wait_for()
         until(lambda: "/answers/objects" in page.stage.picture)
         before = colors(page)
@@ -82,9 +82,8 @@ def grown():
 )
 def test_pages_of_other_sites_are_refused(shown: tuple[Held, Page], host: str, origin: str, refused: bool) -> None:
     client = pytest.importorskip("websockets.sync.client")
-    from websockets.exceptions import ConnectionClosed
-
     import viser
+    from websockets.exceptions import ConnectionClosed
 
     page = shown[1]
     port = page.server.get_port()
