@@ -11,7 +11,7 @@ import numpy as np
 from prior_sg.deploy.showing.colors import UNLABELLED, Color, LabelColors
 from prior_sg.deploy.showing.map import FURNITURE_M
 from prior_sg.deploy.showing.places import SHOWN_AREA_M2
-from prior_sg.deploy.viewing.footprint import Footprint, footprints
+from prior_sg.deploy.viewing.footprint import Footprint, Grounds
 from prior_sg.deploy.viewing.shapes import Arrows, Lines, Mesh, Name, Picture, Points
 from prior_sg.schemas.names import shown
 from prior_sg.schemas.objects import SceneObject
@@ -63,20 +63,15 @@ class Lit:
 
 @dataclass
 class Painter:
-    """Draws one scene after another; labels keep their colours. Ground that has not changed is not computed again."""
+    """Draws one scene after another; labels keep their colours, ground that has not changed is kept."""
 
     theme: Theme = DARK
     colors: LabelColors = field(default_factory=LabelColors)
-    _ground: dict[int, Footprint] = field(default_factory=dict)
-    _ground_of: tuple[bytes, ...] = ()
+    grounds: Grounds = field(default_factory=Grounds)
 
     def ground(self, scene: Scene) -> dict[int, Footprint]:
         """The footprint of each region."""
-        columns = (scene.place_ids, scene.positions_m, scene.radii_m, scene.place_regions)
-        key = tuple(column.tobytes() for column in columns)
-        if key != self._ground_of:
-            self._ground, self._ground_of = footprints(scene), key
-        return self._ground
+        return self.grounds.of(scene)
 
     def label_colors(self, scene: Scene) -> dict[str, Color]:
         """The colour of each label that is on the map."""
@@ -88,8 +83,7 @@ class Painter:
         picture: Picture = {}
         ground = self.ground(scene)
         for region in scene.regions:
-            if region.id in ground:
-                picture |= _region(self.theme, region, ground[region.id], colors[region.label], lit)
+            picture |= _region(self.theme, region, ground.get(region.id), colors[region.label], lit)
         tints = _place_tints(self.theme, scene, colors)
         picture |= _places(self.theme, scene, tints, lit)
         picture |= _edges(self.theme, scene, tints)
@@ -99,23 +93,26 @@ class Painter:
         return picture
 
 
-def _region(theme: Theme, region: Region, ground: Footprint, color: Color, lit: Lit) -> Picture:
-    """Its ground, its outline and its name."""
+def _region(theme: Theme, region: Region, ground: Footprint | None, color: Color, lit: Lit) -> Picture:
+    """Its ground and outline, where it has any, and its name."""
     lifted = np.array((0, 0, ABOVE_FLOOR_M), np.float32)
     dimmed = bool(lit) and region.id not in lit.regions and not lit.objects.intersection(region.object_ids)
     found, chosen = region.id in lit.regions, region.id == lit.picked
     opacity = DIMMED_OPACITY if dimmed else PREDICTED_OPACITY if region.predicted else FLOOR_OPACITY
+    root = f"/regions/{region.id}"
+    x, y, z = region.position_m
+    name = Name(title_of(region), (x, y, z), 0.75 if dimmed else 1.0)
+    if ground is None:
+        return {f"{root}/name": name}
     outline = ground.outline + 2 * lifted
     if region.predicted:
         middles = outline.mean(axis=1)
         outline = outline[np.floor((middles[:, 0] + 1.7 * middles[:, 1]) / DASH_M) % 2 == 0]
     tint = theme.light if found else theme.ink if chosen else mixed(color, theme.background, 0.6 if dimmed else 0.0)
-    root = f"/regions/{region.id}"
-    x, y, _ = region.position_m
     return {
         f"{root}/floor": Mesh(ground.vertices + lifted, ground.faces, color, opacity),
         f"{root}/outline": Lines(outline, np.array(tint, np.uint8), 4.0 if found or chosen else 2.0),
-        f"{root}/name": Name(title_of(region), (x, y, float(ground.vertices[0, 2]) + 1.2), 0.75 if dimmed else 1.0),
+        f"{root}/name": name,
     }
 
 
@@ -155,11 +152,11 @@ def _edges(theme: Theme, scene: Scene, tints: np.ndarray) -> Picture:
     if not len(scene.edges):
         return {}
     rows = np.searchsorted(scene.place_ids, scene.edges)
-    inside = (rows < len(scene.place_ids)).all(axis=1)
+    rows = rows[(rows < len(scene.place_ids)).all(axis=1)]
     faint = (tints * (1 - FAINTER) + np.array(theme.background) * FAINTER).astype(np.uint8)
     return {
-        f"/edges/{block}": Lines(scene.positions_m[rows[inside][of]], faint[rows[inside][of]], EDGE_PX)
-        for block, of in blocks(scene.edges[inside].max(axis=1), BLOCK)
+        f"/edges/{block}": Lines(scene.positions_m[rows[of]], faint[rows[of]], EDGE_PX)
+        for block, of in blocks(scene.place_ids[rows.max(axis=1)], BLOCK)
     }
 
 

@@ -6,6 +6,7 @@ found by marching squares; regions of other storeys do not compete.
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -18,6 +19,7 @@ SMALLEST_CELL_M, CELLS = 0.06, 420  # cell size, and cells along the longer side
 SMOOTHING_CELLS = 1.6
 MARGIN_CELLS = 6  # around everything, so that smoothing meets no end of the grid
 STOREY_M = 1.6  # regions whose middles differ by more in height are on other storeys
+STEP_M, LEVEL_M = 2.0, 0.05  # by which a grid moves, and floors differ
 FAR = -9.0
 
 
@@ -28,7 +30,6 @@ class Footprint:
     vertices: np.ndarray  # (vertex, 3) float32
     faces: np.ndarray  # (face, 3) uint32, seen from above
     outline: np.ndarray  # (segment, 2, 3) float32
-    top_m: float  # of its places
 
 
 @dataclass(frozen=True)
@@ -44,13 +45,58 @@ class _Field:
         return slice(i, i + rows), slice(j, j + columns)
 
 
+class Grounds:
+    """Footprints of one scene after another; those of regions around which nothing has changed are kept."""
+
+    def __init__(self) -> None:
+        self._fields: dict[int, tuple[bytes, _Field]] = {}  # by region, with what they were made of
+        self._made: dict[int, tuple[bytes, Footprint | None]] = {}
+
+    def of(self, scene: Scene) -> dict[int, Footprint]:
+        """By region id; regions without places have none, nor those whose places lie all under others' higher ones."""
+        rows = _rows_of_regions(scene)
+        self._fields = {region: kept for region, kept in self._fields.items() if region in rows}
+        self._made = {region: kept for region, kept in self._made.items() if region in rows}
+        found: dict[int, Footprint | None] = {}
+        for storey in _storeys(scene, rows):
+            found |= self._of_storey(scene, {region: rows[region] for region in storey})
+        return {region: footprint for region, footprint in found.items() if footprint is not None}
+
+    def _of_storey(self, scene: Scene, rows: dict[int, np.ndarray]) -> dict[int, Footprint | None]:
+        every = np.concatenate(list(rows.values()))
+        grid, ground_m = _grid(scene, every), round(floor_m(scene, every) / LEVEL_M) * LEVEL_M
+        fields = {region: self._field(scene, region, of, grid) for region, of in rows.items()}
+        best, second, owner = _contest(fields)
+        found = {}
+        for region, field in fields.items():
+            rival = np.where(owner[field.window] == region, second[field.window], best[field.window])
+            signed = np.minimum(field.heights, field.heights - rival)
+            key = b"".join((signed.tobytes(), repr((field.corner, grid, ground_m)).encode()))
+            if region not in self._made or self._made[region][0] != key:
+                self._made[region] = key, _footprint(signed, field.corner, grid, ground_m)
+            found[region] = self._made[region][1]
+        return found
+
+    def _field(self, scene: Scene, region: int, rows: np.ndarray, grid: "_Grid") -> "_Field":
+        columns = (scene.positions_m[rows], scene.radii_m[rows])
+        key = b"".join((*(column.tobytes() for column in columns), repr(grid).encode()))
+        if region not in self._fields or self._fields[region][0] != key:
+            self._fields[region] = key, _field(*columns, grid)
+        return self._fields[region][1]
+
+
 def footprints(scene: Scene) -> dict[int, Footprint]:
-    """By region id; regions without places have none."""
-    rows = {region: np.flatnonzero(scene.place_regions == region) for region in _regions(scene)}
-    found: dict[int, Footprint] = {}
-    for storey in _storeys(scene, rows):
-        found |= _of_storey(scene, {region: rows[region] for region in storey})
-    return found
+    """The footprints of one scene, by region id."""
+    return Grounds().of(scene)
+
+
+def _footprint(signed: np.ndarray, corner: tuple[int, int], grid: "_Grid", ground_m: float) -> Footprint | None:
+    plane, faces, segments = _contour(cv2.GaussianBlur(signed, (0, 0), SMOOTHING_CELLS))
+    if not len(faces):
+        return None
+    origin_m = np.array(grid.low_m) + np.array(corner) * grid.cell_m
+    plane_m, segments_m = plane * grid.cell_m + origin_m, segments * grid.cell_m + origin_m
+    return Footprint(_lifted(plane_m, ground_m), faces, _lifted(segments_m, ground_m))
 
 
 def floor_m(scene: Scene, rows: np.ndarray) -> float:
@@ -58,8 +104,12 @@ def floor_m(scene: Scene, rows: np.ndarray) -> float:
     return float(np.quantile(scene.positions_m[rows, 2] - scene.radii_m[rows], 0.1)) if len(rows) else 0.0
 
 
-def _regions(scene: Scene) -> list[int]:
-    return [int(region) for region in np.unique(scene.place_regions) if region != NO_REGION]
+def _rows_of_regions(scene: Scene) -> dict[int, np.ndarray]:
+    """Rows of each region's places."""
+    order = np.argsort(scene.place_regions, kind="stable")
+    regions, starts = np.unique(scene.place_regions[order], return_index=True)
+    parts = np.split(order, starts[1:])
+    return {int(region): rows for region, rows in zip(regions, parts, strict=True) if region != NO_REGION}
 
 
 def _storeys(scene: Scene, rows: dict[int, np.ndarray]) -> list[list[int]]:
@@ -75,48 +125,39 @@ def _storeys(scene: Scene, rows: dict[int, np.ndarray]) -> list[list[int]]:
     return storeys
 
 
-def _of_storey(scene: Scene, rows: dict[int, np.ndarray]) -> dict[int, Footprint]:
-    every = np.concatenate(list(rows.values()))
-    reach_m = float(scene.radii_m[every].max()) + PAD_M
-    low_m = scene.positions_m[every, :2].min(axis=0) - reach_m
-    extent_m = scene.positions_m[every, :2].max(axis=0) + reach_m - low_m
-    cell_m = max(SMALLEST_CELL_M, float(extent_m.max()) / CELLS)
-    low_m = low_m - MARGIN_CELLS * cell_m
-    shape = tuple((np.ceil(extent_m / cell_m).astype(int) + 2 * MARGIN_CELLS).tolist())
-    ground_m = floor_m(scene, every)
-    fields = {region: _field(scene, of, low_m, cell_m) for region, of in rows.items()}
-    best, second, owner = _contest(fields, shape)
-    found = {}
-    for region, field in fields.items():
-        rival = np.where(owner[field.window] == region, second[field.window], best[field.window])
-        signed = np.minimum(field.heights, field.heights - rival)
-        plane, faces, segments = _contour(cv2.GaussianBlur(signed, (0, 0), SMOOTHING_CELLS))
-        origin_m = low_m + np.array(field.corner) * cell_m
-        places = rows[region]
-        found[region] = Footprint(
-            _lifted(plane * cell_m + origin_m, ground_m),
-            faces,
-            _lifted(segments * cell_m + origin_m, ground_m),
-            float((scene.positions_m[places, 2] + scene.radii_m[places]).max()),
-        )
-    return found
+class _Grid(NamedTuple):
+    """Cells of a storey. It moves and grows in steps, so that it stays the same while the map grows a little."""
+
+    low_m: tuple[float, float]
+    cell_m: float
+
+
+def _grid(scene: Scene, rows: np.ndarray) -> _Grid:
+    reach_m = float(scene.radii_m[rows].max()) + PAD_M
+    low_m = scene.positions_m[rows, :2].min(axis=0) - reach_m
+    extent_m = float((scene.positions_m[rows, :2].max(axis=0) + reach_m - low_m).max())
+    cell_m = SMALLEST_CELL_M
+    while cell_m * CELLS < extent_m:
+        cell_m *= 2
+    low_m = np.floor((low_m - MARGIN_CELLS * cell_m) / STEP_M) * STEP_M
+    return _Grid((float(low_m[0]), float(low_m[1])), cell_m)
 
 
 def _lifted(plane_m: np.ndarray, height_m: float) -> np.ndarray:
     return np.concatenate((plane_m, np.full((*plane_m.shape[:-1], 1), height_m)), axis=-1).astype(np.float32)
 
 
-def _field(scene: Scene, rows: np.ndarray, low_m: np.ndarray, cell_m: float) -> _Field:
-    """The height field of some places on the window that holds their discs and a margin of one cell."""
-    at = (scene.positions_m[rows, :2] - low_m) / cell_m  # in cells
-    radii = (scene.radii_m[rows] + PAD_M) / cell_m
-    reach = int(np.ceil(radii.max())) + MARGIN_CELLS - 1
-    corner = np.maximum(np.floor(at.min(axis=0)).astype(int) - reach - 1, 0)
-    size = np.ceil(at.max(axis=0)).astype(int) + reach + 2 - corner
+def _field(positions_m: np.ndarray, radii_m: np.ndarray, grid: _Grid) -> _Field:
+    """The height field of some places on the window that holds their discs and a margin."""
+    at = (positions_m[:, :2] - np.array(grid.low_m)) / grid.cell_m  # in cells
+    radii = (radii_m + PAD_M) / grid.cell_m
+    reach = int(np.ceil(radii.max())) + 1
+    corner = np.maximum(np.floor(at.min(axis=0)).astype(int) - reach - MARGIN_CELLS, 0)
+    size = np.ceil(at.max(axis=0)).astype(int) + reach + MARGIN_CELLS - corner
     heights = np.full(size, FAR, np.float32)
-    raise_field = _by_place if len(rows) < (2 * reach + 1) ** 2 else _by_step
+    raise_field = _by_place if len(at) < (2 * reach + 1) ** 2 else _by_step
     raise_field(heights, at - corner, radii, reach)
-    return _Field((int(corner[0]), int(corner[1])), heights * np.float32(cell_m))
+    return _Field((int(corner[0]), int(corner[1])), heights * np.float32(grid.cell_m))
 
 
 def _by_place(heights: np.ndarray, at: np.ndarray, radii: np.ndarray, reach: int) -> None:
@@ -140,10 +181,10 @@ def _by_step(heights: np.ndarray, at: np.ndarray, radii: np.ndarray, reach: int)
         np.maximum.at(heights, tuple(cells[inside].T), cones.astype(np.float32))
 
 
-def _contest(fields: dict[int, _Field], shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _contest(fields: dict[int, _Field]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Per cell of the storey the highest field, the second highest, and whose the highest is."""
-    rows = max([shape[0], *(field.corner[0] + field.heights.shape[0] for field in fields.values())])
-    columns = max([shape[1], *(field.corner[1] + field.heights.shape[1] for field in fields.values())])
+    rows = max(field.corner[0] + field.heights.shape[0] for field in fields.values())
+    columns = max(field.corner[1] + field.heights.shape[1] for field in fields.values())
     best = np.full((rows, columns), FAR, np.float32)
     second, owner = best.copy(), np.full((rows, columns), NO_REGION, np.int64)
     for region, field in fields.items():
