@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from prior_sg.deploy.api.errors import NotInSceneError, PackageMissingError, SaveError
 from prior_sg.deploy.json_text import json_text
+from prior_sg.deploy.settings import DEFAULT_ROBOT
 from prior_sg.schemas.regions import NO_REGION, Region
 from prior_sg.schemas.scene import Scene as SceneMessage
 
@@ -97,6 +98,20 @@ class Scene:
             f"<Scene of {self.robot}, {task}: {len(self.places)} places, {len(self.edges)} edges, "
             f"{len(self.regions)} regions ({regions or 'none'}), {len(self.objects)} objects>"
         )
+
+    @classmethod
+    def read(cls, path: str | Path, robot: str = DEFAULT_ROBOT) -> "Scene":
+        """The scene in a run's folder, scene.json, scene.sqlite, log.mcap or a file of Spark-DSG. Raises Error."""
+        from prior_sg.deploy.showing.reading import read_scene
+
+        return cls(read_scene(path, robot))
+
+    def save(self, path: str | Path, format: str = "") -> None:
+        """Write it in a format of docs/exports.md, which the path's ending names unless `format` does. Raises Error."""
+        from prior_sg.deploy.showing import formats
+        from prior_sg.deploy.showing.material import Material
+
+        formats.save(Material(self.message), Path(path), format)
 
     @property
     def robot(self) -> str:
@@ -239,7 +254,7 @@ class Scene:
         """
         frame = _package("pandas", "Scene.to_pandas").DataFrame
         tables = {
-            name: frame.from_records([_flat(row) for row in _rows(table)], columns=list(_columns(table))).set_index(
+            name: frame.from_records([flat_row(row) for row in _rows(table)], columns=list(_columns(table))).set_index(
                 "id"
             )
             for name, table in (("places", self.places), ("regions", self.regions), ("objects", self.objects))
@@ -275,7 +290,12 @@ def _columns(table: Places | Regions | Objects) -> Iterator[str]:
             yield from _flat_names(SINGULAR.get(field.name, field.name), getattr(table, field.name).ndim == 2)
 
 
-def _flat(row: dict[str, Any]) -> dict[str, Any]:
+def flat_rows(table: Places | Regions | Objects) -> tuple[list[str], Iterator[list[Any]]]:
+    """Names of a table's columns and its rows, points as three columns each; without posteriors."""
+    return list(_columns(table)), (list(flat_row(row).values()) for row in _rows(table))
+
+
+def flat_row(row: dict[str, Any]) -> dict[str, Any]:
     """Points as three numbers."""
     flat: dict[str, Any] = {}
     for name, value in row.items():

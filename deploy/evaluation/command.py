@@ -39,6 +39,7 @@ SHOWN = {  # keys with their column titles
     "accuracy": "acc.",
     "boundary_f1": "bound.",
     "ece": "ECE",
+    "risk_half": "risk½",
 }
 
 

@@ -107,7 +107,7 @@ class View:
 def draw_map(scene: Scene, voxel_map: VoxelMap | None, outlines_m: list[np.ndarray]) -> bytes:
     """A PNG file of the scene; `outlines_m` are ground-truth polygons (corner, 2). Spheres stand for a missing map."""
     turned = _is_tall(scene, voxel_map, outlines_m)
-    layers = _layers(scene, voxel_map, turned)
+    layers = layers_of(scene, voxel_map, turned)
     view = View(*_bounds(scene, layers, outlines_m, turned))
     colors = label_colors(scene)
     _paint_floor(view, layers, colors)
@@ -154,7 +154,7 @@ def _bounds(scene: Scene, layers: Layers, outlines_m: list[np.ndarray], turned: 
     return points.min(axis=0) - BORDER_M, points.max(axis=0) + BORDER_M
 
 
-def _layers(scene: Scene, voxel_map: VoxelMap | None, turned: bool) -> Layers:
+def layers_of(scene: Scene, voxel_map: VoxelMap | None, turned: bool) -> Layers:
     """Walls and free space within the band; free columns are coloured by the places that own their voxels."""
     if voxel_map is None:
         voxel_m, occupied = 0.05, np.zeros((0, 3), int)

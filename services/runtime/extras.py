@@ -20,6 +20,7 @@ MODULES = {  # by extra; what the build file lists there, by the names that code
     "clip": ("open_clip",),
     "export": ("sentencepiece",),
     "dsg": ("spark_dsg",),
+    "graph": ("networkx",),
     "fast-cut": ("maxflow",),
     "postgres": ("psycopg", "pgvector"),
     "api": ("litestar", "uvicorn"),

@@ -8,7 +8,7 @@ import pytest
 
 import prior_sg
 from prior_sg.deploy.api.frames import frame_of
-from prior_sg.deploy.cli.report import scene_in
+from prior_sg.deploy.showing.reading import scene_in
 from prior_sg.schemas.codec import encode
 from prior_sg.schemas.frames import Intrinsics, Keyframe
 from prior_sg.schemas.topics import KEYFRAME
