@@ -20,6 +20,7 @@ from prior_sg.schemas.scene import Scene
 
 BLOCK = 4096  # consecutive ids of places whose dots and edges are one shape
 OBJECT_BLOCK = 512
+MOST_EDGES = 60_000
 MOST_NAMES = 60  # of objects: more cover each other
 PLACE_M, LIT_PLACE_M, EDGE_PX = 0.085, 0.2, 0.75
 FAINTER = 0.45  # edges than their places
@@ -152,12 +153,18 @@ def _edges(theme: Theme, scene: Scene, tints: np.ndarray) -> Picture:
     if not len(scene.edges):
         return {}
     rows = np.searchsorted(scene.place_ids, scene.edges)
-    rows = rows[(rows < len(scene.place_ids)).all(axis=1)]
+    drawn = (rows < len(scene.place_ids)).all(axis=1) & (scene.edges.sum(axis=1) % edges_left_out(scene) == 0)
+    rows = rows[drawn]
     faint = (tints * (1 - FAINTER) + np.array(theme.background) * FAINTER).astype(np.uint8)
     return {
         f"/edges/{block}": Lines(scene.positions_m[rows[of]], faint[rows[of]], EDGE_PX)
         for block, of in blocks(scene.place_ids[rows.max(axis=1)], BLOCK)
     }
+
+
+def edges_left_out(scene: Scene) -> int:
+    """One of how many edges is drawn: of very many, some show the graph as well, and browsers stay fluent."""
+    return max(1, -(-len(scene.edges) // MOST_EDGES))
 
 
 def blocks(ids: np.ndarray, size: int) -> list[tuple[int, np.ndarray]]:

@@ -9,6 +9,7 @@ import numpy as np
 from prior_sg.deploy.api.client import Health
 from prior_sg.deploy.inspecting.explain import gains
 from prior_sg.deploy.showing.colors import Color
+from prior_sg.deploy.viewing.drawing import edges_left_out
 from prior_sg.schemas.names import shown
 from prior_sg.schemas.regions import NO_REGION, PosteriorReply, Region
 from prior_sg.schemas.scene import Scene
@@ -37,6 +38,8 @@ def headline(scene: Scene, title: str) -> str:
             (len(scene.objects), "object"),
         )
     )
+    if (one_of := edges_left_out(scene)) > 1:
+        counts += f"; one of {one_of} edges is drawn"
     where = " · ".join(part for part in (text_of(scene.environment), text_of(scene.robot), text_of(title)) if part)
     return (
         f'<div style="{_BOX};padding-bottom:8px"><div style="font-size:19px;font-weight:650;line-height:1.25">{task}'

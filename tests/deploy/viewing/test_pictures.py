@@ -3,12 +3,14 @@ import numpy as np
 import pytest
 
 from prior_sg.deploy.showing.colors import PALETTE, LabelColors
+from prior_sg.deploy.viewing import drawing
 from prior_sg.deploy.viewing.cloud import Cloud, points_of
 from prior_sg.deploy.viewing.drawing import BLOCK, Lit, Painter
 from prior_sg.deploy.viewing.footprint import Footprint, footprints
 from prior_sg.deploy.viewing.picking import pick, typical_place
 from prior_sg.deploy.viewing.search import find
 from prior_sg.deploy.viewing.shapes import Mesh, difference
+from prior_sg.deploy.viewing.words import headline
 from tests.help.homes import home, keyframe, region
 
 
@@ -175,3 +177,13 @@ def test_points_above_the_cut_and_later_ones_are_left_out() -> None:
     low = np.concatenate([shape.points_m[:, 2] for shape in cloud.picture(middle_m).values()])
     assert low.max() <= middle_m and len(low) < len(heights)
     assert cloud.picture(until_ns=frame.stamp_ns - 1) == {}
+
+
+def test_of_very_many_edges_some_are_drawn_and_the_page_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = home()
+    assert len(Painter().draw(scene)["/edges/0"].points_m) == 3
+    assert "edges" not in headline(scene, "test")
+    monkeypatch.setattr(drawing, "MOST_EDGES", 2)
+    fewer = home(edges=np.array([(10, 11), (10, 12), (11, 12)]))
+    assert len(Painter().draw(fewer)["/edges/0"].points_m) == 1  # the one whose ids have an even sum
+    assert "one of 2 edges is drawn" in headline(scene, "test")
