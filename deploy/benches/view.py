@@ -22,9 +22,9 @@ from prior_sg.schemas.scene import Scene
 
 SIZES = (10_000, 100_000)
 OBJECTS = 1000
-WINDOW = (800, 500)  # pixels
+WINDOW = (480, 320)  # pixels
 SOFTWARE = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-background-networking")
-COUNT_S, SETTLE_S, CHANGES, PATIENCE_S = 8.0, 60.0, 5, 60.0
+COUNT_S, SETTLE_S, CHANGES, PATIENCE_S = 10.0, 30.0, 5, 60.0
 KEEP_PIXELS = """
 const plain = HTMLCanvasElement.prototype.getContext;
 HTMLCanvasElement.prototype.getContext = function (kind, more) {
@@ -127,7 +127,7 @@ def _showing(scene: Scene, browser: str) -> dict[str, float]:
     page = Page(source, Options(port=18080, interval_s=0.05))
     try:
         with _tab(browser, page.address) as tab:
-            time.sleep(SETTLE_S / 4)
+            time.sleep(SETTLE_S)
             frames = tab.evaluate(f"window.frames_in({COUNT_S})")
             latencies = [_latency_ms(tab, source, divided_anew(scene, 1 + seed)) for seed in range(CHANGES)]
     finally:
