@@ -7,8 +7,9 @@ from typing import Self
 from prior_sg.deploy.api.kept import kept
 from prior_sg.deploy.api.scene import Scene
 from prior_sg.schemas.codec import decode
+from prior_sg.schemas.priors import Prior
 from prior_sg.schemas.scene import StoredRevision
-from prior_sg.schemas.topics import OBJECT_DELTA, PLACE_DELTA, REGION_DELTA, TASK
+from prior_sg.schemas.topics import OBJECT_DELTA, PLACE_DELTA, PRIOR, REGION_DELTA, TASK
 from prior_sg.services.registry import BY_NAME
 from prior_sg.services.runtime.record import read_log
 from prior_sg.services.runtime.runner import Runner
@@ -18,7 +19,7 @@ from prior_sg.services.scene_store.database import Database
 from prior_sg.services.scene_store.storage import is_url
 from prior_sg.services.scene_store.storage.tables import LAST, StoreError
 
-READ_OF_LOGS = (PLACE_DELTA, REGION_DELTA, OBJECT_DELTA, TASK)
+READ_OF_LOGS = (PLACE_DELTA, REGION_DELTA, OBJECT_DELTA, TASK, PRIOR)
 
 
 class History:
@@ -48,6 +49,11 @@ class History:
         """The revisions that are kept of a robot, oldest first."""
         with self._asking:
             return self.database.history(robot, LAST)
+
+    def prior(self, digest: str) -> Prior | None:
+        """The prior that `Scene.message.prior_digest` names; None where it is not kept."""
+        with self._asking:
+            return self.database.prior(digest)
 
     def scene(self, robot: str, revision: int | None = None, stamp_ns: int | None = None) -> Scene:
         """The newest scene of a robot, that of one revision, or the newest at a time. Raises NotInSceneError."""

@@ -164,7 +164,7 @@ class Mapper:
     def scene(self) -> Scene:
         """The scene graph of all frames so far, once nothing is pending."""
         self._settle()
-        return Scene(self._pipeline.of("scene_store").answer(SCENE, SceneRequest(robot=self.robot)))
+        return Scene(self._pipeline.of("scene_store").answer(SCENE, SceneRequest(robot=self.robot)), self._prior)
 
     @property
     def prior(self) -> Prior:

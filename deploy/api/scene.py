@@ -2,7 +2,7 @@
 
 import importlib
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
@@ -11,9 +11,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from prior_sg.deploy.api.asking import Asking
 from prior_sg.deploy.api.errors import NotInSceneError, PackageMissingError, SaveError
 from prior_sg.deploy.json_text import json_text
 from prior_sg.deploy.settings import DEFAULT_ROBOT
+from prior_sg.schemas.priors import Prior
+from prior_sg.schemas.queries import Answer, Difference, Question
 from prior_sg.schemas.regions import NO_REGION, Region
 from prior_sg.schemas.scene import Scene as SceneMessage
 
@@ -84,11 +87,13 @@ class Objects:
         return len(self.ids)
 
 
-class Scene:
-    """One robot's scene graph at one moment. `message` is what the store sent; everything else follows from it."""
+class Scene(Asking):
+    """One robot's scene graph at one moment. `message` is what the store sent; everything else follows from it, and
+    from `prior`, the one its regions follow, where it is at hand: `find` knows by it what labels mean.
+    """
 
-    def __init__(self, message: SceneMessage) -> None:
-        self.message = message
+    def __init__(self, message: SceneMessage, prior: Prior | None = None) -> None:
+        self.message, self.prior = message, prior
 
     def __repr__(self) -> str:
         counts = Counter(region.label for region in self.message.regions)
@@ -102,9 +107,10 @@ class Scene:
     @classmethod
     def read(cls, path: str | Path, robot: str = DEFAULT_ROBOT) -> "Scene":
         """The scene in a run's folder, scene.json, scene.sqlite, log.mcap or a file of Spark-DSG. Raises Error."""
-        from prior_sg.deploy.showing.reading import read_scene
+        from prior_sg.deploy.showing.reading import read_material
 
-        return cls(read_scene(path, robot))
+        found = read_material(path, robot)
+        return cls(found.scene, found.prior)
 
     def save(self, path: str | Path, format: str = "") -> None:
         """Write it in a format of docs/exports.md, which the path's ending names unless `format` does. Raises Error."""
@@ -210,6 +216,34 @@ class Scene:
             there = ", ".join(f"{region.id} {region.label}" for region in self.message.regions) or "no regions yet"
             raise NotInSceneError(f"the scene has no region {label_or_id!r}; it has: {there}")
         return max(found, key=lambda region: region.area_m2)
+
+    def ask(self, *questions: Question) -> list[Answer]:
+        """Answers to questions of `prior_sg.schemas.queries`, in their order."""
+        from prior_sg.services.scene_store.core.queries.answering import answer
+
+        return [answer(self._index, question) for question in questions]
+
+    def difference(self, older: "Scene") -> Difference:
+        """What is new, gone and renamed since another scene of the same robot."""
+        from prior_sg.services.scene_store.core.queries.changes import difference
+
+        return difference(older._index, self._index)
+
+    def prior_of(self, digest: str) -> Prior | None:
+        """The prior of a digest, where it is at hand."""
+        return self.prior if self.prior is not None and self.prior.digest() == digest else None
+
+    def embed(self, space: str, phrases: Sequence[str]) -> np.ndarray[Any, Any]:
+        """Unit vectors (phrase, dim) by the text side of the space, which is loaded here. Raises PriorSgError."""
+        from prior_sg.deploy.api.embedding import embed_here
+
+        return embed_here(space, phrases)
+
+    @cached_property
+    def _index(self) -> Any:
+        from prior_sg.services.scene_store.core.queries.index import Index
+
+        return Index(self.message)
 
     def to_dict(self) -> dict[str, Any]:
         """Everything as dictionaries, lists, numbers and text, in the layout of scene.json."""

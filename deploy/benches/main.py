@@ -10,10 +10,13 @@ from typing import Any
 from prior_sg.deploy.benches import features as bench_features
 from prior_sg.deploy.benches import segmenter
 from prior_sg.deploy.benches.bus import bus_bench
+from prior_sg.deploy.benches.crashes import crashes
 from prior_sg.deploy.benches.encoder_swap import encoder_swap
 from prior_sg.deploy.benches.kernel import kernel
 from prior_sg.deploy.benches.learning import learning_bench
 from prior_sg.deploy.benches.places import place_bench
+from prior_sg.deploy.benches.queries import query_bench
+from prior_sg.deploy.benches.store import store_bench
 from prior_sg.deploy.benches.swap import swap_bench
 from prior_sg.deploy.sample import SAMPLE
 from prior_sg.deploy.settings import DEMO_ENVIRONMENT, DEMO_TASK
@@ -111,15 +114,18 @@ BENCHES: dict[str, Callable[[], tuple[dict, dict]]] = {
     "task": segmenter.switch,
     "learning": learning_bench,
     "encoder_swap": exchanged_encoder,
+    "queries": query_bench,
     "e2e": e2e,
+    "store": store_bench,
 }
-
-
-VIEW = "view"  # needs an extra and a browser, so it is no part of `all`
-POOL = "pool"  # lasts as long as it is told to, so it is no part of `all`
+LONG: dict[str, Callable[[float], tuple[dict, dict]]] = {  # no part of `all`; the pool lasts as long as it is told to
+    "pool": attacked_pool,
+    "store_crashes": lambda seconds: crashes(),
+    "view": lambda seconds: view(),  # needs an extra and a browser
+}
 
 
 def run(name: str, seconds: float) -> dict[str, Any]:
     """One measurement as the object that `--json` prints; `seconds` are those of the attacked pool."""
-    metrics, settings = attacked_pool(seconds) if name == POOL else (view if name == VIEW else BENCHES[name])()
+    metrics, settings = LONG[name](seconds) if name in LONG else BENCHES[name]()
     return {"bench": name, "metrics": metrics, "machine": machine(), "settings": settings}

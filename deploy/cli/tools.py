@@ -102,7 +102,9 @@ def _add_system(commands: Commands) -> None:
         needs="encode",
     )
     bench.add_argument(
-        "name", help="bus, places, features, kernel, swap, segmenter, task, learning, e2e, all of these, or pool"
+        "name",
+        help="bus, places, features, kernel, swap, segmenter, task, learning, queries, e2e, store, all of these, pool, "
+        "or store_crashes",
     )
     bench.add_argument("--seconds", type=float, default=300.0, help="how long pool lasts (default: %(default)s)")
     bench.add_argument("--json", action="store_true", help="print one JSON object per measurement")
@@ -262,9 +264,10 @@ def cmd_bench(arguments: argparse.Namespace) -> int:
     """Measure."""
     from prior_sg.deploy.benches import main as bench
 
-    known = (*bench.BENCHES, bench.POOL, bench.VIEW)
-    if arguments.name not in (*known, "all"):
-        raise UserError(f"there is no measurement {arguments.name!r}; known: {', '.join(known)}, all")
+    if arguments.name not in (*bench.BENCHES, *bench.LONG, "all"):
+        raise UserError(
+            f"there is no measurement {arguments.name!r}; known: {', '.join((*bench.BENCHES, *bench.LONG))}, all"
+        )
     for name in bench.BENCHES if arguments.name == "all" else [arguments.name]:
         with console.status(f"measuring {name}"):
             found = bench.run(name, arguments.seconds)

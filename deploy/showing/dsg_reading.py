@@ -61,6 +61,7 @@ def scene_of_graph(graph: spark_dsg.DynamicSceneGraph) -> Scene:
         objects=[_object(graph, item) for item in objects],
         trajectory=np.array(about.get("trajectory_m", ()), np.float32).reshape(-1, 3),
         origin_m=tuple(about.get("origin_m", (0.0, 0.0, 0.0))),
+        revision=-1,  # of no store
         **_edges(graph, places),
         **columns,
     )
@@ -175,7 +176,7 @@ def _edges(graph: spark_dsg.DynamicSceneGraph, places: list[Item]) -> dict[str, 
     }
 
 
-def _region(room: Item, names: dict[int, str], columns: dict[str, np.ndarray], layers: dict[str, list[Item]]) -> Region:
+def _region(room: Item, names: dict[int, str], columns: dict[str, Any], layers: dict[str, list[Item]]) -> Region:
     """As we wrote it, or put together from the places and objects below the room and the rooms beside it."""
     if "place_count" in room.told:
         return msgspec.convert(room.told, Region)

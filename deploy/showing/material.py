@@ -7,6 +7,7 @@ import numpy as np
 
 from prior_sg.deploy.truth import GroundTruth
 from prior_sg.schemas.places import VoxelMap
+from prior_sg.schemas.priors import Prior
 from prior_sg.schemas.scene import Scene
 
 
@@ -38,4 +39,5 @@ class Material:
     settings: dict[str, dict[str, Any]] = field(default_factory=dict)  # of each service that ran
     losses: list[dict[str, Any]] | None = None  # what a run could not use; None = not known
     truth: GroundTruth | None = None
+    prior: Prior | None = None  # that the regions follow
     crs: str = ""  # coordinate reference system of the world with its origin, such as EPSG:32632; "" = local metres

@@ -1,4 +1,4 @@
-"""What a recorded log tells beside its final scene: how the scene came about, the surface's colours, the settings."""
+"""What is told beside a final scene: how it came about, and of a log the surface's colours and the settings."""
 
 from pathlib import Path
 from typing import Any
@@ -6,49 +6,24 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from prior_sg.deploy.api.history import History
 from prior_sg.deploy.showing.material import Cloud, Moment
 from prior_sg.schemas.codec import decode
 from prior_sg.schemas.frames import Keyframe, PoseUpdate
-from prior_sg.schemas.objects import ObjectDelta
-from prior_sg.schemas.places import PlaceDelta
-from prior_sg.schemas.regions import RegionDelta
 from prior_sg.schemas.status import Consumed, Started
-from prior_sg.schemas.topics import JOURNAL, KEYFRAME, OBJECT_DELTA, PLACE_DELTA, POSE_UPDATE, REGION_DELTA
-from prior_sg.services.deltas import Follower, PoseCorrections
+from prior_sg.schemas.topics import JOURNAL, KEYFRAME, POSE_UPDATE
+from prior_sg.services.deltas import PoseCorrections
 from prior_sg.services.images import MAX_PRINCIPAL_OFFSET, ImageFault, color_of, depth_of
 from prior_sg.services.runtime.record import read_log
-from prior_sg.services.scene_store.core import graph as store
 
 CLOUD_FRAMES, CLOUD_POINTS, PIXEL_STEP, CLOUD_VOXEL_M = 60, 400_000, 4, 0.04
-DELTAS = (PLACE_DELTA, REGION_DELTA, OBJECT_DELTA)
 
 
-def moments_of(log: Path, robot: str, count: int) -> list[Moment]:
-    """The scene of a robot after evenly many deltas of a log, at most `count`, the last included. Raises LogError."""
-    deltas: list[Any] = [decode(logged.topic.type, logged.payload) for logged in read_log(log, DELTAS)]
-    deltas = [delta for delta in deltas if delta.robot == robot]
-    wanted = set(np.linspace(len(deltas) - 1, 0, min(count, len(deltas))).round().astype(int).tolist())
-    graph = store.Graph(robot)
-    followers: dict[type, Follower[Any]] = {kind: Follower() for kind in (PlaceDelta, RegionDelta, ObjectDelta)}
-    found = []
-    for row, delta in enumerate(deltas):
-        _apply(graph, followers[type(delta)], delta)
-        if row in wanted:
-            found.append(Moment(graph.revision, store.scene(graph)))
-    return found
-
-
-def _apply(graph: store.Graph, follower: Follower[Any], delta: PlaceDelta | RegionDelta | ObjectDelta) -> None:
-    if isinstance(delta, PlaceDelta):
-        store.note_cameras(graph, delta)
-    for due in follower.take(delta):
-        match due:
-            case PlaceDelta():
-                store.apply_places(graph, due)
-            case RegionDelta():
-                store.apply_regions(graph, due)
-            case ObjectDelta():
-                store.apply_objects(graph, due)
+def moments_of(history: History, robot: str, count: int) -> list[Moment]:
+    """The scene of a robot at evenly many of the revisions that are kept, at most `count`, the last included."""
+    kept = [entry.revision for entry in history.revisions(robot)]
+    wanted = sorted(set(np.linspace(len(kept) - 1, 0, min(count, len(kept))).round().astype(int).tolist()))
+    return [Moment(kept[row], history.scene(robot, kept[row]).message) for row in wanted]
 
 
 def cloud_of(log: Path, robot: str) -> Cloud | None:

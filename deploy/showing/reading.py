@@ -1,5 +1,6 @@
 """Finds a scene, and what is known beside it, in what a run or another program left on disk."""
 
+import contextlib
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -12,9 +13,11 @@ from prior_sg.deploy.showing.material import Material
 from prior_sg.deploy.showing.scene_reading import scene_of_json
 from prior_sg.schemas.codec import DecodeError, decode
 from prior_sg.schemas.places import VoxelMap
+from prior_sg.schemas.priors import Prior
 from prior_sg.schemas.scene import Scene
+from prior_sg.schemas.topics import PRIOR
 from prior_sg.services.runtime import extras
-from prior_sg.services.runtime.record import attachments
+from prior_sg.services.runtime.record import attachments, read_log
 
 IN_FOLDER = ("log.mcap", "scene.sqlite", "scene.json", "dsg.json")  # of a run; the first tells most
 SCORES = ("scores.json", "metrics.json")
@@ -22,11 +25,6 @@ SCORES = ("scores.json", "metrics.json")
 
 class SourceUnreadable(UserError):
     """A source holds no scene; the message says what would."""
-
-
-def read_scene(path: str | Path, robot: str) -> Scene:
-    """The scene in a run's folder or one of its files, or in a file of Spark-DSG. Raises SourceUnreadable."""
-    return read_material(path, robot).scene
 
 
 def read_material(path: str | Path, robot: str, *, moments_wanted: int = 0, cloud_wanted: bool = False) -> Material:
@@ -58,7 +56,7 @@ def _read_file(path: Path, robot: str, moments_wanted: int, cloud_wanted: bool) 
             case ".mcap":
                 return _read_log(path, robot, moments_wanted, cloud_wanted)
             case ".sqlite":
-                return Material(_some(scene_in(path, robot), path, robot))
+                return _read_database(path, robot, moments_wanted)
             case ".json" | ".sparkdsg":
                 return _read_graph(path)
     except OSError as error:
@@ -101,11 +99,16 @@ def _read_log(path: Path, robot: str, moments_wanted: int, cloud_wanted: bool) -
     except DecodeError as error:
         raise SourceUnreadable(f"{path} holds a scene that this version cannot read: {error}") from error
     left = scene is not None and scene.robot == robot
-    story = moments.moments_of(path, robot, max(1, moments_wanted)) if moments_wanted or not left else []
+    story = []
+    if moments_wanted or not left:
+        with open_history(path) as history:
+            story = moments.moments_of(history, robot, max(1, moments_wanted))
     if not left:
         scene, voxels = story[-1].scene if story else None, None
+    found = _some(scene, path, robot)
     return Material(
-        scene=_some(scene, path, robot),
+        scene=found,
+        prior=_prior_in(path, found.prior_digest),
         voxels=voxels,
         cloud=moments.cloud_of(path, robot) if cloud_wanted else None,
         moments=story if moments_wanted else [],
@@ -114,13 +117,27 @@ def _read_log(path: Path, robot: str, moments_wanted: int, cloud_wanted: bool) -
     )
 
 
+def _read_database(path: Path, robot: str, moments_wanted: int) -> Material:
+    with open_history(path) as history:
+        scene = history.scene(robot).message
+        return Material(
+            _some(scene, path, robot),
+            prior=history.prior(scene.prior_digest),
+            moments=moments.moments_of(history, robot, moments_wanted),
+        )
+
+
+def _prior_in(path: Path, digest: str) -> Prior | None:
+    """The prior of a digest, where the log holds it; one that cannot be decoded was refused by everybody."""
+    for entry in read_log(path, [PRIOR]):
+        with contextlib.suppress(DecodeError):
+            prior = decode(Prior, entry.payload)
+            if prior.digest() == digest:
+                return prior
+    return None
+
+
 def _some(scene: Scene | None, path: Path, robot: str) -> Scene:
     if scene is None or not len(scene.place_ids):
         raise SourceUnreadable(f"{path} holds no places of {robot}; name another with --robot")
     return scene
-
-
-def scene_in(database: Path, robot: str) -> Scene:
-    """The scene of one robot in a database file of the store, which may be in use."""
-    with open_history(database) as history:
-        return history.scene(robot).message

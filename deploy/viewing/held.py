@@ -7,7 +7,7 @@ import numpy as np
 from prior_sg.deploy.api.client import Health
 from prior_sg.deploy.errors import UserError
 from prior_sg.deploy.viewing.cloud import Cloud
-from prior_sg.deploy.viewing.sources import Camera, Say
+from prior_sg.deploy.viewing.sources import Camera, Likeness, Say
 from prior_sg.schemas.priors import Prior
 from prior_sg.schemas.regions import PosteriorReply
 from prior_sg.schemas.scene import Scene
@@ -41,6 +41,9 @@ class Held:
 
     def camera(self, until_ns: float = np.inf) -> Camera | None:
         return None
+
+    def likeness(self, scene: Scene, text: str) -> Likeness:
+        return Likeness({}, {}, "a scene alone has no encoder")
 
     def explain(self, place_id: int, say: Say) -> PosteriorReply:
         raise UserError("a scene alone holds beliefs but no votes")

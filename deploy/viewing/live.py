@@ -12,13 +12,13 @@ import numpy as np
 from prior_sg.deploy.api.client import Changes, Client, Health
 from prior_sg.deploy.viewing.cloud import Cloud
 from prior_sg.deploy.viewing.recorded import camera_of
-from prior_sg.deploy.viewing.sources import Camera, Say
+from prior_sg.deploy.viewing.sources import Camera, Likeness, Say
 from prior_sg.schemas.codec import DecodeError, decode
 from prior_sg.schemas.frames import ArchiveReply, ArchiveRequest, Keyframe, PoseUpdate
-from prior_sg.schemas.priors import Prior, PriorRequest
+from prior_sg.schemas.priors import Prior
 from prior_sg.schemas.regions import PosteriorReply
 from prior_sg.schemas.scene import Scene, StoredRevision
-from prior_sg.schemas.topics import ARCHIVE, KEYFRAME, POSE_UPDATE, PRIORS
+from prior_sg.schemas.topics import ARCHIVE, KEYFRAME, POSE_UPDATE
 from prior_sg.services.deltas import PoseCorrections
 from prior_sg.services.images import ImageFault
 from prior_sg.services.runtime.bus import Bus, BusError, Sample
@@ -111,12 +111,14 @@ class Live:
         seen = [camera for camera in list(self._cameras) if camera.stamp_ns <= until_ns]
         return max(seen, key=lambda camera: camera.stamp_ns, default=None)
 
+    def likeness(self, scene: Scene, text: str) -> Likeness:
+        return Likeness(*self._client.likeness(text))
+
     def explain(self, place_id: int, say: Say) -> PosteriorReply:
         return self._client.explain(place_id)
 
     def prior(self, digest: str) -> Prior | None:
-        found = self._bus.ask(PRIORS, PriorRequest(digest=digest)).priors if digest else []
-        return found[0] if found else None
+        return self._client.prior_of(digest) if digest else None
 
     def health(self) -> Health | None:
         return self._client.health()

@@ -16,7 +16,8 @@ from prior_sg.deploy.viewing.drawing import DARK, LIGHT, Painter
 from prior_sg.deploy.viewing.footprint import floor_m
 from prior_sg.deploy.viewing.panel import CUT_M, Asked, Panel
 from prior_sg.deploy.viewing.picking import Picked, pick, typical_place
-from prior_sg.deploy.viewing.sources import Source
+from prior_sg.deploy.viewing.search import NOTHING_KNOWN
+from prior_sg.deploy.viewing.sources import Likeness, Source
 from prior_sg.deploy.viewing.stage import SafeServer, Stage
 from prior_sg.schemas.regions import NO_REGION
 from prior_sg.schemas.scene import Scene
@@ -24,7 +25,7 @@ from prior_sg.services.errors import PriorSgError
 
 SHARE = 4.0  # drawing takes at most one part in so many of the time
 PLAY_S, FRAME_S = 20.0, 0.1  # a whole history, and one step of it
-HEALTH_S, POLL_S = 5.0, 0.5
+HEALTH_S, POLL_S, TYPING_S = 5.0, 0.5, 0.5
 MOST_CATCH_UP_S = 5.0
 
 
@@ -60,6 +61,8 @@ class Page:
         self._wanted = Wanted()
         self._wake, self._closed = threading.Event(), threading.Event()
         self._scene: Scene | None = None
+        self._meant: dict[tuple[str, str], Likeness] = {}  # by text and prior
+        self._asking = threading.Lock()
         self.sent_bytes = 0
         self.server = SafeServer(options.host, options.port)
         self.server.gui.configure_theme(
@@ -93,7 +96,7 @@ class Page:
     def _asked(self) -> Asked:
         return Asked(
             task=lambda task, environment: self._later(self._give_task, task, environment),
-            search=lambda text: self._want(text=text),
+            search=self._search,
             moment=lambda moment: self._want(moment=moment, playing=False),
             follow=lambda: self._want(moment=None, playing=False),
             play=self._start_playing,
@@ -106,6 +109,25 @@ class Page:
     def _want(self, **changes: object) -> None:
         for name, value in changes.items():
             setattr(self._wanted, name, value)
+        self._wake.set()
+
+    def _search(self, text: str) -> None:
+        """Words are compared at once; what they mean is asked when nobody has typed for a moment."""
+        self._want(text=text)
+        self._later(self._find_meaning, text)
+
+    def _find_meaning(self, text: str) -> None:
+        scene = self._scene
+        if self._closed.wait(TYPING_S) or scene is None or text != self._wanted.text or not text.strip():
+            return
+        key = (text, scene.prior_digest)
+        with self._asking:
+            if key in self._meant or text != self._wanted.text:
+                return
+            try:
+                self._meant[key] = self._source.likeness(scene, text)
+            except PriorSgError as error:
+                self._meant[key] = Likeness({}, {}, str(error))
         self._wake.set()
 
     def _later(self, work: Callable[..., None], *arguments: object) -> None:
@@ -136,7 +158,7 @@ class Page:
         scene = self._source.scene(wanted.moment)
         self._scene = scene
         until_ns = scene.stamp_ns if wanted.moment is not None else np.inf
-        found = search.find(scene, wanted.text)
+        found = search.find(scene, wanted.text, self._meant.get((wanted.text, scene.prior_digest), NOTHING_KNOWN))
         picked = NO_REGION if wanted.picked is None else wanted.picked.region
         picture = self._painter.draw(scene, replace(found.lit, picked=picked))
         ground_m = floor_m(scene, np.arange(len(scene.place_ids)))

@@ -11,10 +11,11 @@ import numpy as np
 
 from prior_sg.deploy.api.client import Health
 from prior_sg.deploy.api.history import History, open_history
+from prior_sg.deploy.api.scene import Scene as AskedScene
 from prior_sg.deploy.errors import UserError
 from prior_sg.deploy.inspecting import replay
 from prior_sg.deploy.viewing.cloud import Cloud, small_image
-from prior_sg.deploy.viewing.sources import Camera, Say
+from prior_sg.deploy.viewing.sources import Camera, Likeness, Say
 from prior_sg.schemas.codec import Message, decode
 from prior_sg.schemas.frames import Keyframe, PoseUpdate
 from prior_sg.schemas.priors import Prior
@@ -93,6 +94,9 @@ class Recorded:
         cameras = list(self._cameras)
         at = bisect.bisect_right([camera.stamp_ns for camera in cameras], until_ns)
         return cameras[at - 1] if at else None
+
+    def likeness(self, scene: Scene, text: str) -> Likeness:
+        return Likeness(*AskedScene(scene, self.prior(scene.prior_digest)).likeness(text))
 
     def explain(self, place_id: int, say: Say) -> PosteriorReply:
         if self._log is None:

@@ -1,14 +1,16 @@
 """What a search lights up (pure)."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from prior_sg.deploy.viewing.drawing import Lit
+from prior_sg.deploy.viewing.sources import Likeness
 from prior_sg.schemas.queries import AnswersTo, Ranking
 from prior_sg.schemas.scene import Scene
 from prior_sg.services.scene_store.core.queries.answering import answer
 from prior_sg.services.scene_store.core.queries.index import Index
 
 MOST_ANSWERS = 8
+NOTHING_KNOWN = Likeness({}, {})
 AS_GOOD = 0.6  # of the best answer's score: what answers so well is lit, too
 
 
@@ -21,9 +23,10 @@ class Found:
     said: str  # a sentence; empty when there is nothing to say
 
 
-def ranked(scene: Scene, text: str) -> Ranking:
-    """What answers a text in the words of its labels, without an embedding of it."""
-    found = answer(Index(scene, 0), AnswersTo(text=text, limit=2 * MOST_ANSWERS))
+def ranked(scene: Scene, text: str, likeness: Likeness) -> Ranking:
+    """What answers a text by what its labels mean; where nothing is known of that, by their words."""
+    asked = AnswersTo(text=text, regions=likeness.regions, objects=likeness.objects, limit=3 * MOST_ANSWERS)
+    found = answer(Index(scene, 0), asked)
     if not isinstance(found, Ranking):
         raise TypeError(f"AnswersTo is answered by {type(found).__name__}")
     return found
@@ -63,9 +66,12 @@ def begun(scene: Scene, text: str) -> Found:
     return Found([(kind, name, score) for score, kind, name, _ in best], lit, said)
 
 
-def find(scene: Scene, text: str) -> Found:
-    """What of a scene answers a text; nothing where it is empty."""
-    return found_in(ranked(scene, text), scene, text) if text.strip() else Found([], Lit(), "")
+def find(scene: Scene, text: str, likeness: Likeness = NOTHING_KNOWN) -> Found:
+    """What of a scene answers a text; nothing where it is empty. It says what was missing to know better."""
+    if not text.strip():
+        return Found([], Lit(), "")
+    found = found_in(ranked(scene, text, likeness), scene, text)
+    return replace(found, said=": ".join(part for part in (found.said, likeness.missing) if part))
 
 
 def _begins(name: str, start: str) -> bool:

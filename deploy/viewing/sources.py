@@ -27,6 +27,15 @@ class Camera:
     image: np.ndarray  # (row, column, 3) uint8, made smaller
 
 
+@dataclass(frozen=True)
+class Likeness:
+    """How probably regions and objects answer a text, by label; what was missing to find it out, as a sentence."""
+
+    regions: dict[str, float]
+    objects: dict[str, float]
+    missing: str = ""
+
+
 class Source(Protocol):
     """One robot's scene over time. Its methods may be called from any thread and raise PriorSgError."""
 
@@ -46,6 +55,9 @@ class Source(Protocol):
 
     def camera(self, until_ns: float = np.inf) -> Camera | None:
         """The last image no later than that."""
+
+    def likeness(self, scene: Scene, text: str) -> Likeness:
+        """How probably what carries a label answers a text, found out in the scene's embedding space; may take long."""
 
     def explain(self, place_id: int, say: Say) -> PosteriorReply:
         """Why a place carries its label, at the newest moment; may take long, then it says why."""

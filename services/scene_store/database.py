@@ -4,8 +4,10 @@ A graph is the nearest snapshot and the events after it; nothing else is the tru
 leaves the state before or after an event, never between.
 """
 
+import contextlib
+import gc
 import logging
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import zstandard
@@ -102,8 +104,16 @@ class Database:
 
     def put_prior(self, prior: Prior) -> None:
         """Keep a prior under its digest."""
-        told = (prior.digest(), prior.environment, prior.task, prior.provenance.source)
-        self.storage.put_prior((*told, encode(prior)))
+        told = (prior.environment, prior.task, prior.provenance.source)
+        self.storage.put_prior(prior.digest(), told, encode(prior))
+
+    def prior(self, digest: str) -> Prior | None:
+        """The prior of a digest; None where it is not kept, or not in a form that this version reads."""
+        message = self.storage.prior(digest)
+        if message is not None:
+            with contextlib.suppress(DecodeError):
+                return decode(Prior, message)
+        return None
 
     def rest(self, graphs: Iterable[core.Graph]) -> None:
         """Between deltas: take the snapshots that are due, thin out old history, tidy up."""
@@ -143,7 +153,9 @@ class Database:
         record = self.storage.snapshot(key, revision)
         if record is None:
             raise StoreError(f"{self.storage.location}: its history is being thinned out; ask again")
-        return Past(robot, graph_of(self._read(GraphImage, record)), record.sequence), len(record.payload)
+        with _many_made():
+            graph = graph_of(self._read(GraphImage, record))
+        return Past(robot, graph, record.sequence), len(record.payload)
 
     def _replay(self, past: Past, key: int, revision: int) -> int:
         """Apply the events that follow, up to a revision; what they weigh."""
@@ -164,6 +176,10 @@ class Database:
             raise StoreError(
                 f"{self.storage.location} holds an event that cannot be read ({error}); choose another path."
             ) from error
+
+    def forget(self) -> None:
+        """Let go of the graph that was asked for last, from which later ones are reached faster."""
+        self._past = None
 
     def history(self, robot: str, limit: int = 1000, before: int | None = None) -> list[StoredRevision]:
         """The newest revisions of a robot that are kept, of those below `before`, oldest first."""
@@ -212,3 +228,15 @@ class Database:
             if gone := keeping.thinned(self._cfg, self.storage.marks(standing.key), graph.revision):
                 self.storage.thin(standing.key, gone)
         standing.snapshot, standing.snapshot_bytes, standing.weight = mark, len(payload), 0
+
+
+@contextlib.contextmanager
+def _many_made() -> Iterator[None]:
+    """No search for garbage: among so many new objects that all stay it takes three times as long as making them."""
+    searching = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if searching:
+            gc.enable()

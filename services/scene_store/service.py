@@ -160,7 +160,12 @@ def answer_history(state: State, request: HistoryRequest, cfg: core.Config) -> R
 
 def answer_query(state: State, request: SceneQuery, cfg: core.Config) -> SceneAnswer:
     """Questions about one robot's scene; of one that the store has never heard of, it is empty."""
-    return reply(_index(state.robots.get(request.robot) or _robot(core.Graph(request.robot))), request)
+
+    def older(revision: int) -> Scene | None:
+        found = state.database.at(request.robot, revision)
+        return core.scene(found) if found is not None and found.revision == revision else None
+
+    return reply(_index(state.robots.get(request.robot) or _robot(core.Graph(request.robot))), request, older)
 
 
 def _index(robot: Robot) -> Index:
@@ -190,12 +195,7 @@ SERVICE = Service(
     step=step,
     reads=(PLACE_DELTA, REGION_DELTA, OBJECT_DELTA, TASK, PRIOR),
     writes=(SCENE_REVISION,),
-    answers={
-        SCENE: answer_scene,
-        SCENE_QUERY: answer_query,
-        HISTORY: answer_history,
-        TASK_IN_FORCE: answer_task,
-    },
+    answers={SCENE: answer_scene, SCENE_QUERY: answer_query, HISTORY: answer_history, TASK_IN_FORCE: answer_task},
     asks=(PLACE_SNAPSHOT, REGION_SNAPSHOT, OBJECT_SNAPSHOT),
     tick_s=CHECKPOINT_S,
     close=close,

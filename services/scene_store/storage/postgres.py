@@ -25,7 +25,7 @@ import psycopg  # noqa: E402
 
 SCHEMA = "prior_sg"
 WRITER_LOCK = 0x70736753  # "psgS"; of a database
-ROBOT_APART_M = 1e7  # the robot is a fourth axis of boxes and centres, along which robots stand this far apart
+ROBOT_APART_M = 1e9  # the robot is a fourth axis of boxes and centres, along which robots stand this far apart
 CONNECT_S = 10
 PAGE = 200  # events fetched at a time
 
@@ -161,12 +161,15 @@ class Postgres(Storage):
             ) from error
 
     def nearest(self, robot: int, kind: Indexed, point_m: Point, count: int) -> list[Found]:
-        sql = f"SELECT {_columns(kind)} FROM {kind}s WHERE robot = ? ORDER BY centre <-> cube(?), number LIMIT ?"
-        return _found(kind, self.run(sql, (robot, _corner(point_m, robot), count)))
+        """All other robots stand farther away, so that the index alone says what comes first."""
+        order, point = "ORDER BY centre <-> cube(?), number", _corner(point_m, robot)
+        first = f"SELECT * FROM {kind}s {order} LIMIT ?"
+        sql = f"SELECT {_columns(kind)} FROM ({first}) AS first WHERE robot = ? {order}"
+        return _found(kind, self.run(sql, (point, count, robot, point)))
 
     def overlapping(self, robot: int, kind: Indexed, min_m: Point, max_m: Point) -> list[Found]:
-        sql = f"SELECT {_columns(kind)} FROM {kind}s WHERE robot = ? AND box && cube(?, ?) ORDER BY number"
-        return _found(kind, self.run(sql, (robot, _corner(min_m, robot), _corner(max_m, robot))))
+        sql = f"SELECT {_columns(kind)} FROM {kind}s WHERE box && cube(?, ?) ORDER BY number"
+        return _found(kind, self.run(sql, (_corner(min_m, robot), _corner(max_m, robot))))
 
     def labelled(self, robot: int, kind: Indexed, text: str) -> list[Found]:
         query = " & ".join(f"'{word}':*" for word in words_of(text).split())

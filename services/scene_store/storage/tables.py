@@ -17,6 +17,7 @@ from prior_sg.services.scene_store.core.keeping import Mark, Thinned
 
 LAYOUT_VERSION = 6
 LAST = 2**62  # beyond every revision
+LONGEST_WORD, MOST_WORDS = 64, 64  # letters of a word, words of a label
 Point = tuple[float, float, float]
 Indexed = Literal["place", "object", "region"]
 
@@ -59,8 +60,13 @@ class Found(NamedTuple):
 
 
 def words_of(text: str) -> str:
-    """The words of a label as they are indexed: lower case, one space between."""
-    return " ".join(re.findall(r"[^\W_]+", text.lower()))
+    """The words of a label as they are indexed: lower case, one space between, of absurd ones the beginning."""
+    return " ".join(word[:LONGEST_WORD] for word in re.findall(r"[^\W_]+", text.lower())[:MOST_WORDS])
+
+
+def without_nul(text: str) -> str:
+    """A text as any database holds it: PostgreSQL knows no NUL."""
+    return text.replace("\0", " ")
 
 
 class Storage(ABC):
@@ -190,10 +196,16 @@ class Storage(ABC):
         """The numbers that the index holds."""
         return {number for (number,) in self.run(f"SELECT number FROM {kind}s WHERE robot = ?", (robot,))}
 
-    def put_prior(self, row: tuple[str, str, str, str, bytes]) -> None:
-        """Keep a prior (digest, environment, task, source, message)."""
+    def put_prior(self, digest: str, told: Sequence[str], message: bytes) -> None:
+        """Keep a prior; `told` are its environment, task and source."""
+        row = (digest, *map(without_nul, told), message)
         with self.transaction():
             self.run("INSERT INTO priors VALUES (?, ?, ?, ?, ?) ON CONFLICT DO NOTHING", row)
+
+    def prior(self, digest: str) -> bytes | None:
+        """The message of a prior."""
+        rows = self.run("SELECT message FROM priors WHERE digest = ?", (digest,))
+        return bytes(rows[0][0]) if rows else None
 
 
 def _marks(columns: Sequence[str]) -> str:

@@ -10,7 +10,7 @@ from prior_sg.schemas.regions import Region
 from prior_sg.services.scene_store.core import events
 from prior_sg.services.scene_store.core import graph as core
 from prior_sg.services.scene_store.core.image import image_of
-from prior_sg.services.scene_store.storage.tables import Indexed, Record, Storage, words_of
+from prior_sg.services.scene_store.storage.tables import Indexed, Record, Storage, without_nul, words_of
 
 COMPRESSION = 1  # of zstandard: the fastest already halves an event
 SNAPSHOT = "snapshot"
@@ -66,7 +66,7 @@ def _row(entry: core.Place | Region | SceneObject) -> tuple[Any, ...]:
     """The columns of one entry, as in INDEX."""
     if isinstance(entry, core.Place):
         return (*entry.position_m, entry.radius_m)
-    named = (entry.label, words_of(entry.label), *entry.position_m)
+    named = (without_nul(entry.label), words_of(entry.label), *entry.position_m)
     if isinstance(entry, SceneObject):
         return (*named, *entry.min_m, *entry.max_m)
     return (*named, entry.place_count, entry.area_m2, entry.probability)

@@ -278,6 +278,14 @@ def test_the_index_answers_as_a_search_through_everything(place):
     store.runner.close()
 
 
+def test_absurd_labels_end_no_store(place):
+    store = Store(place)
+    labels = ["a\0b", "w" * 5000 + " x", " ".join(f"w{i}" for i in range(3000)), "", "_", "😀'\"\\;--"]
+    store.feed(region_delta(0, regions=[(i, label, 1) for i, label in enumerate(labels)]))
+    assert [region.label for region in store.reopened().scene().regions] == labels
+    assert [one.id for one in store.reopened().state.database.labelled(ROBOT, "region", "w" * 70)] == [1]
+
+
 def test_a_password_stays_out_of_settings_and_messages():
     for url in ("postgresql://me:secret@host/db", "postgres://host/db?user=me&password=secret"):
         with pytest.raises(ConfigError, match="PGPASSWORD") as caught:

@@ -24,7 +24,7 @@ class Ways:
 
     graph: csr_array  # (place, place) lengths in metres
     component: np.ndarray  # (place,)
-    usable: np.ndarray  # (place,) bool: has the room, and a way on
+    roomy: np.ndarray  # (place,) bool: has the clearance itself
 
 
 class Index:
@@ -202,10 +202,7 @@ class Index:
         a, b = rows[wide].T
         both = (np.concatenate((a, b)), np.concatenate((b, a)))
         graph = csr_array((np.tile(np.maximum(lengths_m[wide], 1e-9), 2), both), shape=(count, count))
-        usable = self.scene.radii_m >= clearance_m
-        if clearance_m > 0:
-            usable &= np.bincount(both[0], minlength=count) > 0
-        return Ways(graph, connected_components(graph, directed=False)[1], usable)
+        return Ways(graph, connected_components(graph, directed=False)[1], self.scene.radii_m >= clearance_m)
 
 
 def _rows_by_label(labels: list[str]) -> dict[str, np.ndarray]:

@@ -1,7 +1,10 @@
 """What answers a text: regions, places and objects on one scale (pure).
 
-The score is a probability. A thing that carries a label for sure answers the text as probably as its label does; of one
-whose label is uncertain it is the mean over what it may be.
+A thing that carries a label for sure answers the text as probably as its label does; of one whose label is uncertain it
+is the mean over what it may be. Beliefs and likenesses are too cautious to be multiplied as they are, so the product is
+read through a monotone curve, which makes it the share of things that were right where it was fitted: every thing
+listed for the questions with odd numbers in deploy/evaluation/search_questions.py. At 0.5 a thing is as likely right as
+not.
 """
 
 import heapq
@@ -19,14 +22,15 @@ from prior_sg.services.scene_store.core.queries.things import thing
 LETTERS = re.compile(r"\w+")
 STOP_WORDS = {"a", "an", "and", "are", "at", "be", "can", "for", "i", "in", "is", "it", "my", "of", "on", "or", "some"}
 STOP_WORDS |= {"somewhere", "the", "there", "to", "we", "where", "with"}
-SAME_WORD = 0.9  # score of a label whose words are all in the text
+SAME_WORD = 0.9  # likeness of a label whose words are all in the text
 NOTE = "labels were compared with the text word by word, for no embedding of the text was given"
 ORDER: tuple[What, ...] = ("region", "place", "object")  # of equal scores
+SLOPE, MIDDLE = 2.5, 0.3  # log odds of a score grow so fast with the logarithm of the product, from 0 at the middle
 HELD = 0.8  # of an object's score for the region that holds it
 
 
 class Scored(NamedTuple):
-    """A row with its score."""
+    """A row with its product of belief and likeness."""
 
     what: What
     row: int
@@ -43,8 +47,13 @@ def ranking(index: Index, question: AnswersTo) -> Ranking:
     found = [one for one in _scored(index, regions, objects) if question.what in (None, one.what) and one.score > 0]
     best = heapq.nsmallest(question.limit, found, key=lambda one: (-one.score, ORDER.index(one.what), one.row))
     reason = "" if best else f"nothing in the scene answers {question.text!r}"
-    listed = [thing(index, one.what, one.row, score=one.score) for one in best]
+    listed = [thing(index, one.what, one.row, score=calibrated(one.score)) for one in best]
     return Ranking(things=listed, note=note, reason=reason)
+
+
+def calibrated(product: float) -> float:
+    """Probability that a thing is right, of a product above 0."""
+    return 1.0 / (1.0 + (MIDDLE / product) ** SLOPE)
 
 
 def _scored(index: Index, regions: dict[str, float], objects: dict[str, float]) -> Iterator[Scored]:

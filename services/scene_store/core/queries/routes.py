@@ -13,7 +13,7 @@ from prior_sg.services.scene_store.core.queries.labels import REGIONS_AND_OBJECT
 from prior_sg.services.scene_store.core.queries.spatial import distances_of
 from prior_sg.services.scene_store.core.queries.things import thing
 
-REACH_M = 1.0  # beyond the nearest place, other places may stand for a point or an object where the nearest has no way
+REACH_M = 1.0  # so much farther than the nearest place, others may stand for an object where the nearest has no way
 FIRST_LIMIT, WIDER = 1.5, 3.0  # a search goes as far as so many straight distances, then farther by so much
 
 
@@ -98,7 +98,7 @@ def _ends(index: Index, spot: Spot, ways: Ways, side: str, clearance_m: float) -
     """Places that stand for an end, the nearest to it first. Raises NoSuchSpot."""
     if spot.point_m is not None:
         reach_m = distances_of(index, "place", spot.point_m)
-        found = _around(reach_m, np.arange(len(reach_m)), ways, None)
+        found = _around(reach_m, np.arange(len(reach_m)), ways, None, index.scene.radii_m)
     else:
         found = [end for what, row in _meant(index, spot, side) for end in _of_thing(index, what, row, ways)]
     if not found:
@@ -129,30 +129,30 @@ def _of_thing(index: Index, what: What, row: int, ways: Ways) -> list[End]:
     """Places that stand for one thing: in each connected part of the map the nearest."""
     shown = thing(index, what, row)
     if what == "place":
-        return [End(row, 0.0, shown)] if ways.usable[row] else []
+        return [End(row, 0.0, shown)] if ways.roomy[row] else []
     if what == "region":
         rows = index.members(row)
-        return _around(np.linalg.norm(index.points_m[rows] - shown.position_m, axis=1), rows, ways, shown, np.inf)
+        gaps_m = np.linalg.norm(index.points_m[rows] - shown.position_m, axis=1)
+        return _around(gaps_m, rows, ways, shown, np.full(len(rows), np.inf))
     low_m, high_m = (side[row] for side in index.boxes_m)
     holder = int(index.object_regions[row])
     rows = index.members(holder) if holder >= 0 else np.zeros(0, np.int64)
-    if not ways.usable[rows].any():
+    if not ways.roomy[rows].any():
         rows = np.arange(len(index.points_m))
     points_m = index.points_m[rows]
     gaps_m = np.linalg.norm(np.maximum(np.maximum(low_m - points_m, points_m - high_m), 0.0), axis=1)
-    return _around(gaps_m, rows, ways, shown)
+    reach_m = gaps_m[ways.roomy[rows]].min(initial=np.inf) + REACH_M
+    return _around(gaps_m, rows, ways, shown, np.full(len(rows), reach_m))
 
 
-def _around(
-    gaps_m: np.ndarray, rows: np.ndarray, ways: Ways, shown: Thing | None, reach_m: float = REACH_M
-) -> list[End]:
-    """In each connected part of the map the row with the least gap, unless it is much farther than the nearest of all:
-    a scrap of free space under a table may be nearest and lead nowhere."""
-    usable = ways.usable[rows]
-    rows, gaps_m = rows[usable], gaps_m[usable]
+def _around(gaps_m: np.ndarray, rows: np.ndarray, ways: Ways, shown: Thing | None, reach_m: np.ndarray) -> list[End]:
+    """In each connected part of the map the row with the least gap: a scrap of free space under a table may be nearest
+    and lead nowhere. Beside the nearest of all, only rows (row,) count whose gap is within their reach (row,)."""
+    roomy = ways.roomy[rows]
+    rows, gaps_m, reach_m = rows[roomy], gaps_m[roomy], reach_m[roomy]
     if not len(rows):
         return []
-    near = np.flatnonzero(gaps_m <= gaps_m.min() + reach_m)
+    near = np.flatnonzero((gaps_m <= gaps_m.min()) | (gaps_m <= reach_m))
     order = near[np.argsort(gaps_m[near], kind="stable")]
     _, first = np.unique(ways.component[rows[order]], return_index=True)
     return [End(int(rows[one]), float(gaps_m[one]), shown) for one in order[first]]
