@@ -11,6 +11,7 @@ from prior_sg.services.scene_store.core.queries.index import Index
 
 MOST_ANSWERS = 8
 NOTHING_KNOWN = Likeness({}, {})
+LIKELY = 0.5  # a score from which an answer is rather right than wrong
 AS_GOOD = 0.6  # of the best answer's score: what answers so well is lit, too
 
 
@@ -43,7 +44,8 @@ def found_in(ranking: Ranking, scene: Scene, text: str) -> Found:
         regions=frozenset(thing.id for thing in bright if thing.what == "region"),
         objects=frozenset(thing.id for thing in bright if thing.what == "object"),
     )
-    return Found([(thing.what, thing.label, thing.score) for thing in things[:MOST_ANSWERS]], lit, ranking.note)
+    said = ranking.note or ("" if best >= LIKELY else "nothing answers this for sure; these come nearest")
+    return Found([(thing.what, thing.label, thing.score) for thing in things[:MOST_ANSWERS]], lit, said)
 
 
 def begun(scene: Scene, text: str) -> Found:

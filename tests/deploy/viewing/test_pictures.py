@@ -10,6 +10,7 @@ from prior_sg.deploy.viewing.footprint import Footprint, footprints
 from prior_sg.deploy.viewing.picking import pick, typical_place
 from prior_sg.deploy.viewing.search import find
 from prior_sg.deploy.viewing.shapes import Mesh, difference
+from prior_sg.deploy.viewing.sources import Likeness
 from prior_sg.deploy.viewing.words import headline
 from tests.help.homes import home, keyframe, region
 
@@ -126,6 +127,15 @@ def test_answers_are_lit_and_the_rest_is_dimmed() -> None:
     assert find(scene, "bedr").lit == Lit(regions=frozenset({7}))
     assert find(scene, "").lit == Lit()
     assert "nothing" in find(scene, "submarine").said
+
+
+def test_what_a_text_means_comes_before_its_words_and_doubts_are_said() -> None:
+    scene = home()
+    meant = find(scene, "somewhere to sleep", Likeness({"bedroom": 0.9, "kitchen": 0.05}, {"bed": 0.8}))
+    assert meant.rows[0][:2] == ("region", "bedroom") and meant.lit.regions == {7} and meant.said == ""
+    doubted = find(scene, "somewhere to sleep", Likeness({"bedroom": 0.3, "kitchen": 0.2}, {}))
+    assert "for sure" in doubted.said
+    assert "no worker" in find(scene, "stove", Likeness({}, {}, "no worker embeds it")).said
 
 
 @pytest.mark.parametrize(
