@@ -9,7 +9,7 @@ from prior_sg.schemas.scene import Scene
 from prior_sg.services.scene_store.core.queries.answering import answer
 from prior_sg.services.scene_store.core.queries.index import Index
 
-MOST_ANSWERS = 8
+MOST_ANSWERS = 5
 NOTHING_KNOWN = Likeness({}, {})
 LIKELY = 0.5  # a score from which an answer is rather right than wrong
 AS_GOOD = 0.6  # of the best answer's score: what answers so well is lit, too
