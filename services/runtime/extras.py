@@ -22,7 +22,7 @@ MODULES = {  # by extra; what the build file lists there, by the names that code
     "dsg": ("spark_dsg",),
     "graph": ("networkx",),
     "fast-cut": ("maxflow",),
-    "postgres": ("psycopg", "pgvector"),
+    "postgres": ("psycopg",),
     "api": ("litestar", "uvicorn"),
     "mcp": ("mcp",),
     "view": ("viser",),
