@@ -48,7 +48,7 @@ INSTALL := $(BIN)/pip install --quiet --disable-pip-version-check -c constraints
 FORGET_LOOPS := find schemas services deploy -name '*.nb[ci]' -delete
 
 $(VENV)/installed: pyproject.toml constraints.txt | $(BIN)/pip
-	$(INSTALL) -e '.[encode,dsg,fast-cut]'
+	$(INSTALL) -e '.[encode,dsg,fast-cut,view]'
 	$(FORGET_LOOPS)
 	touch $@
 

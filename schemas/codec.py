@@ -139,7 +139,7 @@ def _holds_reals(hint: Any) -> bool:
 def _numbers(kind: type[msgspec.Struct]) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Names of the fields that hold a whole number, and of those that hold real ones."""
     hints = get_type_hints(kind)
-    whole = tuple(name for name, hint in hints.items() if hint is int)
+    whole = tuple(name for name, hint in hints.items() if hint is int or int in get_args(hint))
     return whole, tuple(name for name, hint in hints.items() if _holds_reals(hint))
 
 

@@ -5,10 +5,11 @@ from typing import Annotated
 import msgspec
 import numpy as np
 
-from prior_sg.schemas.codec import Message, Shape
+from prior_sg.schemas.codec import Message, Part, Shape
 from prior_sg.schemas.objects import SceneObject
 from prior_sg.schemas.regions import Region
 
+MOST_REVISIONS = 10_000  # in one answer
 _NO_IDS = msgspec.field(default_factory=lambda: np.zeros(0, np.int64))
 _NO_LENGTHS = msgspec.field(default_factory=lambda: np.zeros(0, np.float32))
 _NO_CORNERS = msgspec.field(default_factory=lambda: np.zeros((0, 2), np.float32))
@@ -28,13 +29,48 @@ class SceneRevision(Message, frozen=True, kw_only=True):
 
 
 class SceneRequest(Message, frozen=True, kw_only=True):
-    """The scene graph of one robot as stored."""
+    """The scene graph of one robot as stored: now, or as it was at the newest revision that is kept and not beyond the
+    given one, nor later than the given time."""
 
     robot: str
+    revision: int | None = None
+    stamp_ns: int | None = None
+
+
+class HistoryRequest(Message, frozen=True, kw_only=True):
+    """Which revisions of one robot's scene are kept: the newest `limit`, of those below `before` where it is given."""
+
+    robot: str
+    limit: int = 1000
+    before: int | None = None
+
+    def check(self) -> None:
+        if not 0 < self.limit <= MOST_REVISIONS:
+            raise ValueError(f"limit: not between 1 and {MOST_REVISIONS}")
+
+
+class StoredRevision(Part, frozen=True, kw_only=True):
+    """One revision that can be asked for, and what it held."""
+
+    revision: int
+    session: int  # the life of the store that wrote it
+    kind: str  # the delta that made it: place, region or object; snapshot where older history has been thinned out
+    stamp_ns: int  # of the newest delta in it
+    places: int
+    edges: int
+    regions: int
+    objects: int
+
+
+class RevisionList(Message, frozen=True, kw_only=True):
+    """Revisions of one robot's scene, oldest first."""
+
+    robot: str
+    revisions: list[StoredRevision]
 
 
 class Scene(Message, frozen=True, kw_only=True):
-    """Everything the store holds about one robot; sorted by id, so equal scenes have equal bytes."""
+    """Everything the store holds about one robot; sorted by id, so equal scenes of one revision have equal bytes."""
 
     robot: str
     stamp_ns: int
@@ -65,3 +101,4 @@ class Scene(Message, frozen=True, kw_only=True):
     hull_counts: Annotated[np.ndarray, Shape("int64", "surface")] = _NO_IDS
     hulls_m: Annotated[np.ndarray, Shape("float32", "hull", 2)] = _NO_CORNERS
     origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of the world, as in Keyframe; add it to any position
+    revision: int = -1  # of the store, as in SceneRevision; -1 = nothing stored

@@ -29,8 +29,9 @@ from prior_sg.schemas.priors import (
     TaskInForce,
     TaskRequest,
 )
+from prior_sg.schemas.queries import SceneAnswer, SceneQuery
 from prior_sg.schemas.regions import PosteriorReply, PosteriorRequest, RegionDelta
-from prior_sg.schemas.scene import Scene, SceneRequest, SceneRevision
+from prior_sg.schemas.scene import HistoryRequest, RevisionList, Scene, SceneRequest, SceneRevision
 from prior_sg.schemas.status import Consumed, ServiceStatus, StatusRequest
 
 prepare()  # every process imports this table before it opens a bus, whose threads then find all decoders built
@@ -140,6 +141,8 @@ OBJECT_SNAPSHOT = Query("OBJECT_SNAPSHOT", SnapshotRequest, ObjectDelta, f"{ROOT
 POSTERIOR = Query("POSTERIOR", PosteriorRequest, PosteriorReply, f"{ROOT}/{{robot}}/ask/posterior")
 TASK_IN_FORCE = Query("TASK_IN_FORCE", TaskRequest, TaskInForce, f"{ROOT}/{{robot}}/ask/task")
 SCENE = Query("SCENE", SceneRequest, Scene, f"{ROOT}/{{robot}}/ask/scene")
+HISTORY = Query("HISTORY", HistoryRequest, RevisionList, f"{ROOT}/{{robot}}/ask/history")
+SCENE_QUERY = Query("SCENE_QUERY", SceneQuery, SceneAnswer, f"{ROOT}/{{robot}}/ask/query")
 TEXT = Query("TEXT", TextRequest, TextEmbeddings, f"{ROOT}/encoder/{{space}}/text")
 PRIORS = Query("PRIORS", PriorRequest, PriorList, f"{ROOT}/fleet/ask/prior")
 
@@ -152,6 +155,8 @@ QUERIES = (
     POSTERIOR,
     TASK_IN_FORCE,
     SCENE,
+    HISTORY,
+    SCENE_QUERY,
     TEXT,
     PRIORS,
 )

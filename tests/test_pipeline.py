@@ -311,7 +311,7 @@ def test_replay_and_export_on_the_command_line(disturbed, capsys, tmp_path):
     assert main(["replay", str(out / "log.mcap"), "segmenter", "--diff"]) == 0
     assert "0 differences" in capsys.readouterr().out
     again = tmp_path / "again.json"
-    assert main(["export", "--database", str(out / "scene.sqlite"), "--format", "json", "--out", str(again)]) == 0
+    assert main(["export", str(out / "scene.sqlite"), "--format", "json", "--out", str(again)]) == 0
     written = json.loads((out / "scene.json").read_text())
     assert json.loads(again.read_text()) | {"losses": written["losses"]} == written  # which the store does not keep
 
@@ -324,7 +324,7 @@ def test_replay_and_export_on_the_command_line(disturbed, capsys, tmp_path):
         (["replay", "x.mcap", "nobody"], "there is no service 'nobody'"),
         (["up", "nobody"], "there is no service 'nobody'"),
         (["health", "--connect", "tcp/127.0.0.1:1"], "no router answers on tcp/127.0.0.1:1"),
-        (["export", "--out", "x", "--database", "/nowhere.sqlite"], "nowhere.sqlite does not exist"),
+        (["export", "/nowhere.sqlite", "--out", "x.json"], "nowhere.sqlite does not exist"),
     ],
 )
 def test_errors_are_one_sentence(arguments, sentence, capsys):

@@ -11,25 +11,33 @@ from typing import Any, Self
 
 import numpy as np
 
+from prior_sg.deploy.api.asking import Asking
 from prior_sg.deploy.api.errors import NotInSceneError, PosesError, TaskError
+from prior_sg.deploy.api.kept import kept
 from prior_sg.deploy.api.scene import Scene
 from prior_sg.deploy.settings import DEFAULT_CONNECT, DEFAULT_ROBOT
 from prior_sg.schemas.codec import DecodeError, Message, decode
+from prior_sg.schemas.features import TextEmbeddings, TextRequest
 from prior_sg.schemas.frames import PoseUpdate
-from prior_sg.schemas.priors import Prior, Task
+from prior_sg.schemas.priors import Prior, PriorList, PriorRequest, Task
+from prior_sg.schemas.queries import Answer, ChangedSince, Difference, Question, SceneAnswer, SceneQuery
 from prior_sg.schemas.regions import PosteriorReply, PosteriorRequest, RegionDelta
+from prior_sg.schemas.scene import HistoryRequest, RevisionList, SceneRequest, StoredRevision
 from prior_sg.schemas.scene import Scene as SceneMessage
-from prior_sg.schemas.scene import SceneRequest
 from prior_sg.schemas.status import Consumed, ServiceStatus
 from prior_sg.schemas.topics import (
+    HISTORY,
     JOURNAL,
     OBJECT_DELTA,
     PLACE_DELTA,
     POSE_UPDATE,
     POSTERIOR,
+    PRIORS,
     REGION_DELTA,
     SCENE,
+    SCENE_QUERY,
     SCENE_REVISION,
+    TEXT,
 )
 from prior_sg.services.runtime.bus import Bus, BusError, Sample
 from prior_sg.services.runtime.client import BusClient
@@ -76,7 +84,7 @@ class Changes:
         self._arrived.put(None)
 
 
-class Client:
+class Client(Asking):
     """One robot of a running system. Use as a context manager, or call `close`. Raises BusError when no router answers.
 
     `bus` takes the place of a connection of its own, for tests and for programs that hold one.
@@ -86,6 +94,7 @@ class Client:
         self.robot = robot
         self._client = BusClient(ZenohBus(connect, ROUTER_WAIT_S) if bus is None else bus)
         self._lock = threading.Lock()
+        self._priors: dict[str, Prior] = {}  # by digest
         self._followers: dict[str, weakref.WeakSet[Changes]] = {}  # by topic
 
     def __enter__(self) -> Self:
@@ -101,10 +110,48 @@ class Client:
             for follower in {one for followers in self._followers.values() for one in followers}:
                 follower.close()
 
-    def scene(self) -> Scene:
-        """The scene graph as stored now. Raises BusError."""
-        message: SceneMessage = self._client.ask(SCENE, SceneRequest(robot=self.robot))
-        return Scene(message)
+    def scene(self, *, revision: int | None = None, stamp_ns: int | None = None) -> Scene:
+        """The scene graph as stored now, as it was at a revision, or as it was last at a time. Raises BusError,
+        NotInSceneError.
+        """
+        request = SceneRequest(robot=self.robot, revision=revision, stamp_ns=stamp_ns)
+        message: SceneMessage = self._client.ask(SCENE, request)
+        return kept(Scene(message), revision, stamp_ns)
+
+    def history(self, limit: int = 1000, before: int | None = None) -> list[StoredRevision]:
+        """The newest revisions that the store keeps, of those below `before`, oldest first; at most 10 000 at once.
+        Raises BusError.
+        """
+        request = HistoryRequest(robot=self.robot, limit=limit, before=before)
+        reply: RevisionList = self._client.ask(HISTORY, request)
+        return reply.revisions
+
+    def ask(self, *questions: Question) -> list[Answer]:
+        """Answers to questions of `prior_sg.schemas.queries`, in their order, over one revision. Raises BusError."""
+        return self.answers(*questions).answers
+
+    def answers(self, *questions: Question) -> SceneAnswer:
+        """The same with the revision that they are about. Raises BusError."""
+        found: SceneAnswer = self._client.ask(SCENE_QUERY, SceneQuery(robot=self.robot, questions=list(questions)))
+        return found
+
+    def changed_since(self, revision: int) -> Difference:
+        """What is new, gone and renamed since a revision. Raises NotInSceneError where it is not kept, BusError."""
+        difference: Difference = self._understood(ChangedSince(revision=revision))
+        return difference
+
+    def prior_of(self, digest: str) -> Prior | None:
+        """The prior of a digest, where a gateway knows it. Raises BusError."""
+        if digest not in self._priors:
+            known: PriorList = self._client.ask(PRIORS, PriorRequest(digest=digest))
+            self._priors |= {prior.digest(): prior for prior in known.priors}
+        return self._priors.get(digest)
+
+    def embed(self, space: str, phrases: Sequence[str]) -> np.ndarray[Any, Any]:
+        """Unit vectors (phrase, dim) by a worker of the space. Raises BusError."""
+        request = TextRequest(space=space, concepts=[[phrase] for phrase in phrases])
+        reply: TextEmbeddings = self._client.ask(TEXT, request)
+        return reply.embeddings
 
     def explain(self, place: int) -> PosteriorReply:
         """Why a place carries its label. Raises NotInSceneError, BusError."""

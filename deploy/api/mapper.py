@@ -48,7 +48,10 @@ from prior_sg.services.runtime.service import Identity, Service, ServiceError
 SUFFIXES = (".json", ".sqlite")
 NEWS = (PLACE_DELTA, REGION_DELTA, OBJECT_DELTA)
 MOST_TICKS = 1000  # until the map rests; it takes a few
-IN_MEMORY: dict[str, dict[str, Any]] = {"scene_store": {"path": ":memory:"}, "prior_gateway": {"archive": ""}}
+IN_MEMORY: dict[str, dict[str, Any]] = {
+    "scene_store": {"path": ":memory:", "history": "last", "history_last": 0},
+    "prior_gateway": {"archive": ""},
+}
 
 Event = RawFrame | BadFrame | Correction
 Progress = Callable[[int, int], None]  # frames read, frames in all (0 = unknown)
@@ -161,7 +164,7 @@ class Mapper:
     def scene(self) -> Scene:
         """The scene graph of all frames so far, once nothing is pending."""
         self._settle()
-        return Scene(self._pipeline.of("scene_store").answer(SCENE, SceneRequest(robot=self.robot)))
+        return Scene(self._pipeline.of("scene_store").answer(SCENE, SceneRequest(robot=self.robot)), self._prior)
 
     @property
     def prior(self) -> Prior:

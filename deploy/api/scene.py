@@ -2,7 +2,7 @@
 
 import importlib
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
@@ -11,8 +11,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from prior_sg.deploy.api.asking import Asking
 from prior_sg.deploy.api.errors import NotInSceneError, PackageMissingError, SaveError
 from prior_sg.deploy.json_text import json_text
+from prior_sg.deploy.settings import DEFAULT_ROBOT
+from prior_sg.schemas.priors import Prior
+from prior_sg.schemas.queries import Answer, Difference, Question
 from prior_sg.schemas.regions import NO_REGION, Region
 from prior_sg.schemas.scene import Scene as SceneMessage
 
@@ -83,11 +87,13 @@ class Objects:
         return len(self.ids)
 
 
-class Scene:
-    """One robot's scene graph at one moment. `message` is what the store sent; everything else follows from it."""
+class Scene(Asking):
+    """One robot's scene graph at one moment. `message` is what the store sent; everything else follows from it, and
+    from `prior`, the one its regions follow, where it is at hand: `find` knows by it what labels mean.
+    """
 
-    def __init__(self, message: SceneMessage) -> None:
-        self.message = message
+    def __init__(self, message: SceneMessage, prior: Prior | None = None) -> None:
+        self.message, self.prior = message, prior
 
     def __repr__(self) -> str:
         counts = Counter(region.label for region in self.message.regions)
@@ -97,6 +103,21 @@ class Scene:
             f"<Scene of {self.robot}, {task}: {len(self.places)} places, {len(self.edges)} edges, "
             f"{len(self.regions)} regions ({regions or 'none'}), {len(self.objects)} objects>"
         )
+
+    @classmethod
+    def read(cls, path: str | Path, robot: str = DEFAULT_ROBOT) -> "Scene":
+        """The scene in a run's folder, scene.json, scene.sqlite, log.mcap or a file of Spark-DSG. Raises Error."""
+        from prior_sg.deploy.showing.reading import read_material
+
+        found = read_material(path, robot)
+        return cls(found.scene, found.prior)
+
+    def save(self, path: str | Path, format: str = "") -> None:
+        """Write it in a format of docs/exports.md, which the path's ending names unless `format` does. Raises Error."""
+        from prior_sg.deploy.showing import formats
+        from prior_sg.deploy.showing.material import Material
+
+        formats.save(Material(self.message), Path(path), format)
 
     @property
     def robot(self) -> str:
@@ -117,6 +138,11 @@ class Scene:
     def stamp_ns(self) -> int:
         """Time of the newest frame it rests on."""
         return self.message.stamp_ns
+
+    @property
+    def revision(self) -> int:
+        """Which one of the store it is; -1 where nothing is stored."""
+        return self.message.revision
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -191,6 +217,34 @@ class Scene:
             raise NotInSceneError(f"the scene has no region {label_or_id!r}; it has: {there}")
         return max(found, key=lambda region: region.area_m2)
 
+    def ask(self, *questions: Question) -> list[Answer]:
+        """Answers to questions of `prior_sg.schemas.queries`, in their order."""
+        from prior_sg.services.scene_store.core.queries.answering import answer
+
+        return [answer(self._index, question) for question in questions]
+
+    def difference(self, older: "Scene") -> Difference:
+        """What is new, gone and renamed since another scene of the same robot."""
+        from prior_sg.services.scene_store.core.queries.changes import difference
+
+        return difference(older._index, self._index)
+
+    def prior_of(self, digest: str) -> Prior | None:
+        """The prior of a digest, where it is at hand."""
+        return self.prior if self.prior is not None and self.prior.digest() == digest else None
+
+    def embed(self, space: str, phrases: Sequence[str]) -> np.ndarray[Any, Any]:
+        """Unit vectors (phrase, dim) by the text side of the space, which is loaded here. Raises PriorSgError."""
+        from prior_sg.deploy.api.embedding import embed_here
+
+        return embed_here(space, phrases)
+
+    @cached_property
+    def _index(self) -> Any:
+        from prior_sg.services.scene_store.core.queries.index import Index
+
+        return Index(self.message)
+
     def to_dict(self) -> dict[str, Any]:
         """Everything as dictionaries, lists, numbers and text, in the layout of scene.json."""
         from prior_sg.deploy.showing.export import scene_json
@@ -206,6 +260,14 @@ class Scene:
             except OSError as error:
                 raise SaveError(f"cannot write {path} ({error.strerror}); choose another file") from error
         return text
+
+    def to_text(self, budget_tokens: int = 2000) -> str:
+        """In few words, for language models: the most useful first, what is left out said, and never more than so many
+        tokens, counted cautiously without a tokenizer. Raises ValueError below 200 and above 100 000.
+        """
+        from prior_sg.deploy.showing.text import scene_text
+
+        return scene_text(self.message, budget_tokens)
 
     def to_networkx(self) -> Any:
         """An undirected networkx.Graph. Nodes are ("place", id), ("region", id) and ("object", id), their columns are
@@ -234,7 +296,7 @@ class Scene:
         """
         frame = _package("pandas", "Scene.to_pandas").DataFrame
         tables = {
-            name: frame.from_records([_flat(row) for row in _rows(table)], columns=list(_columns(table))).set_index(
+            name: frame.from_records([flat_row(row) for row in _rows(table)], columns=list(_columns(table))).set_index(
                 "id"
             )
             for name, table in (("places", self.places), ("regions", self.regions), ("objects", self.objects))
@@ -270,7 +332,12 @@ def _columns(table: Places | Regions | Objects) -> Iterator[str]:
             yield from _flat_names(SINGULAR.get(field.name, field.name), getattr(table, field.name).ndim == 2)
 
 
-def _flat(row: dict[str, Any]) -> dict[str, Any]:
+def flat_rows(table: Places | Regions | Objects) -> tuple[list[str], Iterator[list[Any]]]:
+    """Names of a table's columns and its rows, points as three columns each; without posteriors."""
+    return list(_columns(table)), (list(flat_row(row).values()) for row in _rows(table))
+
+
+def flat_row(row: dict[str, Any]) -> dict[str, Any]:
     """Points as three numbers."""
     flat: dict[str, Any] = {}
     for name, value in row.items():

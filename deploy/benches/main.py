@@ -10,10 +10,13 @@ from typing import Any
 from prior_sg.deploy.benches import features as bench_features
 from prior_sg.deploy.benches import segmenter
 from prior_sg.deploy.benches.bus import bus_bench
+from prior_sg.deploy.benches.crashes import crashes
 from prior_sg.deploy.benches.encoder_swap import encoder_swap
 from prior_sg.deploy.benches.kernel import kernel
 from prior_sg.deploy.benches.learning import learning_bench
 from prior_sg.deploy.benches.places import place_bench
+from prior_sg.deploy.benches.queries import query_bench
+from prior_sg.deploy.benches.store import store_bench
 from prior_sg.deploy.benches.swap import swap_bench
 from prior_sg.deploy.sample import SAMPLE
 from prior_sg.deploy.settings import DEMO_ENVIRONMENT, DEMO_TASK
@@ -70,6 +73,13 @@ def bus() -> tuple[dict, dict]:
     return bus_bench(_sample_keyframes()[0])
 
 
+def view() -> tuple[dict, dict]:
+    """The live page; see `prior_sg.deploy.benches.view`."""
+    from prior_sg.deploy.benches.view import view_bench  # needs the extra `view`
+
+    return view_bench()
+
+
 def e2e() -> tuple[dict, dict]:
     """Keyframe in hand → region delta that follows from it, encoder time excluded, without transport."""
     keyframes = _sample_keyframes()
@@ -104,14 +114,18 @@ BENCHES: dict[str, Callable[[], tuple[dict, dict]]] = {
     "task": segmenter.switch,
     "learning": learning_bench,
     "encoder_swap": exchanged_encoder,
+    "queries": query_bench,
     "e2e": e2e,
+    "store": store_bench,
 }
-
-
-POOL = "pool"  # lasts as long as it is told to, so it is no part of `all`
+LONG: dict[str, Callable[[float], tuple[dict, dict]]] = {  # no part of `all`; the pool lasts as long as it is told to
+    "pool": attacked_pool,
+    "store_crashes": lambda seconds: crashes(),
+    "view": lambda seconds: view(),  # needs an extra and a browser
+}
 
 
 def run(name: str, seconds: float) -> dict[str, Any]:
     """One measurement as the object that `--json` prints; `seconds` are those of the attacked pool."""
-    metrics, settings = attacked_pool(seconds) if name == POOL else BENCHES[name]()
+    metrics, settings = LONG[name](seconds) if name in LONG else BENCHES[name]()
     return {"bench": name, "metrics": metrics, "machine": machine(), "settings": settings}

@@ -1,6 +1,7 @@
 """What a run leaves for people: tables on the terminal, files in the output folder."""
 
 import math
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -8,31 +9,22 @@ from typing import Any
 import msgspec
 from rich.table import Table
 
-from prior_sg.deploy.errors import UserError
 from prior_sg.deploy.evaluation.metrics import evaluate
 from prior_sg.deploy.evaluation.object_metrics import NO_DETECTOR, OBJECT_SHARES, object_scores
 from prior_sg.deploy.inspecting.replay import Log, message_differences, undisturbed
 from prior_sg.deploy.json_text import json_text
 from prior_sg.deploy.running.job import Result
-from prior_sg.deploy.showing.export import map_png, places_png, scene_json
+from prior_sg.deploy.showing import formats
+from prior_sg.deploy.showing.material import Material
 from prior_sg.deploy.terminal import Terminal
 from prior_sg.deploy.truth import GroundTruth, TrueObject
 from prior_sg.schemas.codec import decode, encode
-from prior_sg.schemas.places import VoxelMap
 from prior_sg.schemas.scene import Scene, SceneRequest
 from prior_sg.schemas.topics import SCENE
-from prior_sg.services.registry import BY_NAME
 from prior_sg.services.runtime import extras
 from prior_sg.services.runtime.record import attachments
-from prior_sg.services.runtime.runner import Runner
 
-SUFFIXES = {"json": (".json",), "spark-dsg": (".json", ".sparkdsg"), "png": (".png",)}
-Told = list[dict[str, Any]] | None  # losses of a run; none where they are not known
 MAIN_METRICS = ("f1_s", "f1_g", "miou_s", "miou_g", "miou_s_penalised", "accuracy")
-
-
-class ExportError(UserError):
-    """The file cannot be written as asked; the message says what to do."""
 
 
 def region_table(scene: Scene) -> Table:
@@ -78,16 +70,19 @@ def write(
     losses = msgspec.to_builtins(result.losses)
     if metrics := compare(result, truth, objects, console):
         (out / "metrics.json").write_text(json_text(metrics | {"losses": losses}))
-    files = {"scene.json": "json", "dsg.json": "spark-dsg", "map.png": "png"}
+    outlines = GroundTruth.from_json(truth) if truth else None
+    material = Material(scene, result.voxels, losses=losses, truth=outlines)
+    files = {"scene.json": "json", "dsg.json": "dsg", "map.png": "png"}
     try:
         extras.require("dsg", "dsg.json")
     except extras.ExtraMissing as error:
         console.print(f"without dsg.json: {error}")
         del files["dsg.json"]
     for name, kind in files.items():
-        export(scene, result.voxels, kind, out / name, truth, losses=losses)
+        formats.save(material, out / name, kind)
     names = ", ".join((*files, "map-3d.png", result.log_path.name))
     console.print(f"written to {out}: {names} ({result.seconds:.0f} s)")
+    console.print(f"look at it: prior-sg view {shlex.quote(str(out))}")
 
 
 def compare(
@@ -109,59 +104,6 @@ def compare(
         console.print(f"objects against the ground truth: {counts}, {shares}")
         metrics |= found
     return {name: None if math.isnan(value) else value for name, value in metrics.items()}
-
-
-def export(
-    scene: Scene,
-    voxels: VoxelMap | None,
-    kind: str,
-    path: Path,
-    truth: dict[str, Any] | None = None,
-    *,
-    losses: Told = None,
-) -> None:
-    """Write one file: `json`, `spark-dsg` or `png`; `losses`, where a run knows them, go into the first."""
-    if path.suffix not in SUFFIXES[kind]:
-        raise ExportError(f"{kind} is written to a file ending in {' or '.join(SUFFIXES[kind])}; got {path}")
-    try:
-        _write(scene, voxels, kind, path, truth, losses=losses)
-    except OSError as error:
-        raise ExportError(f"cannot write {path} ({error.strerror}); choose another file with --out") from error
-
-
-def _write(
-    scene: Scene,
-    voxels: VoxelMap | None,
-    kind: str,
-    path: Path,
-    truth: dict[str, Any] | None,
-    *,
-    losses: Told,
-) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    if kind == "json":
-        told = {} if losses is None else {"losses": losses}
-        path.write_text(json_text(scene_json(scene) | told))
-    elif kind == "spark-dsg":
-        from prior_sg.deploy.showing.dsg import spark_dsg_graph
-
-        spark_dsg_graph(scene).save(str(path))
-    else:
-        map_png(scene, voxels, path, GroundTruth.from_json(truth) if truth else None)
-        places_png(scene, voxels, picture_of_places(path))
-
-
-def picture_of_places(path: Path) -> Path:
-    """The file of the three-dimensional picture beside a map."""
-    return path.with_stem(f"{path.stem}-3d")
-
-
-def scene_in(database: Path, robot: str) -> Scene:
-    """The scene of one robot in a database file of the store, which may be in use."""
-    store = BY_NAME["scene_store"]
-    with Runner(store, store.config(path=str(database))) as runner:
-        scene: Scene = runner.answer(SCENE, SceneRequest(robot=robot))
-        return scene
 
 
 def final_scene_difference(log: Log, path: Path) -> str:

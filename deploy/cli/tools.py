@@ -19,27 +19,13 @@ if TYPE_CHECKING:
 
 
 def add_commands(commands: Commands) -> None:
-    """`export`, `explain`, `record`, `replay`, `topics`, `health`, `eval`, `tune` and `bench`."""
+    """`explain`, `record`, `replay`, `topics`, `health`, `eval`, `tune` and `bench`."""
     _add_results(commands)
     _add_logs(commands)
     _add_system(commands)
 
 
 def _add_results(commands: Commands) -> None:
-    export = commands.add(
-        "export",
-        cmd_export,
-        "write the scene graph as a file",
-        "prior-sg export --format spark-dsg --out dsg.json",
-        needs="map",
-    )
-    export.add_argument("--format", choices=("json", "spark-dsg", "png"), default="json")
-    export.add_argument(
-        "--out", type=Path, required=True, help="the file to write; png: the map, and places in 3D in NAME-3d.png"
-    )
-    export.add_argument("--database", type=Path, help="read this scene.sqlite instead of the running store")
-    add_bus(export)
-
     explain = commands.add(
         "explain",
         cmd_explain,
@@ -116,39 +102,12 @@ def _add_system(commands: Commands) -> None:
         needs="encode",
     )
     bench.add_argument(
-        "name", help="bus, places, features, kernel, swap, segmenter, task, learning, e2e, all of these, or pool"
+        "name",
+        help="bus, places, features, kernel, swap, segmenter, task, learning, queries, e2e, store, all of these, pool, "
+        "or store_crashes",
     )
     bench.add_argument("--seconds", type=float, default=300.0, help="how long pool lasts (default: %(default)s)")
     bench.add_argument("--json", action="store_true", help="print one JSON object per measurement")
-
-
-def cmd_export(arguments: argparse.Namespace) -> int:
-    """Write the scene graph from the running store or a database file."""
-    from prior_sg.deploy.cli import report
-    from prior_sg.schemas.places import MapRequest
-    from prior_sg.schemas.scene import SceneRequest
-    from prior_sg.schemas.topics import SCENE, VOXEL_MAP
-    from prior_sg.services.runtime.bus import BusError
-
-    voxels = None
-    if arguments.database is not None:
-        if not arguments.database.exists():
-            raise UserError(f"{arguments.database} does not exist; `run` and `up` write it as scene.sqlite")
-        scene = report.scene_in(arguments.database, arguments.robot)
-    else:
-        with open_client(arguments.connect) as client:
-            scene = client.ask(SCENE, SceneRequest(robot=arguments.robot))
-            if arguments.format == "png":
-                try:
-                    voxels = client.ask(VOXEL_MAP, MapRequest(robot=arguments.robot))
-                except BusError as error:
-                    console.print(f"without the map of walls: {error}")
-    if not len(scene.place_ids):
-        raise UserError(f"the store holds no places of {arguments.robot}; name another with --robot")
-    report.export(scene, voxels, arguments.format, arguments.out)
-    also = f" and {report.picture_of_places(arguments.out)}" if arguments.format == "png" else ""
-    console.print(f"{len(scene.place_ids)} places, {len(scene.regions)} regions: {arguments.out}{also}")
-    return 0
 
 
 def cmd_explain(arguments: argparse.Namespace) -> int:
@@ -305,9 +264,9 @@ def cmd_bench(arguments: argparse.Namespace) -> int:
     """Measure."""
     from prior_sg.deploy.benches import main as bench
 
-    if arguments.name not in (*bench.BENCHES, bench.POOL, "all"):
+    if arguments.name not in (*bench.BENCHES, *bench.LONG, "all"):
         raise UserError(
-            f"there is no measurement {arguments.name!r}; known: {', '.join((*bench.BENCHES, bench.POOL))}, all"
+            f"there is no measurement {arguments.name!r}; known: {', '.join((*bench.BENCHES, *bench.LONG))}, all"
         )
     for name in bench.BENCHES if arguments.name == "all" else [arguments.name]:
         with console.status(f"measuring {name}"):

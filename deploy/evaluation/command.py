@@ -39,6 +39,7 @@ SHOWN = {  # keys with their column titles
     "accuracy": "acc.",
     "boundary_f1": "bound.",
     "ece": "ECE",
+    "risk_half": "risk½",
 }
 
 
@@ -86,6 +87,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--ahead",
     )
     parser.add_argument(
+        "--search",
+        action="store_true",
+        help="instead, whether what is found for texts answers them, on the sequences with questions: aws_small_house "
+        "and the sample; writes search.json",
+    )
+    parser.add_argument(
         "--priors",
         type=int,
         default=1,
@@ -109,6 +116,8 @@ def run(arguments: argparse.Namespace, console: Terminal) -> int:
         raise EvaluationError("--priors must be at least 1 and --strength at least 0")
     if arguments.jobs < 0:
         raise EvaluationError("--jobs must be at least 1, or 0 for the number of cores")
+    if arguments.search and arguments.ahead:
+        raise EvaluationError("--search and --ahead judge different things: give one of them")
     if arguments.ahead and (arguments.methods != OURS or arguments.ablate or arguments.oracle or arguments.sweep):
         raise EvaluationError("--ahead brings its own methods: leave out --methods, --ablate, --oracle and --sweep")
     if arguments.ahead and (arguments.priors > 1 or arguments.jobs > 1):
@@ -120,6 +129,10 @@ def run(arguments: argparse.Namespace, console: Terminal) -> int:
     arguments.out.mkdir(parents=True, exist_ok=True)
     if arguments.ahead:
         return judge_ahead(arguments, layers, datasets, console)
+    if arguments.search:
+        from prior_sg.deploy.evaluation.search_command import judge_search
+
+        return judge_search(arguments, layers, datasets, console)
     jobs = min(arguments.jobs or os.cpu_count() or 1, len(datasets))
     with progress(Terminal(stderr=True)) as report:
         if jobs > 1:

@@ -7,11 +7,12 @@ hold its centre; places in no polygon are left out before anything else. An esti
 its id, and places without a region take part on the ground-truth side only. Regions that own no voxel do not count on
 either side.
 
-Two scores go beyond the paper. `boundary_f1` compares where regions end: a boundary is a pair of face neighbours among
-the scored voxels whose regions differ, at the middle of the common face, and it is found when the other side has one
-within BOUNDARY_TOLERANCE_M. A pair with a voxel that no estimated region holds is no estimated boundary. `ece` is the
-expected calibration error: the mean distance between the confidence and the accuracy of CALIBRATION_BINS equal bins of
-confidence, weighted by volume; the confidence is a place's posterior of its own label.
+Three scores go beyond the paper. `boundary_f1` compares where regions end: a boundary is a pair of face neighbours
+among the scored voxels whose regions differ, at the middle of the common face, and it is found when the other side has
+one within BOUNDARY_TOLERANCE_M. A pair with a voxel that no estimated region holds is no estimated boundary. `ece` is
+the expected calibration error: the mean distance between the confidence and the accuracy of CALIBRATION_BINS equal bins
+of confidence, weighted by volume; the confidence is a place's posterior of its own label. `risk_half` is the share of
+wrong labels in the half of the volume that is believed most firmly: what a planner gets that acts on those only.
 """
 
 from dataclasses import dataclass
@@ -41,6 +42,7 @@ SCORES = (
     "accuracy",
     "boundary_f1",
     "ece",
+    "risk_half",
 )
 
 
@@ -67,6 +69,15 @@ class Overlap:
 
 
 @dataclass(frozen=True)
+class Beliefs:
+    """How firmly each scored place believes its label, and whether that is right."""
+
+    volumes: np.ndarray  # (belief,) voxels
+    confidence: np.ndarray  # (belief,) posterior of its own label
+    right: np.ndarray  # (belief,) bool
+
+
+@dataclass(frozen=True)
 class Reliability:
     """What is believed against what is so, in equal bins of confidence from 0 to 1."""
 
@@ -88,8 +99,8 @@ def evaluate(scene: Scene, free: VoxelMap, truth: GroundTruth) -> dict[str, floa
     Precision, recall and F1 (p, r, f1) and mean intersection over union (miou), each for labels and shape (s) and for
     shape alone (g). `miou_*` averages over the matched pairs, min(estimated, true) of them, as the paper does;
     `miou_*_penalised` lets every unmatched region count as 0. `accuracy` is the share of the scored volume whose label
-    is right. Without estimated regions every score is 0. `ece`, where less is better, is NaN for a scene without
-    posteriors.
+    is right. Without estimated regions every score is 0. `ece` and `risk_half`, where less is better, are NaN for a
+    scene without posteriors.
     """
     assignment = assign(scene, free, truth)
     overlap = overlap_of(scene, assignment, truth)
@@ -99,7 +110,8 @@ def evaluate(scene: Scene, free: VoxelMap, truth: GroundTruth) -> dict[str, floa
     scores["miou_s_penalised"], scores["miou_g_penalised"] = scores["penalised_s"], scores["penalised_g"]
     scores["accuracy"] = _ratio((overlap.shared * overlap.same_label).sum(), overlap.true.sum())
     scores["boundary_f1"] = boundary_f1(assignment, free.voxel_m)
-    scores["ece"] = reliability(scene, assignment, truth).error
+    beliefs = beliefs_of(scene, assignment, truth)
+    scores["ece"], scores["risk_half"] = reliability(beliefs).error, risk(beliefs, coverage=0.5)
     return {name: scores[name] for name in SCORES}
 
 
@@ -155,25 +167,41 @@ def boundary_f1(assignment: Assignment, voxel_m: float) -> float:
     return _ratio(2 * precision * recall, precision + recall)
 
 
-def reliability(scene: Scene, assignment: Assignment, truth: GroundTruth) -> Reliability:
-    """Confidence against accuracy of the scored places that have a label and a posterior of it."""
+def beliefs_of(scene: Scene, assignment: Assignment, truth: GroundTruth) -> Beliefs:
+    """The scored places that have a label and a posterior of it."""
     names = {region.id: region.label for region in scene.regions}
     true_names = {region.id: region.label for region in truth.regions}
     columns = {label: column for column, label in enumerate(scene.labels[: scene.posteriors.shape[1]])}
     labels = [names.get(region, "") for region in assignment.estimated_ids.tolist()]
     kept = np.array([label in columns for label in labels], bool)
     column = np.array([columns.get(label, 0) for label in labels], int)[kept]
+    right = [label == true_names[true] for label, true in zip(labels, assignment.true_ids.tolist(), strict=True)]
     confidence = scene.posteriors[assignment.rows[kept], column].astype(float)
-    right = np.array([a == true_names[b] for a, b in zip(labels, assignment.true_ids.tolist(), strict=True)], bool)[
-        kept
-    ]
-    bins = np.clip((confidence * CALIBRATION_BINS).astype(int), 0, CALIBRATION_BINS - 1)
+    return Beliefs(assignment.volumes[kept], confidence, np.array(right, bool)[kept])
+
+
+def reliability(beliefs: Beliefs) -> Reliability:
+    """Confidence against accuracy."""
+    bins = np.clip((beliefs.confidence * CALIBRATION_BINS).astype(int), 0, CALIBRATION_BINS - 1)
     volumes, believed, found = (
-        np.bincount(bins, assignment.volumes[kept] * weight, minlength=CALIBRATION_BINS)
-        for weight in (1.0, confidence, right)
+        np.bincount(bins, beliefs.volumes * weight, minlength=CALIBRATION_BINS)
+        for weight in (1.0, beliefs.confidence, beliefs.right)
     )
     some = np.maximum(volumes, 1)
     return Reliability(volumes, believed / some, found / some)
+
+
+def risk(beliefs: Beliefs, coverage: float) -> float:
+    """Share of wrong labels in the part `coverage`, in (0, 1], of the volume that is believed most firmly.
+
+    Equal beliefs count alike; NaN without any belief.
+    """
+    levels, level = np.unique(-beliefs.confidence, return_inverse=True)
+    volumes = np.bincount(level, beliefs.volumes, minlength=len(levels))
+    wrong = np.bincount(level, beliefs.volumes * ~beliefs.right, minlength=len(levels))
+    wanted = coverage * volumes.sum()
+    taken = np.clip(wanted - (np.cumsum(volumes) - volumes), 0.0, volumes)
+    return float((wrong * taken / np.maximum(volumes, 1)).sum() / wanted) if wanted else float("nan")
 
 
 def _face_neighbours(voxels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

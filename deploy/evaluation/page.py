@@ -24,7 +24,7 @@ from prior_sg.services.segmenter.core.regions.components import footprint_m2
 
 PICTURE_WIDTH_PX = 900
 FOOTPRINT_CELL_M = 0.1
-LESS_IS_BETTER = ("ece", "seconds")
+LESS_IS_BETTER = ("ece", "risk_half", "seconds")
 PICTURED = ("method", "oracle")  # groups whose scenes are drawn and whose errors are listed
 STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; color: #1f2328; margin: 2rem auto; max-width: 1240px; padding: 0 1rem; }
@@ -176,14 +176,16 @@ def true_scene(scene: Scene, truth: GroundTruth) -> Scene:
 
 def _calibration(results: Results) -> str:
     """Accuracy over confidence, all sequences together, for methods that hold beliefs."""
-    series = {}
+    believed, risky = {}, {}
     for method in results.methods:
         tables = [p.calibration for p in results.pictures if p.method.name == method.name]
         if method.group in PICTURED and sum(table.volumes.sum() for table in tables):
-            series[method.name] = reliability_points(tables)
-    plot = line_plot(series, "confidence", "accuracy", diagonal=True)
+            believed[method.name], risky[method.name] = reliability_points(tables), risk_points(tables)
     return (
-        f"<h2>Calibration</h2><p>Share of the volume that is labelled right, over the posterior of its label.</p>{plot}"
+        "<h2>Calibration</h2><p>Share of the volume that is labelled right, over the posterior of its label; and the "
+        "share that is labelled wrong when only what is believed most firmly is taken, over how much that is.</p>"
+        f'<div class="plots">{line_plot(believed, "confidence", "accuracy", diagonal=True)}'
+        f"{line_plot(risky, 'coverage', 'risk')}</div>"
     )
 
 
@@ -194,6 +196,14 @@ def reliability_points(tables: Sequence[Reliability]) -> list[Point]:
     accuracy = np.sum([table.volumes * table.accuracy for table in tables], axis=0)
     filled = np.flatnonzero(volumes)
     return [(float(confidence[b] / volumes[b]), float(accuracy[b] / volumes[b])) for b in filled]
+
+
+def risk_points(tables: Sequence[Reliability]) -> list[Point]:
+    """(coverage, risk) when the bins of highest confidence are taken first, the tables together."""
+    volumes = np.sum([table.volumes for table in tables], axis=0)[::-1]
+    wrong = np.sum([table.volumes * (1 - table.accuracy) for table in tables], axis=0)[::-1]
+    taken, missed = np.cumsum(volumes), np.cumsum(wrong)
+    return [(float(taken[b] / taken[-1]), float(missed[b] / taken[b])) for b in np.flatnonzero(volumes)]
 
 
 def _confusions(results: Results) -> str:

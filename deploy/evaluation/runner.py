@@ -11,7 +11,7 @@ import numpy as np
 from prior_sg.deploy.evaluation.datasets import SEQUENCE, Dataset
 from prior_sg.deploy.evaluation.kinds import OURS
 from prior_sg.deploy.evaluation.methods import Case, Method
-from prior_sg.deploy.evaluation.metrics import SCORES, Reliability, assign, evaluate, reliability
+from prior_sg.deploy.evaluation.metrics import SCORES, Reliability, assign, beliefs_of, evaluate, reliability
 from prior_sg.deploy.evaluation.object_metrics import NO_DETECTOR, OBJECT_SCORES, object_scores
 from prior_sg.deploy.evaluation.perception import Perception, Report
 from prior_sg.deploy.evaluation.priors import variations
@@ -213,7 +213,7 @@ def judge(method: Method, case: Case, prior: int = 0) -> tuple[Outcome, Picture]
     for true_id, estimated_id, volume in rows:
         pair = (true_labels[true_id], labels.get(estimated_id, NO_LABEL))
         confusion[pair] = confusion.get(pair, 0) + volume
-    calibration = reliability(scene, assignment, case.truth)
+    calibration = reliability(beliefs_of(scene, assignment, case.truth))
     return Outcome(name, method, prior, scores), Picture(name, method, scene, voxels, calibration, confusion)
 
 

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 SECTION = "segmenter"  # whose settings are those of our method
 DEFAULT_SCORES = "f1_s,miou_s_penalised"
-LOWER_IS_BETTER = ("ece", "seconds")
+LOWER_IS_BETTER = ("ece", "risk_half", "seconds")
 DATASET, KIND = "dataset", "kind"
 
 Values = Mapping[str, Sequence[str]]  # by setting

@@ -3,16 +3,24 @@
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import spark_dsg
 
-from prior_sg.deploy.showing.export import adjacent_regions, members_of, objects_with_places, surfaces_of
-from prior_sg.deploy.showing.map import label_colors
+from prior_sg.deploy.showing.colors import label_colors
+from prior_sg.deploy.showing.export import (
+    adjacent_regions,
+    frontiers_of,
+    members_of,
+    objects_with_places,
+    surfaces_of,
+)
 from prior_sg.schemas.objects import SceneObject
 from prior_sg.schemas.regions import Region
 from prior_sg.schemas.scene import Scene
 
 OBJECT, PLACE, PLACE_2D, ROOM, BUILDING = "O", "p", "P", "R", "B"  # node prefixes of Spark-DSG
+MESH_PLACES = "MESH_PLACES"  # its layer of 2D places
 
 
 def spark_dsg_graph(scene: Scene) -> spark_dsg.DynamicSceneGraph:
@@ -24,19 +32,11 @@ def spark_dsg_graph(scene: Scene) -> spark_dsg.DynamicSceneGraph:
     """
     graph = spark_dsg.DynamicSceneGraph()
     colors = label_colors(scene)
-    surfaces = surfaces_of(scene)
-    prefix = PLACE_2D if surfaces else PLACE
-    layer = "MESH_PLACES" if surfaces else spark_dsg.DsgLayers.PLACES
-    if surfaces:
+    flat = len(scene.surface_ids) > 0
+    prefix, layer = (PLACE_2D, MESH_PLACES) if flat else (PLACE, spark_dsg.DsgLayers.PLACES)
+    if flat:
         graph.add_layer(3, 1, layer)
-    for row, place in enumerate(scene.place_ids.tolist()):
-        node = _ground_node(scene, row, surfaces[place]) if place in surfaces else _place_node(scene, row)
-        _describe_place(node, scene, row, prefix, colors)
-        _add(graph, layer, prefix, place, node)
-    for (a, b), clearance_m in zip(scene.edges.tolist(), scene.clearances_m.tolist(), strict=True):
-        weight = spark_dsg.EdgeAttributes()
-        weight.weighted, weight.weight = True, clearance_m
-        graph.insert_edge(_symbol(prefix, a), _symbol(prefix, b), weight)
+    _add_places(graph, scene, layer, prefix, colors)
     for item, place in objects_with_places(scene):
         _add(graph, spark_dsg.DsgLayers.OBJECTS, OBJECT, item.id, _object_node(scene, item))
         if place is not None:
@@ -53,8 +53,9 @@ def spark_dsg_graph(scene: Scene) -> spark_dsg.DynamicSceneGraph:
         _add(graph, spark_dsg.DsgLayers.BUILDINGS, BUILDING, 0, _building_node(scene))
         for region in scene.regions:
             graph.insert_edge(_symbol(BUILDING, 0), _symbol(ROOM, region.id), enforce_single_parent=True)
-    about = {"robot": scene.robot, "environment": scene.environment, "task": scene.task}
+    about: dict[str, Any] = {"robot": scene.robot, "environment": scene.environment, "task": scene.task}
     about |= {"prior_digest": scene.prior_digest, "embedding_space": scene.space}
+    about |= {"stamp_ns": scene.stamp_ns, "trajectory_m": scene.trajectory.tolist()}
     graph.metadata.set(about | {"origin_m": list(scene.origin_m)})
     labelspace = spark_dsg.Labelspace(dict(enumerate(scene.labels)))  # kept in the metadata, hence after them
     for named in (layer, spark_dsg.DsgLayers.ROOMS):
@@ -68,16 +69,34 @@ def save_spark_dsg(scene: Scene, path: str | Path) -> None:
     spark_dsg_graph(scene).save(str(path), include_mesh=False)
 
 
-def _place_node(scene: Scene, row: int) -> spark_dsg.PlaceNodeAttributes:
+def _add_places(
+    graph: spark_dsg.DynamicSceneGraph, scene: Scene, layer: str, prefix: str, colors: dict[str, tuple[int, int, int]]
+) -> None:
+    surfaces, frontiers, predicted = surfaces_of(scene), frontiers_of(scene), set(scene.predicted_ids.tolist())
+    names = {region.id: region.label for region in scene.regions}
+    for row, place in enumerate(scene.place_ids.tolist()):
+        opening = frontiers.get(place)
+        node = _ground_node(scene, row, surfaces[place]) if place in surfaces else _place_node(scene, row, opening)
+        node.is_predicted = place in predicted
+        node.name = str(_symbol(prefix, place))
+        label = names.get(int(scene.place_regions[row]), "")
+        _describe_place(node, scene, row, label, opening)
+        _label_node(node, label, scene, colors)
+        _add(graph, layer, prefix, place, node)
+    for (a, b), clearance_m in zip(scene.edges.tolist(), scene.clearances_m.tolist(), strict=True):
+        weight = spark_dsg.EdgeAttributes()
+        weight.weighted, weight.weight = True, clearance_m
+        graph.insert_edge(_symbol(prefix, a), _symbol(prefix, b), weight)
+
+
+def _place_node(scene: Scene, row: int, opening: tuple[np.ndarray, float] | None) -> spark_dsg.PlaceNodeAttributes:
     """A sphere; one beside unobserved space is an active frontier whose x axis leads there."""
     node = spark_dsg.PlaceNodeAttributes()
     node.distance = float(scene.radii_m[row])
     node.num_basis_points = int(scene.basis_points[row])
     node.real_place = True
-    opening = np.flatnonzero(scene.frontier_ids == scene.place_ids[row])
-    if len(opening):
-        x, y, z = scene.frontier_directions[opening[0]].astype(float)
-        side_m = float(scene.frontier_areas_m2[opening[0]]) ** 0.5
+    if opening is not None:
+        (x, y, z), side_m = opening[0].astype(float), opening[1] ** 0.5
         node.active_frontier = True
         node.frontier_scale = np.array((0.0, side_m, side_m))
         # Half the turn from the x axis: the axis halfway between the two, as a quaternion (w, cross product).
@@ -103,17 +122,20 @@ def _describe_place(
     node: spark_dsg.SemanticNodeAttributes,
     scene: Scene,
     row: int,
-    prefix: str,
-    colors: dict[str, tuple[int, int, int]],
+    label: str,
+    opening: tuple[np.ndarray, float] | None,
 ) -> None:
-    """What places of both kinds tell."""
-    names = {region.id: region.label for region in scene.regions}
-    label = names.get(int(scene.place_regions[row]), "")
+    """What places of both kinds tell, and what Spark-DSG has no field for."""
+    posterior = scene.posteriors[row].astype(float)
     node.position = scene.positions_m[row].astype(float)
     node.last_update_time_ns = scene.stamp_ns
-    node.name = str(_symbol(prefix, int(scene.place_ids[row])))
-    node.metadata.set({"label": label, "unknown": float(scene.unknown[row])})
-    _label_node(node, label, scene, colors)
+    told: dict[str, Any] = {"label": label, "unknown": float(scene.unknown[row])}
+    told |= {"radius_m": float(scene.radii_m[row]), "basis_points": int(scene.basis_points[row])}
+    if posterior.any():
+        told["posterior"] = dict(zip(scene.labels, posterior.tolist(), strict=True))
+    if opening is not None:
+        told["frontier"] = {"direction": opening[0].tolist(), "area_m2": opening[1]}
+    node.metadata.set(told)
 
 
 def _object_node(scene: Scene, item: SceneObject) -> spark_dsg.ObjectNodeAttributes:
@@ -135,7 +157,8 @@ def _room_node(
     node.position = np.array(region.position_m)
     node.last_update_time_ns = scene.stamp_ns
     node.name = region.label
-    node.metadata.set({"area_m2": region.area_m2, "probability": region.probability})
+    node.is_predicted = region.predicted
+    node.metadata.set(msgspec.to_builtins(region))
     _label_node(node, region.label, scene, colors)
     if len(rows):
         posterior = scene.posteriors[rows].astype(float).mean(axis=0)

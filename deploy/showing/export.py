@@ -42,7 +42,7 @@ def scene_json(scene: Scene) -> dict[str, Any]:
     adjacent = adjacent_regions(scene)
     members = members_of(scene)
     predicted = set(scene.predicted_ids.tolist())
-    frontiers, surfaces = _frontiers(scene), surfaces_of(scene)
+    frontiers, surfaces = frontiers_of(scene), surfaces_of(scene)
     return {
         "robot": scene.robot,
         "stamp_ns": scene.stamp_ns,
@@ -154,7 +154,7 @@ def _ground_json(surface: tuple[np.ndarray, np.ndarray] | None) -> dict[str, Any
     return {"ellipse": ellipse, "hull_m": _short(hull_m)}
 
 
-def _frontiers(scene: Scene) -> dict[int, tuple[np.ndarray, float]]:
+def frontiers_of(scene: Scene) -> dict[int, tuple[np.ndarray, float]]:
     """Direction and area of each opening, by place id."""
     columns = (scene.frontier_ids.tolist(), scene.frontier_directions, scene.frontier_areas_m2.tolist())
     return {place: (direction, area_m2) for place, direction, area_m2 in zip(*columns, strict=True)}

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import partial
 from typing import TypeVar
 
 import msgspec
@@ -11,10 +10,12 @@ from prior_sg.schemas.codec import Message
 from prior_sg.schemas.objects import ObjectDelta
 from prior_sg.schemas.places import PlaceDelta, SnapshotRequest
 from prior_sg.schemas.priors import Prior, Task, TaskInForce, TaskRequest
+from prior_sg.schemas.queries import SceneAnswer, SceneQuery
 from prior_sg.schemas.regions import RegionDelta
-from prior_sg.schemas.scene import Scene, SceneRequest
+from prior_sg.schemas.scene import HistoryRequest, RevisionList, Scene, SceneRequest
 from prior_sg.schemas.status import Tick
 from prior_sg.schemas.topics import (
+    HISTORY,
     OBJECT_DELTA,
     OBJECT_SNAPSHOT,
     PLACE_DELTA,
@@ -23,18 +24,21 @@ from prior_sg.schemas.topics import (
     REGION_DELTA,
     REGION_SNAPSHOT,
     SCENE,
+    SCENE_QUERY,
     SCENE_REVISION,
     TASK,
     TASK_IN_FORCE,
     Query,
 )
-from prior_sg.services.deltas import Delta, Follower
+from prior_sg.services.deltas import Follower
 from prior_sg.services.runtime.service import Ask, Identity, Output, Service
 from prior_sg.services.scene_store.core import graph as core
+from prior_sg.services.scene_store.core.queries.answering import reply
+from prior_sg.services.scene_store.core.queries.index import Index
 from prior_sg.services.scene_store.database import Database
 
 CHECKPOINT_S = 1.0  # the write-ahead log is folded into the file between deltas, not within a commit
-D = TypeVar("D", bound=Delta)
+D = TypeVar("D", PlaceDelta, RegionDelta, ObjectDelta)
 
 
 @dataclass
@@ -45,6 +49,7 @@ class Robot:
     places: Follower[PlaceDelta]
     regions: Follower[RegionDelta]
     objects: Follower[ObjectDelta]
+    index: Index | None = None  # of the revision that was last asked about
 
 
 @dataclass
@@ -59,7 +64,7 @@ class State:
 
 def init(cfg: core.Config, identity: Identity) -> State:
     """Open or create the database and resume from its cursors. Raises StoreError."""
-    database = Database(cfg)
+    database = Database(cfg, identity.epoch)
     robots = {name: _robot(graph) for name, graph in database.graphs().items()}
     return State(identity.epoch, database, robots, sorted(robots))
 
@@ -75,12 +80,13 @@ def step(state: State, message: Message, cfg: core.Config) -> Iterator[Output]:
         case ObjectDelta():
             yield from _take_objects(state, _known(state, message.robot), message)
         case Task():
-            if core.set_task(_known(state, message.robot).graph, message):
-                state.database.put_task(message)
+            graph = _known(state, message.robot).graph
+            if core.set_task(graph, message):
+                state.database.put_task(graph, message)
         case Prior():
             state.database.put_prior(message)
         case Tick():
-            state.database.checkpoint()
+            state.database.rest(robot.graph for robot in state.robots.values())
 
 
 def _resume(state: State) -> Iterator[Output]:
@@ -96,19 +102,16 @@ def _take_places(state: State, robot: Robot, delta: PlaceDelta) -> Iterator[Outp
     """Where the cameras were is known even while the delta itself must wait."""
     cameras = core.note_cameras(robot.graph, delta)
     if cameras and robot.places.verdict(delta) != "apply":
-        state.database.put_cameras(delta.robot, cameras)
-    put = partial(state.database.put_places, cameras=cameras)
-    yield from _follow(state, robot, robot.places, delta, apply=core.apply_places, put=put, snapshot=PLACE_SNAPSHOT)
+        state.database.put_cameras(robot.graph, delta)
+    yield from _follow(state, robot, robot.places, delta, apply=core.apply_places, snapshot=PLACE_SNAPSHOT)
 
 
 def _take_regions(state: State, robot: Robot, delta: RegionDelta) -> Iterator[Output]:
-    put = state.database.put_regions
-    return _follow(state, robot, robot.regions, delta, apply=core.apply_regions, put=put, snapshot=REGION_SNAPSHOT)
+    return _follow(state, robot, robot.regions, delta, apply=core.apply_regions, snapshot=REGION_SNAPSHOT)
 
 
 def _take_objects(state: State, robot: Robot, delta: ObjectDelta) -> Iterator[Output]:
-    put = state.database.put_objects
-    return _follow(state, robot, robot.objects, delta, apply=core.apply_objects, put=put, snapshot=OBJECT_SNAPSHOT)
+    return _follow(state, robot, robot.objects, delta, apply=core.apply_objects, snapshot=OBJECT_SNAPSHOT)
 
 
 def _follow(
@@ -118,12 +121,11 @@ def _follow(
     delta: D,
     *,
     apply: Callable[[core.Graph, D], core.Changes],
-    put: Callable[[core.Graph, core.Changes], None],
     snapshot: Query,
 ) -> Iterator[Output]:
     """Apply what is due of one writer's stream, make it durable and announce it; while deltas are missing, ask."""
     for due in follower.take(delta):
-        put(robot.graph, apply(robot.graph, due))
+        state.database.put(robot.graph, apply(robot.graph, due), due)
         yield SCENE_REVISION, core.revision_of(robot.graph, state.epoch)
     if follower.needs_snapshot:
         yield Ask(snapshot, SnapshotRequest(robot=robot.graph.robot))
@@ -143,9 +145,34 @@ def _robot(graph: core.Graph) -> Robot:
 
 
 def answer_scene(state: State, request: SceneRequest, cfg: core.Config) -> Scene:
-    """The scene of one robot; empty when the store has never heard of it."""
+    """The scene of one robot, now or in the past; empty when nothing is stored of it, or was by then."""
     robot = state.robots.get(request.robot)
-    return core.scene(robot.graph if robot else core.Graph(request.robot))
+    if request.revision is None and request.stamp_ns is None:
+        return core.scene(robot.graph if robot else core.Graph(request.robot))
+    return core.scene(state.database.at(request.robot, request.revision, request.stamp_ns) or core.Graph(request.robot))
+
+
+def answer_history(state: State, request: HistoryRequest, cfg: core.Config) -> RevisionList:
+    """The revisions of one robot that can be asked for."""
+    revisions = state.database.history(request.robot, request.limit, request.before)
+    return RevisionList(robot=request.robot, revisions=revisions)
+
+
+def answer_query(state: State, request: SceneQuery, cfg: core.Config) -> SceneAnswer:
+    """Questions about one robot's scene; of one that the store has never heard of, it is empty."""
+
+    def older(revision: int) -> Scene | None:
+        found = state.database.at(request.robot, revision)
+        return core.scene(found) if found is not None and found.revision == revision else None
+
+    return reply(_index(state.robots.get(request.robot) or _robot(core.Graph(request.robot))), request, older)
+
+
+def _index(robot: Robot) -> Index:
+    """The graph as it is, prepared for questions; made once for each revision that somebody asks about."""
+    if robot.index is None or robot.index.revision != robot.graph.revision:
+        robot.index = Index(core.scene(robot.graph), robot.graph.revision)
+    return robot.index
 
 
 def answer_task(state: State, request: TaskRequest, cfg: core.Config) -> TaskInForce:
@@ -161,14 +188,14 @@ def close(state: State) -> None:
 
 SERVICE = Service(
     name="scene_store",
-    purpose="keeps every robot's scene graph durably and answers with it",
+    purpose="keeps every robot's scene graph and its history durably and answers with it",
     scope="fleet",
     config=core.Config,
     init=init,
     step=step,
     reads=(PLACE_DELTA, REGION_DELTA, OBJECT_DELTA, TASK, PRIOR),
     writes=(SCENE_REVISION,),
-    answers={SCENE: answer_scene, TASK_IN_FORCE: answer_task},
+    answers={SCENE: answer_scene, SCENE_QUERY: answer_query, HISTORY: answer_history, TASK_IN_FORCE: answer_task},
     asks=(PLACE_SNAPSHOT, REGION_SNAPSHOT, OBJECT_SNAPSHOT),
     tick_s=CHECKPOINT_S,
     close=close,

@@ -7,7 +7,8 @@
         print(mapper.scene.regions.labels)
 
 `Mapper` does everything in this process, `Client` talks to a running system, `open_source` reads recordings, `Scene` is
-what comes out. Whatever goes wrong for a user is an `Error`. Nothing is imported before it is used.
+what comes out, `open_history` gives what was. Whatever goes wrong for a user is an `Error`. Nothing is imported before
+it is used.
 """
 
 TYPE_CHECKING = False  # `typing` takes long to import, and nothing is before it is used
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     from prior_sg.deploy.api.errors import PosesError as PosesError
     from prior_sg.deploy.api.errors import SaveError as SaveError
     from prior_sg.deploy.api.errors import TaskError as TaskError
+    from prior_sg.deploy.api.history import open_history as open_history
     from prior_sg.deploy.api.mapper import Mapper as Mapper
     from prior_sg.deploy.api.scene import Scene as Scene
     from prior_sg.services.errors import PriorSgError as Error
@@ -43,6 +45,7 @@ _HOMES = {
     "Scene": "deploy.api.scene",
     "SourceError": "services.ingest.sources",
     "TaskError": "deploy.api.errors",
+    "open_history": "deploy.api.history",
     "open_source": "services.ingest.sources",
 }
 __all__ = [
@@ -60,6 +63,7 @@ __all__ = [
     "SourceError",
     "TaskError",
     "__version__",
+    "open_history",
     "open_source",
 ]
 

@@ -3,7 +3,7 @@
 import msgspec
 import numpy as np
 
-from prior_sg.schemas import features, frames, objects, places, priors, regions, scene, status
+from prior_sg.schemas import features, frames, objects, places, priors, queries, regions, scene, status
 from prior_sg.schemas.codec import Message
 
 CAMERA = frames.Intrinsics(640, 480, 525.5, 526.5, 319.5, 239.5)
@@ -132,6 +132,81 @@ OBJECT = objects.SceneObject(
     max_m=(1.5, 2.5, 1.0),
     frames=3,
 )
+SPOT = queries.Spot(point_m=(1.0, 2.0, 3.0), what="region", id=4, label="hall")
+QUESTIONS = [
+    queries.ById(what="region", id=4),
+    queries.ByLabel(label="oven", what="object", limit=5),
+    queries.InBox(min_m=(0.0, 1.0, 2.0), max_m=(3.0, 4.0, 5.0), what="place", label="hall", limit=6),
+    queries.InRadius(point_m=(1.0, 2.0, 3.0), radius_m=1.5, what="object", label="stove", limit=7),
+    queries.Nearest(point_m=(1.0, 2.0, 3.0), what="region", label="hall", limit=3),
+    queries.NeighboursOf(what="place", id=1),
+    queries.ObjectsInRegions(object_label="stove", region_label="kitchen", limit=8),
+    queries.RouteBetween(start=SPOT, goal=SPOT, clearance_m=0.25),
+    queries.ChangedSince(revision=3),
+    queries.BeliefsOf(region=4, limit=2),
+    queries.WordsInUse(),
+    queries.AnswersTo(text="eat", regions={"kitchen": 0.75}, objects={"stove": 0.5}, what="region", limit=4),
+]
+THING = queries.Thing(
+    what="object",
+    id=4,
+    label="stove",
+    position_m=(1.0, 2.0, 3.0),
+    probability=0.5,
+    region=6,
+    predicted=True,
+    distance_m=1.5,
+    score=0.25,
+)
+BELIEF = queries.LabelBelief(label="kitchen", probability=0.75)
+ANSWERS = [
+    queries.Things(things=[THING], total=2, nearest_labels=["hall"], reason="r"),
+    queries.Details(
+        thing=THING,
+        place=queries.PlaceDetails(radius_m=0.5, beliefs=[BELIEF], unknown=0.25, frontier_m2=1.5),
+        region=REGION,
+        object=OBJECT,
+        reason="r",
+    ),
+    queries.Neighbourhood(
+        neighbours=[queries.Neighbour(thing=THING, clearance_m=0.5, length_m=1.5, ways=REGION.transitions)], reason="r"
+    ),
+    queries.Route(
+        found=True,
+        reason="r",
+        start=THING,
+        goal=THING,
+        place_ids=[1, 2],
+        waypoints_m=[(1.0, 2.0, 3.0), (4.0, 5.0, 6.0)],
+        length_m=2.5,
+        clearance_m=0.25,
+        regions=[THING],
+        start_gap_m=0.5,
+        goal_gap_m=0.75,
+    ),
+    queries.Difference(
+        since_revision=3,
+        appeared=[THING],
+        gone=[THING],
+        renamed=[queries.Renamed(thing=THING, former_label="hall")],
+        places_appeared=1,
+        places_gone=2,
+        places_relabelled=3,
+        task_before="t",
+        reason="r",
+    ),
+    queries.RegionBeliefs(thing=THING, beliefs=[BELIEF], unknown=0.25, predicted_share=0.5, places=3, reason="r"),
+    queries.Words(
+        environment="home",
+        task="tidy up",
+        space="s",
+        prior_digest="d",
+        labels=["kitchen", "hall"],
+        regions={"kitchen": 1},
+        objects={"stove": 2},
+    ),
+    queries.Ranking(things=[THING], note="n", reason="r"),
+]
 
 EXAMPLES: list[Message] = [
     KEYFRAME,
@@ -310,7 +385,16 @@ EXAMPLES: list[Message] = [
         merged_ids=i8([5, 4]),
     ),
     scene.SceneRevision(robot="r", epoch=1, revision=2, stamp_ns=3, places=4, edges=5, regions=6),
-    scene.SceneRequest(robot="r"),
+    scene.SceneRequest(robot="r", revision=7, stamp_ns=8),
+    scene.HistoryRequest(robot="r", limit=5, before=9),
+    scene.RevisionList(
+        robot="r",
+        revisions=[
+            scene.StoredRevision(
+                revision=7, session=1, kind="place", stamp_ns=8, places=4, edges=5, regions=6, objects=3
+            )
+        ],
+    ),
     scene.Scene(
         robot="r",
         stamp_ns=1,
@@ -340,7 +424,10 @@ EXAMPLES: list[Message] = [
         hull_counts=i8(3),
         hulls_m=f4([0, 0], [1, 0], [0, 1]),
         origin_m=(512e3, 5.4e6, 312.0),
+        revision=9,
     ),
+    queries.SceneQuery(robot="r", questions=QUESTIONS),
+    queries.SceneAnswer(robot="r", revision=2, stamp_ns=3, answers=ANSWERS),
     status.Consumed(
         robot="r",
         service="s",

@@ -56,6 +56,18 @@ def test_what_was_written_before_worlds_had_an_offset_has_none(name):
     assert decode(type(message), msgpack.packb(fields)) == msgspec.structs.replace(message, origin_m=(0.0, 0.0, 0.0))
 
 
+@pytest.mark.parametrize(
+    ("name", "defaults"),
+    [("Scene", {"revision": -1}), ("SceneRequest", {"revision": None, "stamp_ns": None})],
+)
+def test_what_was_written_before_the_store_kept_history_means_the_present(name, defaults):
+    message = next(example for example in EXAMPLES if by_name(example) == name)
+    fields = msgpack.unpackb(encode(message), ext_hook=msgpack.ExtType)
+    for field in defaults:
+        del fields[field]
+    assert decode(type(message), msgpack.packb(fields)) == msgspec.structs.replace(message, **defaults)
+
+
 def test_the_digest_of_a_prior_stays():
     prior = next(example for example in EXAMPLES if by_name(example) == "Prior")
     assert prior.digest() == "eab9114663fcaab470acb71942c653fc"
@@ -91,9 +103,15 @@ def array(code, data):
 
 def same(unpacked, value):
     if isinstance(value, msgspec.Struct):
+        config = value.__struct_config__
+        assert config.tag is None or unpacked.pop(config.tag_field) == config.tag
         assert list(unpacked) == list(value.__struct_fields__)
         for name, inner in unpacked.items():
             same(inner, getattr(value, name))
+    elif isinstance(value, dict):
+        assert list(unpacked) == list(value)
+        for name, inner in unpacked.items():
+            same(inner, value[name])
     elif isinstance(value, np.ndarray):
         assert unpacked.dtype == value.dtype
         np.testing.assert_array_equal(unpacked, value)

@@ -4,6 +4,7 @@ import msgspec
 
 from prior_sg.schemas.features import DEFAULT_SPACE
 from prior_sg.services.segmenter.core.appearance.adaptation import AdaptationConfig
+from prior_sg.services.segmenter.core.appearance.information import InformationConfig
 from prior_sg.services.segmenter.core.appearance.label_bias import BalanceConfig
 from prior_sg.services.segmenter.core.appearance.smoothing import SharingConfig
 from prior_sg.services.segmenter.core.appearance.unmixing import UnmixingConfig
@@ -62,6 +63,7 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
     probability_floor: float = 1e-6  # least probability in a logarithm, so that every cost is finite
     object_phrases: int = 2  # objects whose phrases join a region's concept, the most discriminative first
     sharing: SharingConfig = msgspec.field(default_factory=SharingConfig)  # beyond the paper
+    information: InformationConfig = msgspec.field(default_factory=InformationConfig)  # beyond the paper
     unmixing: UnmixingConfig = msgspec.field(default_factory=UnmixingConfig)  # beyond the paper
     region_cost: float = 20.0  # of each region, in the energy's unit; 0 = none (paper)
     balance: BalanceConfig = msgspec.field(default_factory=BalanceConfig)  # beyond the paper

@@ -4,16 +4,19 @@ Masks in `Places` say what changed; each function here does again only what its 
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
+import msgspec
 import numpy as np
 from scipy.spatial import cKDTree
 
-from prior_sg.services.segmenter.core.appearance import adaptation, smoothing, unmixing
+from prior_sg.services.segmenter.core.appearance import adaptation, information, smoothing, unmixing
 from prior_sg.services.segmenter.core.appearance.label_bias import label_bias
 from prior_sg.services.segmenter.core.config import Config
 from prior_sg.services.segmenter.core.energy import posteriors
 from prior_sg.services.segmenter.core.energy.mrf import Field
 from prior_sg.services.segmenter.core.energy.region_cost import consolidated
+from prior_sg.services.segmenter.core.evidence.kernel import Frame
 from prior_sg.services.segmenter.core.experts import REGISTRY, Vote
 from prior_sg.services.segmenter.core.experts.context import Context, ObjectView, standardised
 from prior_sg.services.segmenter.core.map import inclination
@@ -37,6 +40,13 @@ class Budget:
         """Look."""
         self.looks -= 1
         return self.looks < 0
+
+
+class Crops(NamedTuple):
+    """Crops of some frames and how similar each looks to each label (crop, label), in spreads."""
+
+    frames: tuple[Frame, ...]
+    looks: np.ndarray
 
 
 def votes(state: State, rows: np.ndarray, cfg: Config) -> dict[str, Vote]:
@@ -74,6 +84,7 @@ def adapt(state: State, cfg: Config) -> None:
     places, evidence, labelling = state.map.places, state.seen.evidence, state.labelling
     if not cfg.adaptation.weight:
         return
+    doubted = msgspec.structs.replace(cfg.adaptation, weight=cfg.adaptation.weight * (1 - worth(state, cfg)))
     seen = np.flatnonzero(evidence.trust[places.slots] > 0)
     found = evidence.descriptors(places.slots[seen]).astype(np.float32)
     similarity = standardised(found, state.aim.aligned.text)
@@ -84,7 +95,7 @@ def adapt(state: State, cfg: Config) -> None:
         return _visual_labels(state, everywhere, seen, cfg)
 
     masses = np.minimum(evidence.trust[places.slots[seen]], cfg.sharing.trust_limit)
-    now = adaptation.adapted(found, similarity, masses, labels_of, cfg.adaptation)
+    now = adaptation.adapted(found, similarity, masses, labels_of, doubted)
     if adaptation.differs(now, labelling.adaptation, found, similarity, cfg.adaptation.tolerance):
         labelling.adaptation = now
         places.stale[seen] = True
@@ -98,23 +109,39 @@ def _visual_labels(state: State, own: np.ndarray, rows: np.ndarray, cfg: Config)
     return np.argmax(scores + _bias(state, scores, cfg), axis=1)
 
 
-def tell_apart(state: State, cfg: Config) -> None:
-    """What all crops together say of each place beyond its neighbours, and how much they tell at all."""
-    graph, places, text = state.map.graph, state.map.places, state.aim.aligned.text
+def crops_of(state: State) -> Crops:
+    """The crops that stand for all of the map."""
     frames = unmixing.sampled(state.seen.archive.frames)
     if not frames:
-        return
-    looks = standardised(np.concatenate([frame.embeddings for frame in frames]).astype(np.float64), text)
-    told = unmixing.told(text.temperature * looks)
+        return Crops((), np.zeros((0, len(state.aim.aligned.labels))))
+    found = np.concatenate([frame.embeddings for frame in frames]).astype(np.float64)
+    return Crops(tuple(frames), standardised(found, state.aim.aligned.text))
+
+
+def weigh(state: State, crops: Crops) -> None:
+    """How much the crops of this map tell of the labels."""
+    told = information.told(state.aim.aligned.text.temperature * crops.looks)
     if abs(told - state.labelling.told) > TOLD_TOLERANCE * told:
         state.labelling.told = told
-        places.unbelieved[:] = True
-    worth = unmixing.worth(told, cfg.unmixing)
+        state.map.places.unbelieved[:] = True
+
+
+def worth(state: State, cfg: Config) -> float:
+    """What the looks of this map are worth, in [0, 1]."""
+    return information.worth(state.labelling.told, cfg.information)
+
+
+def tell_apart(state: State, crops: Crops, cfg: Config) -> None:
+    """What all crops together say of each place beyond its neighbours."""
+    graph, places = state.map.graph, state.map.places
+    counts = worth(state, cfg)
     now = np.zeros_like(places.similarity)
-    if cfg.unmixing.rounds and worth > 0:
-        shares = unmixing.shown(frames, graph.positions_m, graph.radii_m)
-        apart = unmixing.unmixed(places.similarity, looks, shares, graph.arcs, state.map.weights, cfg=cfg.unmixing)
-        now = worth * (apart - places.similarity)
+    if crops.frames and cfg.unmixing.rounds and counts > 0:
+        shares = unmixing.shown(list(crops.frames), graph.positions_m, graph.radii_m)
+        apart = unmixing.unmixed(
+            places.similarity, crops.looks, shares, graph.arcs, state.map.weights, cfg=cfg.unmixing
+        )
+        now = counts * (apart - places.similarity)
     moved = (np.abs(now - places.correction) > CORRECTION_TOLERANCE).any(axis=1)
     places.correction[moved] = now[moved]
     places.doubtful |= moved
@@ -123,7 +150,8 @@ def tell_apart(state: State, cfg: Config) -> None:
 
 def _bias(state: State, scores: np.ndarray, cfg: Config) -> np.ndarray:
     """The bias of each label, from the scores (place, label) of the observed places."""
-    return label_bias(scores[:: max(len(scores) // BIAS_SAMPLE, 1)], state.aim.aligned.existence, cfg.balance)
+    doubted = msgspec.structs.replace(cfg.balance, limit=cfg.balance.limit * (1 - worth(state, cfg)))
+    return label_bias(scores[:: max(len(scores) // BIAS_SAMPLE, 1)], state.aim.aligned.existence, doubted)
 
 
 def compare(state: State) -> None:
@@ -184,11 +212,13 @@ def evaluate_experts(state: State, idle: bool, cfg: Config) -> None:
     reshape(state, cfg)
     surveyed = survey_due(state, idle, cfg)
     if surveyed:
+        crops = crops_of(state)
+        weigh(state, crops)
         adapt(state, cfg)
     compare(state)
     share(state, cfg)
     if surveyed:
-        tell_apart(state, cfg)
+        tell_apart(state, crops, cfg)
     rebalance(state, idle, cfg)
     places, rows = state.map.places, np.flatnonzero(state.map.places.doubtful)
     answers = votes(state, rows, cfg)

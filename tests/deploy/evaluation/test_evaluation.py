@@ -17,7 +17,7 @@ from prior_sg.deploy.evaluation.errors import EvaluationError
 from prior_sg.deploy.evaluation.kinds import BASELINES, ORACLES, SWEEPS
 from prior_sg.deploy.evaluation.metrics import Reliability
 from prior_sg.deploy.evaluation.object_metrics import OBJECT_SCORES
-from prior_sg.deploy.evaluation.page import page, reliability_points, true_scene
+from prior_sg.deploy.evaluation.page import page, reliability_points, risk_points, true_scene
 from prior_sg.deploy.evaluation.perception import CODE, Cache, Perception, code_digest, source_digest
 from prior_sg.deploy.evaluation.plots import line_plot
 from prior_sg.deploy.running.job import Counts, Result
@@ -322,7 +322,7 @@ def test_the_page_needs_nothing_else(results):
     for heading in ("Methods", "Ablations", "Oracles", "Sweep of radius", "Calibration", "Confusions", "Seconds"):
         assert f"<h2>{heading}</h2>" in html
     assert html.count("data:image/png;base64,") == 4  # truth, ours, argmax, oracle prior
-    assert html.count("<svg") == 4
+    assert html.count("<svg") == 5
 
 
 def test_tables_name_every_method(results):
@@ -345,6 +345,11 @@ def test_reliability_points_weigh_by_volume():
     one = Reliability(np.array([0, 10]), np.array([0, 0.8]), np.array([0, 1.0]))
     two = Reliability(np.array([0, 30]), np.array([0, 0.6]), np.array([0, 0.5]))
     assert reliability_points([one, two]) == [pytest.approx((0.65, 0.625))]
+
+
+def test_risk_points_take_the_firmest_first():
+    one = Reliability(np.array([30, 10]), np.array([0.2, 0.8]), np.array([0.5, 0.9]))
+    assert risk_points([one]) == [pytest.approx((0.25, 0.1)), pytest.approx((1.0, 0.4))]
 
 
 def test_plots_place_points_by_value():

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from prior_sg.deploy.evaluation.metrics import SCORES, assign, evaluate, reliability
+from prior_sg.deploy.evaluation.metrics import SCORES, Beliefs, assign, beliefs_of, evaluate, reliability, risk
 from prior_sg.deploy.truth import GroundTruth, voxel_owners
 from prior_sg.schemas.places import VoxelMap
 from prior_sg.schemas.regions import Region
@@ -78,8 +78,8 @@ def make_truth(*rooms, floors=(FLOOR,)):
 
 def without_ece(scores):
     """The other scores, of scenes without posteriors."""
-    assert math.isnan(scores["ece"])
-    return {key: value for key, value in scores.items() if key != "ece"}
+    assert math.isnan(scores["ece"]) and math.isnan(scores["risk_half"])
+    return {key: value for key, value in scores.items() if key not in {"ece", "risk_half"}}
 
 
 # Six places in a row, one voxel each; the left four in the kitchen, the right two in the hall.
@@ -95,7 +95,7 @@ def row_scores(place_regions, names):
 
 def test_perfect_is_one_everywhere():
     scores = row_scores([7, 7, 7, 7, 3, 3], {7: "kitchen", 3: "hall"})
-    assert list(scores) == [*KEYS, "ece"] == list(SCORES)
+    assert list(scores) == [*KEYS, "ece", "risk_half"] == list(SCORES)
     assert set(without_ece(scores).values()) == {1.0}
 
 
@@ -349,9 +349,19 @@ def test_calibration_worked_by_hand():
         posteriors=beliefs,
     )
     assert evaluate(scene, ROW, ROW_TRUTH)["ece"] == pytest.approx(1.1 / 6, abs=2e-4)  # float16 on the way
-    table = reliability(scene, assign(scene, ROW, ROW_TRUTH), ROW_TRUTH)
+    table = reliability(beliefs_of(scene, assign(scene, ROW, ROW_TRUTH), ROW_TRUTH))
     assert table.volumes.tolist() == [0, 0, 0, 0, 0, 0, 0, 4, 0, 2]
     assert table.accuracy.tolist() == [0, 0, 0, 0, 0, 0, 0, 0.5, 0, 1]
+
+
+def test_risk_is_that_of_the_firmest_part_and_equal_beliefs_count_alike():
+    """10 voxels at 0.9, 2 of them wrong; 10 at 0.5 of two places, one wrong."""
+    beliefs = Beliefs(np.array([8, 2, 6, 4]), np.array([0.9, 0.9, 0.5, 0.5]), np.array([True, False, True, False]))
+    assert risk(beliefs, 0.5) == pytest.approx(0.2)
+    assert risk(beliefs, 0.25) == pytest.approx(0.2)
+    assert risk(beliefs, 0.75) == pytest.approx((2 + 2) / 15)
+    assert risk(beliefs, 1.0) == pytest.approx(6 / 20)
+    assert np.isnan(risk(Beliefs(np.zeros(0, int), np.zeros(0), np.zeros(0, bool)), 0.5))
 
 
 def test_a_boundary_counts_up_to_half_a_metre_away():

@@ -6,7 +6,8 @@ from scipy import sparse
 
 from prior_sg.schemas.frames import Intrinsics
 from prior_sg.services.segmenter.core.appearance import unmixing
-from prior_sg.services.segmenter.core.appearance.unmixing import UnmixingConfig, shown, told, unmixed, worth
+from prior_sg.services.segmenter.core.appearance.information import InformationConfig, told, worth
+from prior_sg.services.segmenter.core.appearance.unmixing import UnmixingConfig, shown, unmixed
 from prior_sg.services.segmenter.core.evidence.kernel import Frame
 from prior_sg.services.segmenter.core.map.arcs import arcs_of
 
@@ -110,11 +111,16 @@ def test_crops_tell_what_their_beliefs_share_with_the_labels():
 
 
 def test_what_is_told_counts_between_two_bounds():
-    cfg = UnmixingConfig(least_information=0.1, full_information=0.3)
+    cfg = InformationConfig(least=0.1, full=0.3)
     assert [worth(share, cfg) for share in (0.0, 0.1, 0.2, 0.3, 0.9)] == pytest.approx([0, 0, 0.5, 1, 1])
 
 
-@pytest.mark.parametrize("wrong", [{"rounds": -1}, {"ridge": 0.0}, {"least_information": 0.7}])
+@pytest.mark.parametrize("wrong", [{"rounds": -1}, {"ridge": 0.0}])
 def test_settings_out_of_range_are_refused(wrong):
-    with pytest.raises(ValueError, match=r"range|below"):
+    with pytest.raises(ValueError, match="range"):
         UnmixingConfig(**wrong)
+
+
+def test_bounds_of_information_in_the_wrong_order_are_refused():
+    with pytest.raises(ValueError, match="below"):
+        InformationConfig(least=0.7)

@@ -28,6 +28,7 @@ from prior_sg.services.runtime.service import Ask, Identity
 from prior_sg.services.segmenter.core import inference, report
 from prior_sg.services.segmenter.core.aim import border_costs, region_concepts
 from prior_sg.services.segmenter.core.appearance.adaptation import Adaptation, AdaptationConfig
+from prior_sg.services.segmenter.core.appearance.information import InformationConfig
 from prior_sg.services.segmenter.core.appearance.label_bias import BalanceConfig
 from prior_sg.services.segmenter.core.appearance.unmixing import UnmixingConfig
 from prior_sg.services.segmenter.core.config import AdjacencyConfig, Config
@@ -385,7 +386,11 @@ def test_following_the_deltas_equals_the_snapshot():
 def test_what_is_kept_up_to_date_equals_what_is_found_afresh(seed):
     """After any history, asking every expert again and describing every region again changes nothing."""
     rng = np.random.default_rng(seed)
-    cfg = Config(balance=BalanceConfig(tolerance=0.0), adaptation=AdaptationConfig(tolerance=0.0))
+    cfg = Config(
+        balance=BalanceConfig(tolerance=0.0),
+        adaptation=AdaptationConfig(tolerance=0.0),
+        information=InformationConfig(least=0.5, full=1.5),  # crops that say nearly all are worth about a third here
+    )
     positions, edges, frames = world()
     run = Run(cfg=cfg).feed(task(), prior(ROOMS), place_delta(positions, edges))
     oven = ObjectView(ids=np.array([3]), positions_m=np.array([(2.0, 2.0, 1.0)]), concepts=np.array([(1.0, 0.0)]))
@@ -427,6 +432,16 @@ def test_what_is_kept_up_to_date_equals_what_is_found_afresh(seed):
         np.testing.assert_allclose(fresh.beliefs[place][1], posterior, atol=cfg.posterior_change + 1e-3)
         assert fresh.beliefs[place][2] == pytest.approx(unknown, abs=cfg.posterior_change + 1e-3)
     assert any(region.object_ids == [3] for region in before.values())
+
+
+def test_a_map_whose_crops_say_all_is_neither_balanced_nor_adapted():
+    positions, edges, frames = world()
+    inputs = (task(), prior(ROOMS), place_delta(positions, edges), *frames[::3], TICK, TICK)
+    doubting = Config(information=InformationConfig(least=0.98, full=0.99))
+    believed, doubted = (Run(cfg=cfg).feed(*inputs).state.labelling for cfg in (Config(), doubting))
+    assert 0.4 < believed.told < 0.98
+    assert np.abs(believed.bias).max() < 0.01 < np.abs(doubted.bias).max()
+    assert not believed.adaptation.directions.any() and doubted.adaptation.directions.any()
 
 
 def test_corrected_poses_equal_poses_known_from_the_start():

@@ -7,8 +7,7 @@ sought whose means, crop by crop, are the similarities of the crops (simultaneou
 Gilbert, 1972). A few rounds from the shared evidence, each smoothed along the place graph, keep what the crops do not
 determine.
 
-Reconstruction sharpens errors as it sharpens looks, so it counts by what the looks are worth: the information that a
-crop's belief over the labels gives beyond that of all crops, as a share of all there is to know.
+Reconstruction sharpens errors as it sharpens looks, so it counts by what the looks are worth, see `information`.
 """
 
 import msgspec
@@ -28,7 +27,6 @@ NUDGE_M = 0.15  # from the surface towards the camera, so that a wall belongs to
 REACH_M = 1.5  # surface further than this from a place's free sphere does not show it
 SOFT_M = 0.3  # distance from the free sphere at which a place's part of a cell counts 1 / e
 NEAREST = 3  # places that share a cell
-FEW_CROPS = 20  # crops at which half of what each tells counts as told of the map
 LEAST_SHOWN = 0.3  # share of a crop that must show places
 
 
@@ -39,14 +37,10 @@ class UnmixingConfig(msgspec.Struct, frozen=True, kw_only=True):
     steps: int = 4  # along the graph over which each round is smoothed
     mass: float = 5.0  # crops' worth of a place above which it counts no more in the smoothing
     ridge: float = 1.0  # crops' worth that each place is taken to have been seen as it is
-    least_information: float = 0.2  # below which looks are not told apart
-    full_information: float = 0.6  # from which they are in full
 
     def __post_init__(self) -> None:
         if not (self.rounds >= 0 and self.steps >= 0 and self.mass > 0 and self.ridge > 0):
             raise ValueError("rounds, steps, mass or ridge is out of range")
-        if not 0 <= self.least_information < self.full_information:
-            raise ValueError("least_information must be below full_information")
 
 
 def sampled(frames: list[Frame]) -> list[Frame]:
@@ -60,29 +54,6 @@ def shown(frames: list[Frame], positions_m: np.ndarray, radii_m: np.ndarray) -> 
     positions_m, radii_m = positions_m.astype(np.float64), radii_m.astype(np.float64)
     rows = [_shares(frame, positions_m, radii_m) for frame in frames]
     return sparse.vstack(rows).tocsr() if rows else sparse.csr_matrix((0, len(radii_m)))
-
-
-def told(scores: np.ndarray) -> float:
-    """What a crop tells of the labels on average, in [0, 1], from `scores` (crop, label) before the softmax.
-
-    It is the mutual information of crop and label over the logarithm of the labels: an encoder that sees one label
-    everywhere tells nothing. Few crops may well show one region only; they count by how sure each is.
-    """
-    count, labels = scores.shape
-    if not count or labels < 2:
-        return 0.0
-    beliefs = np.exp(scores - scores.max(axis=1, keepdims=True))
-    beliefs /= beliefs.sum(axis=1, keepdims=True)
-    doubt = _entropy(beliefs).mean() / np.log(labels)
-    known = _entropy(beliefs.mean(axis=0)) / np.log(labels)
-    few = FEW_CROPS / (count + FEW_CROPS)
-    return float((1 - few) * known + few - doubt)
-
-
-def worth(told_share: float, cfg: UnmixingConfig) -> float:
-    """How far the reconstruction counts, in [0, 1], when crops tell so much."""
-    span = cfg.full_information - cfg.least_information
-    return float(np.clip((told_share - cfg.least_information) / span, 0.0, 1.0))
 
 
 def unmixed(
@@ -106,10 +77,6 @@ def unmixed(
         correction = back @ missing / (seen + cfg.ridge)[:, None]
         found = found + smoothing.shared(correction, masses, near, weights, rows=everywhere, cfg=smooth)
     return found
-
-
-def _entropy(beliefs: np.ndarray) -> np.ndarray:
-    return -(beliefs * np.log(np.maximum(beliefs, np.finfo(float).tiny))).sum(axis=-1)
 
 
 def _shares(frame: Frame, positions_m: np.ndarray, radii_m: np.ndarray) -> sparse.csr_matrix:

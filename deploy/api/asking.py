@@ -1,0 +1,197 @@
+"""What can be asked of a scene, the same of one in memory, of a saved one and of a running system."""
+
+import warnings
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from prior_sg.deploy.api.errors import NotInSceneError
+from prior_sg.schemas.objects import SceneObject
+from prior_sg.schemas.priors import Prior
+from prior_sg.schemas.queries import (
+    MOST_LISTED,
+    MOST_RANKED,
+    Answer,
+    AnswersTo,
+    BeliefsOf,
+    ById,
+    ByLabel,
+    Details,
+    InBox,
+    InRadius,
+    Nearest,
+    Neighbour,
+    NeighboursOf,
+    ObjectsInRegions,
+    Point,
+    Question,
+    RegionBeliefs,
+    Route,
+    RouteBetween,
+    Spot,
+    Thing,
+    What,
+    WordsInUse,
+)
+from prior_sg.schemas.regions import Region
+from prior_sg.services.errors import PriorSgError
+
+NO_PRIOR = "the prior of this scene is not at hand, so labels were compared with the text by their names alone"
+PointLike = Sequence[float] | np.ndarray[Any, Any]
+SpotLike = str | Spot | Thing | Region | SceneObject | PointLike
+
+
+class Asking(ABC):
+    """Questions as methods. What cannot be understood in this scene, such as a label that nothing carries, raises
+    NotInSceneError, whose message names what is nearest; what has no answer, such as an empty box, gives an empty list.
+    `label` narrows to what carries it, whatever its case; `what` is "place", "region" or "object".
+    """
+
+    @abstractmethod
+    def ask(self, *questions: Question) -> list[Answer]:
+        """Answers to questions of `prior_sg.schemas.queries`, in their order, over one revision."""
+
+    @abstractmethod
+    def prior_of(self, digest: str) -> Prior | None:
+        """The prior of a digest, where it is at hand."""
+
+    @abstractmethod
+    def embed(self, space: str, phrases: Sequence[str]) -> np.ndarray[Any, Any]:
+        """Unit vectors (phrase, dim) of phrases in an embedding space. Raises PriorSgError when nothing here can."""
+
+    def near(
+        self, point_m: PointLike, k: int = 1, what: What = "object", label: str = "", radius_m: float | None = None
+    ) -> list[Thing]:
+        """The nearest `k` of a kind, the nearest first; with `radius_m`, none that is farther."""
+        found = self._things(Nearest(point_m=_point(point_m), what=what, label=label, limit=k))
+        return [one for one in found if radius_m is None or (one.distance_m or 0.0) <= radius_m]
+
+    def within(
+        self,
+        point_m: PointLike,
+        radius_m: float,
+        what: What | None = None,
+        label: str = "",
+        limit: int = MOST_LISTED,
+    ) -> list[Thing]:
+        """What is no farther than `radius_m`, the nearest first; without `what`, regions and objects."""
+        point = _point(point_m)
+        return self._things(InRadius(point_m=point, radius_m=radius_m, what=what, label=label, limit=limit))
+
+    def in_box(
+        self,
+        min_m: PointLike,
+        max_m: PointLike,
+        what: What | None = None,
+        label: str = "",
+        limit: int = MOST_LISTED,
+    ) -> list[Thing]:
+        """What lies in an axis-aligned box; without `what`, regions and objects."""
+        low, high = _point(min_m), _point(max_m)
+        return self._things(InBox(min_m=low, max_m=high, what=what, label=label, limit=limit))
+
+    def labelled(self, label: str, what: What | None = None, limit: int = MOST_LISTED) -> list[Thing]:
+        """What carries a label, the most probable first; without `what`, regions and objects."""
+        return self._things(ByLabel(label=label, what=what, limit=limit))
+
+    def objects_in(self, region: str = "", label: str = "", limit: int = MOST_LISTED) -> list[Thing]:
+        """Objects of a label that stand in regions of a label, the most probable first."""
+        return self._things(ObjectsInRegions(object_label=label, region_label=region, limit=limit))
+
+    def describe(self, what: What, number: int) -> Details:
+        """Everything about one place, region or object."""
+        details: Details = self._understood(ById(what=what, id=number))
+        return details
+
+    def neighbours(self, what: What, number: int) -> list[Neighbour]:
+        """Where one can go from a place or a region, or which region holds an object."""
+        neighbours: list[Neighbour] = self._understood(NeighboursOf(what=what, id=number)).neighbours
+        return neighbours
+
+    def route(self, start: SpotLike, goal: SpotLike, clearance_m: float = 0.0) -> Route:
+        """The shortest way on which nothing is closer than `clearance_m`. Both ends are a label, a point, a Thing, a
+        Region, a SceneObject or a Spot. `found` says whether there is one, and `reason` why not.
+        """
+        route: Route
+        (route,) = self.ask(RouteBetween(start=_spot(start), goal=_spot(goal), clearance_m=clearance_m))  # type: ignore[assignment]
+        return route
+
+    def candidates(self, region: int, limit: int = MOST_RANKED) -> RegionBeliefs:
+        """What a region may be: labels with their probabilities, what is unknown, and how much is a prediction."""
+        beliefs: RegionBeliefs = self._understood(BeliefsOf(region=region, limit=limit))
+        return beliefs
+
+    def find(self, text: str, what: What | None = None, limit: int = MOST_RANKED) -> list[Thing]:
+        """What answers a text such as "somewhere to sit and eat", the best first; at a score of 0.5 it is as likely
+        right as not. Without `what`, regions, objects, and the best place of each region.
+
+        Where no embedding of the text can be had, labels are compared with it word by word; where the scene's prior is
+        not at hand, by their names alone. A warning says so.
+        """
+        regions, objects, missing = self.likeness(text)
+        question = AnswersTo(text=text, regions=regions, objects=objects, what=what, limit=limit)
+        ranking: Any
+        (ranking,) = self.ask(question)
+        if missing:
+            warnings.warn(f"{ranking.note}: {missing}" if ranking.note else missing, stacklevel=2)
+        return list(ranking.things)
+
+    def likeness(self, text: str) -> tuple[dict[str, float], dict[str, float], str]:
+        """How probably regions and objects of each label answer a text, by label, both empty where nothing embeds it;
+        and in one sentence what is missing."""
+        from prior_sg.services.scene_store.core.queries import likeness as core
+
+        words: Any
+        (words,) = self.ask(WordsInUse())
+        if not words.space:
+            return {}, {}, "nothing has been seen in an embedding space yet"
+        try:
+            prior = self.prior_of(words.prior_digest)
+            meant = core.vocabulary(words, prior)
+            said = self.embed(words.space, [text])[0]
+            embedded = self._embedded(words.space, meant.phrases)
+        except PriorSgError as error:
+            return {}, {}, str(error)
+        return *core.likeness(said, embedded, meant), "" if prior is not None else NO_PRIOR
+
+    def _embedded(self, space: str, phrases: Sequence[str]) -> Mapping[str, np.ndarray[Any, Any]]:
+        """Vectors by phrase; those of a vocabulary are asked for once."""
+        known: dict[tuple[str, str], np.ndarray[Any, Any]] = self.__dict__.setdefault("_vectors", {})
+        missing = [phrase for phrase in phrases if (space, phrase) not in known]
+        if missing:
+            known |= zip(((space, phrase) for phrase in missing), self.embed(space, missing), strict=True)
+        return {phrase: known[space, phrase] for phrase in phrases}
+
+    def _things(self, question: Question) -> list[Thing]:
+        things: list[Thing] = self._understood(question).things
+        return things
+
+    def _understood(self, question: Question) -> Any:
+        answer: Any
+        (answer,) = self.ask(question)
+        if answer.reason:
+            raise NotInSceneError(answer.reason)
+        return answer
+
+
+def _spot(value: SpotLike) -> Spot:
+    match value:
+        case Spot():
+            return value
+        case str():
+            return Spot(label=value)
+        case Thing():
+            return Spot(what=value.what, id=value.id)
+        case Region():
+            return Spot(what="region", id=value.id)
+        case SceneObject():
+            return Spot(what="object", id=value.id)
+        case _:
+            return Spot(point_m=_point(value))
+
+
+def _point(value: PointLike) -> Point:
+    x, y, z = (float(number) for number in value)
+    return x, y, z

@@ -1,0 +1,285 @@
+"""`prior-sg query`: ask the map, in a sentence or by position, label and route."""
+
+import argparse
+import warnings
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rich.table import Table
+
+from prior_sg.deploy.cli.shared import Commands, add_bus, console
+from prior_sg.deploy.errors import UserError
+
+if TYPE_CHECKING:
+    from prior_sg.deploy.api.asking import Asking
+    from prior_sg.schemas.queries import Details, Difference, Neighbour, RegionBeliefs, Route, Thing
+
+FORMS = """\
+what to ask:
+  "somewhere to sit and eat"       regions, places and objects that answer a sentence, with scores
+  near X Y Z                       the nearest objects; --object LABEL, --what place, --limit N
+  within X Y Z RADIUS              all that is no farther
+  in-box X Y Z X Y Z               all between two corners
+  label LABEL                      all that carries it
+  objects [LABEL] [in REGION]      objects of a label in regions of a label
+  region ID, place ID, object ID   one of them in full: beliefs, neighbours, what it holds
+  route FROM TO                    the shortest way; each a label, place:ID, region:ID, object:ID or X,Y,Z
+  changed REVISION                 what is different since a revision (running store only)
+
+examples:
+  prior-sg query "somewhere to sit and eat" --scene out/demo
+  prior-sg query near 1.0 2.0 0.5 --what region
+  prior-sg query route kitchen bedroom --clearance 0.3"""
+WHATS = ("place", "region", "object")
+DECIMALS = 2
+
+
+def add_commands(commands: Commands) -> None:
+    """`query`."""
+    parser = commands.add(
+        "query",
+        cmd_query,
+        "ask the map: in a sentence, by position, label or route",
+        'prior-sg query "somewhere to sit and eat" --scene out/demo',
+    )
+    parser.epilog = FORMS
+    parser.add_argument("words", nargs="+", metavar="QUESTION", help="a sentence in quotes, or a form listed below")
+    parser.add_argument("--scene", type=Path, help="ask a saved scene: a run's folder or a file of docs/exports.md")
+    parser.add_argument("--what", choices=WHATS, help="only these (default: what suits the question)")
+    parser.add_argument("--label", default="", help="only what carries this label")
+    parser.add_argument("--object", default="", metavar="LABEL", help="only objects of this label")
+    parser.add_argument(
+        "--limit", type=int, default=10, metavar="N", help="list at most so many (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--clearance", type=float, default=0.0, metavar="METRES", help="of routes: nothing is closer to them"
+    )
+    parser.add_argument("--json", action="store_true", help="print JSON")
+    add_bus(parser)
+
+
+def cmd_query(arguments: argparse.Namespace) -> int:
+    """Ask, then print tables or JSON."""
+    import msgspec
+
+    from prior_sg.deploy.api.errors import NotInSceneError
+
+    if arguments.limit < 1:
+        raise UserError("--limit must be at least 1")
+    if arguments.object:
+        arguments.what, arguments.label = "object", arguments.object
+    word, *rest = arguments.words
+    run, show = ASKED.get(word, (_find, _show_things)) if rest else (_find, _show_things)
+    try:
+        with warnings.catch_warnings(record=True) as said, _opened(arguments) as scene:
+            warnings.simplefilter("always", UserWarning)
+            found = run(scene, arguments, rest if run is not _find else arguments.words)
+    except NotInSceneError as error:
+        raise UserError(str(error)) from error
+    notes = [str(warning.message) for warning in said]
+    if arguments.json:
+        print(msgspec.json.encode({"answer": found, "notes": notes}).decode())
+        return 0
+    for note in notes:
+        console.print(f"note: {note}")
+    show(found)
+    return 0
+
+
+class _Saved:
+    """A saved scene where a client, which is closed in the end, would be."""
+
+    def __init__(self, scene: "Asking") -> None:
+        self._scene = scene
+
+    def __enter__(self) -> "Asking":
+        return self._scene
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+
+def _opened(arguments: argparse.Namespace) -> Any:
+    """The running system, or a saved scene. Raises PriorSgError."""
+    if arguments.scene is None:
+        from prior_sg.deploy.api.client import Client
+
+        return Client(arguments.connect, arguments.robot)
+    from prior_sg.deploy.api.scene import Scene
+
+    return _Saved(Scene.read(arguments.scene, arguments.robot))
+
+
+def _find(scene: "Asking", arguments: argparse.Namespace, words: Sequence[str]) -> "list[Thing]":
+    return scene.find(" ".join(words), arguments.what, arguments.limit)
+
+
+def _near(scene: "Asking", arguments: argparse.Namespace, words: Sequence[str]) -> "list[Thing]":
+    point = _numbers(words, 3, "near X Y Z")
+    return scene.near(point, arguments.limit, arguments.what or "object", arguments.label)
+
+
+def _within(scene: "Asking", arguments: argparse.Namespace, words: Sequence[str]) -> "list[Thing]":
+    *point, radius_m = _numbers(words, 4, "within X Y Z RADIUS")
+    return scene.within(point, radius_m, arguments.what, arguments.label, arguments.limit)
+
+
+def _in_box(scene: "Asking", arguments: argparse.Namespace, words: Sequence[str]) -> "list[Thing]":
+    corners = _numbers(words, 6, "in-box X Y Z X Y Z")
+    return scene.in_box(corners[:3], corners[3:], arguments.what, arguments.label, arguments.limit)
+
+
+def _label(scene: "Asking", arguments: argparse.Namespace, words: Sequence[str]) -> "list[Thing]":
+    return scene.labelled(" ".join(words), arguments.what, arguments.limit)
+
+
+def _objects(scene: "Asking", arguments: argparse.Namespace, words: Sequence[str]) -> "list[Thing]":
+    at = words.index("in") if "in" in words else len(words)
+    return scene.objects_in(" ".join(words[at + 1 :]), " ".join(words[:at]) or arguments.label, arguments.limit)
+
+
+def _one(scene: "Asking", arguments: argparse.Namespace, words: Sequence[str]) -> "dict[str, Any]":
+    what: Any = arguments.words[0]
+    number = _id(words)
+    found: dict[str, Any] = {"details": scene.describe(what, number), "neighbours": scene.neighbours(what, number)}
+    return found | ({"beliefs": scene.candidates(number, arguments.limit)} if what == "region" else {})
+
+
+def _route(scene: "Asking", arguments: argparse.Namespace, words: Sequence[str]) -> "Route":
+    if len(words) != 2:
+        raise UserError("a route needs two ends: prior-sg query route kitchen bedroom (quote names of several words)")
+    return scene.route(_end(words[0]), _end(words[1]), arguments.clearance)
+
+
+def _changed(scene: "Asking", arguments: argparse.Namespace, words: Sequence[str]) -> "Difference":
+    from prior_sg.deploy.api.client import Client
+
+    if not isinstance(scene, Client):
+        raise UserError("a saved scene is of one revision; ask the running store, without --scene")
+    return scene.changed_since(_id(words))
+
+
+def _end(word: str) -> Any:
+    """A label, `region:7`, or a point `1.0,2.0,0.5`."""
+    from prior_sg.schemas.queries import Spot
+
+    what, colon, number = word.partition(":")
+    if colon and what in WHATS and number.lstrip("-").isdigit():
+        return Spot(what=what, id=int(number))  # type: ignore[arg-type]
+    parts = word.split(",")
+    try:
+        return [float(part) for part in parts] if len(parts) == 3 else word
+    except ValueError:
+        return word
+
+
+def _numbers(words: Sequence[str], count: int, form: str) -> list[float]:
+    try:
+        numbers = [float(word) for word in words]
+    except ValueError:
+        numbers = []
+    if len(numbers) != count:
+        raise UserError(f"say `{form}` in metres of the world, or put a sentence in quotes; see prior-sg query --help")
+    return numbers
+
+
+def _id(words: Sequence[str]) -> int:
+    if len(words) != 1 or not words[0].lstrip("-").isdigit():
+        raise UserError("name one number, such as `prior-sg query region 7`, or put a sentence in quotes")
+    return int(words[0])
+
+
+def _show_things(things: "Sequence[Thing]") -> None:
+    """One row each, with the columns that this question fills."""
+    if not things:
+        console.print("nothing")
+        return
+    extra = [name for name in ("score", "distance_m") if getattr(things[0], name) is not None]
+    table = Table(
+        *(name.removesuffix("_m") for name in extra), "what", "id", "label", "probability", "region", "position m"
+    )
+    for one in things:
+        label = f"{one.label or '(no label)'}{' (predicted)' if one.predicted else ''}"
+        region = "-" if one.region < 0 or one.what == "region" else str(one.region)
+        values = [f"{getattr(one, name):.{DECIMALS}f}" for name in extra]
+        table.add_row(*values, one.what, str(one.id), label, f"{one.probability:.2f}", region, _at(one.position_m))
+    console.print(table)
+
+
+def _show_one(found: "dict[str, Any]") -> None:
+    details: Details = found["details"]
+    neighbours: list[Neighbour] = found["neighbours"]
+    if details.thing is not None:
+        _show_things([details.thing])
+    if details.region is not None:
+        region = details.region
+        objects = f"objects {', '.join(map(str, region.object_ids))}" if region.object_ids else "no objects"
+        console.print(f"{region.place_count} places, {region.area_m2:.1f} m², {objects}")
+        _show_beliefs(found["beliefs"])
+    if details.place is not None:
+        place = details.place
+        beliefs = ", ".join(f"{one.label} {one.probability:.2f}" for one in place.beliefs)
+        console.print(f"radius {place.radius_m:.2f} m, unknown {place.unknown:.2f}; {beliefs}")
+    if details.object is not None:
+        low, high = _at(details.object.min_m), _at(details.object.max_m)
+        console.print(f"box from {low} to {high}, seen in {details.object.frames} keyframes")
+    for one in neighbours:
+        doors = f", {sum(way.door for way in one.ways)} doors of {len(one.ways)} ways" if one.ways else ""
+        length = f", {one.length_m:.2f} m" if one.length_m else ""
+        clearance = f", clearance {one.clearance_m:.2f} m" if one.clearance_m else ""
+        console.print(f"beside {one.thing.what} {one.thing.id} {one.thing.label}{length}{clearance}{doors}")
+
+
+def _show_beliefs(found: "RegionBeliefs") -> None:
+    table = Table("label", "probability")
+    for one in found.beliefs:
+        table.add_row(one.label, f"{one.probability:.2f}")
+    console.print(table)
+    console.print(f"unknown {found.unknown:.2f}; {found.predicted_share:.0%} of {found.places} places predicted")
+
+
+def _show_route(found: "Route") -> None:
+    if not found.found:
+        console.print(found.reason)
+        return
+    gaps = f"; {found.start_gap_m:.2f} m from the start, {found.goal_gap_m:.2f} m from the goal"
+    console.print(
+        f"{found.length_m:.2f} m over {len(found.place_ids)} places, clearance {found.clearance_m:.2f} m{gaps}"
+    )
+    console.print("through " + (" → ".join(f"{one.label} {one.id}" for one in found.regions) or "no region"))
+    table = Table("place", "position m")
+    for number, point_m in zip(found.place_ids, found.waypoints_m, strict=True):
+        table.add_row(str(number), _at(point_m))
+    console.print(table)
+
+
+def _show_difference(found: "Difference") -> None:
+    for title, things in (("appeared", found.appeared), ("gone", found.gone)):
+        if things:
+            console.print(title)
+            _show_things(things)
+    for one in found.renamed:
+        console.print(f"{one.thing.what} {one.thing.id}: {one.former_label or '(no label)'} → {one.thing.label}")
+    console.print(
+        f"places: {found.places_appeared} new, {found.places_gone} gone, {found.places_relabelled} with another label"
+    )
+
+
+def _at(point_m: Sequence[float]) -> str:
+    return " ".join(f"{value:.{DECIMALS}f}" for value in point_m)
+
+
+Asked = tuple[Callable[["Asking", argparse.Namespace, Sequence[str]], Any], Callable[[Any], None]]
+ASKED: dict[str, Asked] = {  # by first word; whatever else is a sentence
+    "near": (_near, _show_things),
+    "within": (_within, _show_things),
+    "in-box": (_in_box, _show_things),
+    "label": (_label, _show_things),
+    "objects": (_objects, _show_things),
+    "region": (_one, _show_one),
+    "place": (_one, _show_one),
+    "object": (_one, _show_one),
+    "route": (_route, _show_route),
+    "changed": (_changed, _show_difference),
+}

@@ -1,0 +1,206 @@
+"""Questions as methods: of a scene in memory, of a saved one, of a running system, and on the command line."""
+
+import json
+import math
+
+import msgspec
+import numpy as np
+import pytest
+
+import prior_sg
+from prior_sg.deploy.api.client import Client
+from prior_sg.deploy.api.scene import Scene
+from prior_sg.deploy.cli.main import main
+from prior_sg.schemas.codec import decode, encode
+from prior_sg.schemas.features import TextEmbeddings
+from prior_sg.schemas.priors import PriorList
+from prior_sg.schemas.queries import SceneQuery, Spot
+from prior_sg.schemas.topics import PRIOR, PRIORS, SCENE_QUERY, TEXT
+from prior_sg.services.runtime.bus import Hub, LocalBus
+from prior_sg.services.runtime.record import LogWriter
+from prior_sg.services.scene_store.core.queries.answering import reply
+from prior_sg.services.scene_store.core.queries.index import Index
+from prior_sg.services.scene_store.core.queries.ranking import calibrated
+from tests.deploy.api.test_scene import message
+from tests.help.world import prior
+
+ROBOT = "ada"
+PRIOR_OF_SCENE = prior(["kitchen", "hall"], environment="home", task="tidy up")
+AXES = {"kitchen": 0, "hall": 1, "oven": 0, "cook": 0, "leave": 1}
+
+
+def vectors(phrases):
+    """Whatever names a kitchen's things lies along one axis, a hall's along another."""
+    rows = np.full((len(phrases), 3), 0.1, np.float32)
+    for row, phrase in zip(rows, phrases, strict=True):
+        for word, axis in AXES.items():
+            row[axis] += word in phrase
+    return rows / np.linalg.norm(rows, axis=1, keepdims=True)
+
+
+class Told(Scene):
+    """A scene whose texts are embedded here."""
+
+    asked: list
+
+    def embed(self, space, phrases):
+        self.asked = [*getattr(self, "asked", []), list(phrases)]
+        return vectors(phrases)
+
+
+@pytest.fixture
+def scene():
+    return Told(message(prior_digest=PRIOR_OF_SCENE.digest()), PRIOR_OF_SCENE)
+
+
+def test_positions_labels_and_neighbours(scene):
+    assert [one.id for one in scene.near((2.0, 0.0, 1.0), k=2, what="place")] == [3, 2]
+    assert [one.label for one in scene.near(np.array([0.0, 0.0, 0.0]), label="Oven")] == ["oven"]
+    assert scene.near((9.0, 9.0, 9.0), radius_m=1.0) == []
+    assert [(one.what, one.id) for one in scene.within((0.0, 0.0, 1.0), 0.5)] == [("region", 4), ("object", 9)]
+    assert [one.id for one in scene.in_box((0.5, -1.0, 0.0), (3.0, 1.0, 2.0), what="place")] == [2, 3]
+    assert [one.id for one in scene.labelled("KITCHEN")] == [4]
+    assert [one.id for one in scene.objects_in("kitchen", "oven")] == [9]
+    assert [one.thing.id for one in scene.neighbours("region", 4)] == [7]
+    assert scene.describe("place", 1).place.radius_m == pytest.approx(0.5)
+    assert [one.label for one in scene.candidates(4).beliefs] == ["kitchen", "hall"]
+
+
+def test_what_cannot_be_understood_names_what_is_nearest(scene):
+    with pytest.raises(prior_sg.NotInSceneError, match="the nearest labels are: kitchen"):
+        scene.labelled("kitchn")
+    with pytest.raises(prior_sg.NotInSceneError, match="no region 3"):
+        scene.candidates(3)
+
+
+def test_a_route_between_whatever_names_a_place(scene):
+    ends = ["oven", scene.region("kitchen"), scene.message.objects[0], scene.labelled("oven")[0], (0, 0, 1)]
+    for end in ends:
+        assert scene.route(end, "hall").place_ids == [1, 2]
+    assert scene.route(Spot(what="place", id=1), (2, 0, 1)).length_m == pytest.approx(2)
+    assert "the widest one has 0.25 m" in scene.route((0, 0, 1), (2, 0, 1), clearance_m=0.3).reason
+
+
+def test_what_changed_between_two_scenes(scene):
+    later = Scene(msgspec.structs.replace(scene.message, regions=scene.message.regions[:1], objects=[]))
+    found = later.difference(scene)
+    assert [(one.what, one.id) for one in found.gone] == [("region", 7), ("object", 9)]
+
+
+def test_texts_are_answered_by_what_regions_and_objects_mean(scene):
+    cook, leave = scene.find("cook"), scene.find("leave", what="region")
+    assert cook[0].label in ("kitchen", "oven") and leave[0].label == "hall"
+    assert {one.what for one in cook} == {"region", "place", "object"}
+    assert all(0 < one.score < 1 for one in cook)
+    assert [len(asked) for asked in scene.asked][2:] == [1], "phrases of the prior are embedded once"
+
+
+def test_a_score_of_one_half_stands_where_it_was_fitted():
+    assert calibrated(0.3) == pytest.approx(0.5)
+    assert calibrated(1.0) == pytest.approx(1 / (1 + math.exp(2.5 * math.log(0.3))))
+    assert calibrated(0.1) < calibrated(0.2) < calibrated(0.9)
+
+
+def test_without_an_encoder_words_are_compared_and_that_is_said():
+    with pytest.warns(UserWarning, match="word by word.*no encoder serves"):
+        found = Scene(message(space="sim/0.3")).find("in the kitchen")
+    assert found[0].label == "kitchen"
+    with pytest.warns(UserWarning, match="nothing has been seen"):
+        Scene(message(space="")).find("in the kitchen")
+
+
+def test_without_its_prior_names_stand_alone_and_that_is_said():
+    with pytest.warns(UserWarning, match="not at hand"):
+        assert Told(message()).find("kitchen", what="region")[0].label == "kitchen"
+
+
+def test_a_running_system_gives_the_same_answers(scene):
+    hub = Hub()
+    bus = LocalBus(hub)
+    index = Index(scene.message, 5)
+    bus.serve(
+        SCENE_QUERY.key.format(robot=ROBOT),
+        lambda request: request.reply(encode(reply(index, decode(SceneQuery, request.payload)))),
+    )
+    bus.serve(PRIORS.key, lambda request: request.reply(encode(PriorList(priors=[PRIOR_OF_SCENE]))))
+    bus.serve(TEXT.key.format(space="s"), lambda request: request.reply(encode(embedded(request.payload))))
+    with Client(robot=ROBOT, bus=LocalBus(hub)) as client:
+        assert client.find("cook") == scene.find("cook")
+        assert client.near((2.0, 0.0, 1.0), what="place") == scene.near((2.0, 0.0, 1.0), what="place")
+        assert client.route("oven", "hall") == scene.route("oven", "hall")
+        assert client.answers().revision == 5
+        with pytest.raises(prior_sg.NotInSceneError, match="revision 2 is not kept; the scene is at revision 5"):
+            client.changed_since(2)
+
+
+def embedded(payload):
+    request = decode(TEXT.request, payload)
+    found = vectors([phrases[0] for phrases in request.concepts])
+    none = np.zeros(len(found), np.float32)
+    return TextEmbeddings(
+        space="s", embeddings=found, background_mean=none, background_std=none + 1, temperature=1.0, null_score=0.0
+    )
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("run")
+    log = LogWriter(folder / "log.mcap")
+    log.attach("scene.msgpack", "application/msgpack", encode(message(prior_digest=PRIOR_OF_SCENE.digest())))
+    log.add(PRIOR, PRIOR.key_of(PRIOR_OF_SCENE), encode(PRIOR_OF_SCENE), "gateway", 0, 1, 1)
+    log.close()
+    return folder
+
+
+def test_a_saved_scene_is_as_it_was_with_its_prior(saved):
+    for path in (saved, saved / "log.mcap"):
+        found = prior_sg.Scene.read(path, ROBOT)
+        assert found.message == message(prior_digest=PRIOR_OF_SCENE.digest())
+        assert found.prior == PRIOR_OF_SCENE
+
+
+def asked(capsys, saved, *words):
+    status = main(["query", *words, "--scene", str(saved), "--robot", ROBOT])
+    out, err = capsys.readouterr()
+    return status, out, err
+
+
+def test_the_command_answers_in_tables_and_json(capsys, saved):
+    status, out, _ = asked(capsys, saved, "near", "-1.0", "0", "0.5", "--object", "oven")
+    assert status == 0 and "oven" in out
+    status, out, _ = asked(capsys, saved, "route", "place:1", "0,0,1", "--json")
+    assert json.loads(out)["answer"]["place_ids"] == [1]
+    for words in (
+        ["region", "4"],
+        ["place", "1"],
+        ["object", "9"],
+        ["label", "hall"],
+        ["objects", "oven", "in", "kitchen"],
+    ):
+        status, out, _ = asked(capsys, saved, *words)
+        assert status == 0 and ("kitchen" in out or "hall" in out or "oven" in out)
+    for words in (["within", "0", "0", "1", "1"], ["in-box", "0", "0", "0", "2", "2", "2"]):
+        status, out, _ = asked(capsys, saved, *words, "--what", "place", "--json")
+        assert status == 0 and len(json.loads(out)["answer"]) >= 2
+
+
+def test_a_sentence_is_any_other_question_and_what_stands_in_is_said(capsys, saved):
+    status, out, _ = asked(capsys, saved, "where", "is", "the", "kitchen?", "--json")
+    found = json.loads(out)
+    assert status == 0 and found["answer"][0]["label"] == "kitchen" and "word by word" in found["notes"][0]
+
+
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        (["near", "the", "window"], "put a sentence in quotes"),
+        (["region", "kitchen"], "name one number"),
+        (["label", "kitchn"], "nearest labels are: kitchen"),
+        (["changed", "3"], "ask the running store"),
+        (["route", "kitchen"], "two ends"),
+        (["chairs", "--limit", "0"], "at least 1"),
+    ],
+)
+def test_what_cannot_be_asked_is_one_sentence(capsys, saved, words, reason):
+    status, _, err = asked(capsys, saved, *words)
+    assert status == 1 and reason in " ".join(err.split())
