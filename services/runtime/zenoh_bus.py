@@ -132,14 +132,14 @@ class ZenohRequest:
 
     def __init__(self, query: zenoh.Query) -> None:
         self._query = query
-        request, self._reply = called_with(str(query.key_expr))
+        self.key = str(query.key_expr)
+        request, self._reply = called_with(self.key)
         self.payload = _payload(request, query.payload, query.encoding)
 
     def reply(self, payload: bytes) -> None:
         """Answer; a caller that has gone away is no error."""
-        key = str(self._query.key_expr)
         with self._query:
-            _quietly(lambda: self._query.reply(key, payload, encoding=_encoding(self._reply)))
+            _quietly(lambda: self._query.reply(self.key, payload, encoding=_encoding(self._reply)))
 
     def refuse(self, reason: str) -> None:
         """Decline."""
