@@ -85,6 +85,8 @@ def _stay_up(arguments: argparse.Namespace, names: list[str]) -> int:
 
     require_files()
     beyond = beyond_this_host(arguments.listen, arguments.join)
+    if beyond is not None and (own := beyond.bundle.own).role == "robot" and own.name != arguments.robot:
+        raise UserError(f"these keys are of {own.name}, which writes nothing of {arguments.robot}; use --robot")
     if beyond is not None and arguments.no_router:
         raise UserError("--listen and --join are of the router that `up` starts; leave out --no-router")
     settings = [f"scene_store.path={arguments.out / 'scene.sqlite'}", f"ingest.speed={arguments.speed}"]

@@ -11,7 +11,13 @@ import zenoh
 
 from prior_sg.services.runtime import zenoh_bus
 from prior_sg.services.runtime.bus import BusError
-from prior_sg.services.runtime.endpoints import cannot_listen, check_endpoint, free_endpoint, parse_endpoint
+from prior_sg.services.runtime.endpoints import (
+    cannot_listen,
+    check_endpoint,
+    free_endpoint,
+    on_loopback,
+    parse_endpoint,
+)
 from prior_sg.services.runtime.zenoh_bus import ZenohBus, client_config, open_router, router_settings
 
 ROUTER_FILE = Path(__file__).parents[3] / "deploy" / "router.json5"
@@ -130,3 +136,30 @@ def test_a_port_taken_after_it_was_found_free_is_no_end(monkeypatch):
         endpoint, stop = zenoh_bus.open_free_router("tcp/127.0.0.1:0")
         stop()
     assert found == [] and endpoint.startswith("tcp/127.0.0.1:")
+
+
+@pytest.mark.parametrize(
+    ("endpoint", "local"),
+    [
+        ("tcp/127.0.0.1:1", True),
+        ("tcp/127.8.9.1:1", True),
+        ("tcp/localhost:1", True),
+        ("tcp/[::1]:1", True),
+        ("unixsock-stream//tmp/x", True),
+        ("tcp/0.0.0.0:1", False),
+        ("tcp/[::]:1", False),
+        ("udp/10.0.0.1:1", False),
+        ("tcp/localhost.example.org:1", False),
+    ],
+)
+def test_what_others_reach_is_refused_without_keys(endpoint, local):
+    assert on_loopback(endpoint) == local
+    if not local:
+        for use in (open_router, ZenohBus):
+            with pytest.raises(BusError, match="prior-sg keys init"):
+                use(endpoint)
+
+
+def test_a_router_file_of_one_host_listens_to_it_only():
+    endpoints = json.loads(zenoh.Config.from_file(str(ROUTER_FILE)).get_json("listen/endpoints"))
+    assert endpoints and all(map(on_loopback, endpoints))
