@@ -9,7 +9,20 @@ import threading
 
 def build_parser() -> argparse.ArgumentParser:
     """All commands with their options."""
-    from prior_sg.deploy.cli import check, encoders, export, jobs, keys, live, packing, priors, query, tools
+    from prior_sg.deploy.cli import (
+        check,
+        doors,
+        encoders,
+        export,
+        jobs,
+        keys,
+        live,
+        packing,
+        priors,
+        query,
+        tools,
+        view,
+    )
     from prior_sg.deploy.cli.shared import Commands, Parser, with_example
 
     parser = Parser(
@@ -18,7 +31,7 @@ def build_parser() -> argparse.ArgumentParser:
         **with_example("prior-sg demo"),
     )
     commands = Commands(parser, "command", "COMMAND")
-    for module in (jobs, live, query, check, packing, export, tools, priors, encoders, keys):
+    for module in (jobs, live, view, query, doors, check, packing, export, tools, priors, encoders, keys):
         module.add_commands(commands)
     return parser
 

@@ -1,4 +1,4 @@
-"""Who may write, answer, read and ask what: derived from the table of keys and the services' declarations (pure).
+"""Who may write, answer, read and ask what: derived from the table of keys and the services' declarations.
 
 A router knows a participant by its certificate. What is not granted is refused, in both directions: what a participant
 sends, and what is sent to it. Processes on the router's own host come over loopback and are not restricted.

@@ -22,13 +22,13 @@ MODULES = {  # by extra; what the build file lists there, by the names that code
     "dsg": ("spark_dsg",),
     "graph": ("networkx",),
     "fast-cut": ("maxflow",),
-    "postgres": ("psycopg", "pgvector"),
+    "postgres": ("psycopg",),
     "api": ("litestar", "uvicorn"),
     "mcp": ("mcp",),
     "view": ("viser",),
     "rerun": ("rerun",),
 }
-CONTAINS = {"encode": ("map",), "clip": ("encode", "map"), "export": ("clip", "encode", "map")}
+CONTAINS = {"view": ("map",), "encode": ("map",), "clip": ("encode", "map"), "export": ("clip", "encode", "map")}
 
 
 class ExtraMissing(ServiceError):
