@@ -8,7 +8,7 @@ WORKERS ?= 2
 # One process compiles for all others, whatever the caller's shell says.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo test test-llm check loops bench clean
+.PHONY: demo test coverage test-llm check loops bench clean
 .DEFAULT_GOAL := demo
 
 demo: $(VENV)/installed
@@ -16,12 +16,16 @@ demo: $(VENV)/installed
 
 test: $(VENV)/installed-dev
 	$(MAKE) --no-print-directory -j 2 check loops
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
+
+# Shares of the cores that tests run; measuring makes them half as slow again.
+coverage: $(VENV)/installed-dev
 	$(BIN)/coverage erase
 	PSG_TEST_COVERAGE=1 $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
 	$(BIN)/coverage combine --quiet
 	$(BIN)/coverage report --include='services/**/*.py,schemas/*.py' --omit='services/*/service.py,services/runtime/**'
 
-# Tests that compile most inner loops, which takes twice as long where coverage is measured.
+# Tests that compile most inner loops.
 loops: $(VENV)/installed-dev
 	$(BIN)/python -m pytest tests/test_pipeline.py tests/services/segmenter/test_region_cost.py \
 		-k 'could_not_use or neighbours'
