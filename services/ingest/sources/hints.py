@@ -7,7 +7,7 @@ from prior_sg.services.ingest.sources import dataset, generic, pose_lists
 
 FOLDERS_LOOKED_AT, NAMED = 200, 5
 KINDS = {
-    (".bag", ".db3"): "it is a ROS bag: export its images, depth and poses into a folder first",
+    (".zstd",): "it is a packed part of a ROS bag: give the folder that holds it and its metadata.yaml",
     (".zip", ".tar", ".gz", ".tgz", ".xz", ".bz2", ".7z", ".rar"): "it is an archive: unpack it and give the folder",
     (".ply", ".pcd", ".obj", ".glb", ".stl", ".las", ".laz"): "it holds geometry without images: give the recording",
     (".mp4", ".avi", ".mov", ".mkv", ".webm"): "it is a film without depth and poses: give a folder with these",
