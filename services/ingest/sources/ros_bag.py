@@ -18,6 +18,7 @@ from prior_sg.services.runtime import extras
 from prior_sg.services.runtime.record import LogError, holds_ros
 
 BAG, STORAGES, METADATA = ".bag", (".db3", ".mcap"), "metadata.yaml"
+MENDING = {BAG: "rosbag reindex", ".mcap": "mcap recover"}  # by ending; else a folder's
 BAGFILE = b"rosbag2_bagfile_information"
 TRANSFORMS = "geometry_msgs/TransformStamped[] transforms"  # rosbags brings no such message for ROS 1
 
@@ -42,7 +43,10 @@ def readable(path: Path) -> Iterator[None]:
     except (SourceError, extras.ExtraMissing):
         raise
     except Exception as error:  # rosbags, its parsers and decompressors raise nearly everything
-        raise SourceError(f"{path} cannot be read as a recording of ROS: {_said(error)}") from error
+        mend = MENDING.get(path.suffix, "ros2 bag reindex")
+        raise SourceError(
+            f"{path} cannot be read as a recording of ROS: {_said(error)}; `{mend}` may mend one that was cut off"
+        ) from error
 
 
 def _said(error: Exception) -> str:

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,11 +16,17 @@ from prior_sg.schemas.topics import KEYFRAME
 from prior_sg.services.geometry import inverse
 from prior_sg.services.ingest.core.config import Config
 from prior_sg.services.ingest.core.frames import BadFrame, RawFrame
+from prior_sg.services.ingest.core.headers import ImageError
 from prior_sg.services.ingest.core.options import ReadOptions
 from prior_sg.services.ingest.core.pixels import encoded, stored
+from prior_sg.services.ingest.core.poses import PoseError
+from prior_sg.services.ingest.core.ros.cameras import camera_fields
+from prior_sg.services.ingest.core.ros.images import color_file, depth_image, metres, shown_by
+from prior_sg.services.ingest.core.ros.transforms import TransformTree, transforms_of
 from prior_sg.services.ingest.core.selection import State
 from prior_sg.services.ingest.service import step
 from prior_sg.services.ingest.sources import SourceError, open_source
+from prior_sg.services.ingest.sources.base import FrameError, camera_of
 from tests.help.bags import COLOR, DEPTH, INFO, KINDS, OPTICAL, Maker, compressed_depth
 from tests.help.paths import SAMPLE
 from tests.help.room import CAMERA, color_of, depth_of, walk
@@ -341,6 +348,14 @@ def test_our_own_logs_stay_ours_and_files_alone_are_read(bags):
         assert (source.layout, source.total) == ("ros", len(WALK))
 
 
+def test_a_folder_that_lost_its_metadata_is_told_what_to_give(bags, tmp_path):
+    shutil.copytree(bags["sqlite3"], tmp_path / "cut")
+    (tmp_path / "cut/metadata.yaml").unlink()
+    with pytest.raises(SourceError, match=r"it holds recordings, give one of them: walk\.db3"):
+        open_source(tmp_path / "cut")
+    assert_the_walk(open_source(tmp_path / "cut/walk.db3"))
+
+
 def test_check_and_topics_on_the_command_line(bags, capsys):
     assert main(["check", "--json", str(bags["bag"])]) == 0
     report = json.loads(capsys.readouterr().out)
@@ -362,3 +377,36 @@ def test_check_and_topics_on_the_command_line(bags, capsys):
     assert 9 < topics[DEPTH]["rate_hz"] < 12 and topics["/tf_static"]["serves_as"] == "fixed transforms"
     assert main(["ros", "topics", str(SAMPLE)]) == 1
     assert "is no recording of ROS" in capsys.readouterr().err
+
+
+def read_whole(store, name, data):
+    """A message of any topic, all the way; raises what makes a bad frame."""
+    try:
+        message = store.deserialize_cdr(data, name)
+    except Exception as error:  # as sources/ros_bag.py does
+        raise FrameError(str(error)) from error
+    if hasattr(message, "transforms") or hasattr(message, "pose"):
+        tree = TransformTree(list(transforms_of(message)))
+        return tree.at("map", "odom", STAMPS_NS[0], MS)
+    if hasattr(message, "distortion_model"):
+        return camera_of(Path("info"), camera_fields(message, rectified=False))
+    return color_file(message) if shown_by(message) != "depth" else metres(depth_image(message), 0.001)
+
+
+def test_mutated_messages_are_bad_frames_at_most(count=400):
+    """50 000 by hand: python -c "from tests.services.ingest.test_ros_recordings import *; …(50_000)"."""
+    maker, rng = whole("mcap"), np.random.default_rng(7)
+    png = compressed_depth(encoded(DEPTHS_MM[0], ".png"), 10100.0, -1009.0)
+    maker.add("/c", STAMPS_NS[0], maker.compressed(STAMPS_NS[0], png, "32FC1; compressedDepth png"))
+    maker.add("/o", STAMPS_NS[0], maker.odometry(STAMPS_NS[0], "map", "odom", WALK[0]))
+    samples = {topic: message for topic, _, message in maker.messages}
+    plain = [(m.__msgtype__, bytes(maker.store.serialize_cdr(m, m.__msgtype__))) for m in samples.values()]
+    refused = 0
+    for trial in range(count):
+        name, data = plain[trial % len(plain)]
+        changed = bytearray(damaged(rng, data[:400]) + data[400:] if trial % 2 else damaged(rng, data))
+        try:
+            read_whole(maker.store, name, bytes(changed))
+        except (FrameError, ImageError, PoseError, SourceError, ValueError):
+            refused += 1
+    assert count / 4 < refused < count
