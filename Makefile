@@ -37,7 +37,7 @@ bench: $(VENV)/installed-dev
 $(VENV)/installed: pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed; set PYTHON=...")'
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[encode,dsg,fast-cut]'
+	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[encode,dsg,fast-cut,view]'
 	find schemas services deploy -name '*.nb[ci]' -delete # loops compiled for another version may name what it lacks now
 	touch $@
 

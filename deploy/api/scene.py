@@ -261,6 +261,14 @@ class Scene(Asking):
                 raise SaveError(f"cannot write {path} ({error.strerror}); choose another file") from error
         return text
 
+    def to_text(self, budget_tokens: int = 2000) -> str:
+        """In few words, for language models: the most useful first, what is left out said, and never more than so many
+        tokens, counted cautiously without a tokenizer. Raises ValueError below 200 and above 100 000.
+        """
+        from prior_sg.deploy.showing.text import scene_text
+
+        return scene_text(self.message, budget_tokens)
+
     def to_networkx(self) -> Any:
         """An undirected networkx.Graph. Nodes are ("place", id), ("region", id) and ("object", id), their columns are
         attributes; edges have `kind`: "way" between places and between adjacent regions, "in" from a place or an object

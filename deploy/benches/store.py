@@ -79,7 +79,7 @@ def _measure(place: str, places: int, deltas: int, asked: int, past: int) -> dic
                 runner.feed(Tick(stamp_ns=revision))
         return {
             **_percentiles("commit", commits),
-            **_percentiles("past", [_past(runner, int(rng.integers(2, deltas))) for _ in range(past)]),
+            **_past(runner, [int(rng.integers(2, deltas)) for _ in range(past)]),
             **_index(runner, hall, rng, asked),
             "disk_bytes_per_place": places_bytes / count,
             **_sizes(runner, first_bytes, deltas),
@@ -107,10 +107,15 @@ def _object(number: int, middle: list[float], low: list[float], high: list[float
     return SceneObject(id=number, label=LABELS[number % len(LABELS)], probability=0.5, known=0.5, frames=1, **box)
 
 
-def _past(runner: Runner, revision: int) -> float:
-    """Time of one scene of the past, from its snapshot: nothing of the last answer is used."""
-    runner.state.database.forget()
-    return _ms(runner.answer, SCENE, SceneRequest(robot=ROBOT, revision=revision))
+def _past(runner: Runner, revisions: list[int]) -> dict[str, float]:
+    """Scenes of the past, each from its snapshot: nothing of the last answer is used."""
+    spent, processor = [], []
+    for revision in revisions:
+        runner.state.database.forget()
+        started_s = time.process_time()
+        spent.append(_ms(runner.answer, SCENE, SceneRequest(robot=ROBOT, revision=revision)))
+        processor.append(1e3 * (time.process_time() - started_s))
+    return _percentiles("past", spent) | _percentiles("past_processor", processor)
 
 
 def _index(runner: Runner, hall: Hall, rng: np.random.Generator, asked: int) -> dict[str, float]:

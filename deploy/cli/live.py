@@ -3,8 +3,10 @@
 import argparse
 import time
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from prior_sg.deploy.cli.check import before_start
+from prior_sg.deploy.cli.doors import API_PORT, port_in
 from prior_sg.deploy.cli.jobs import add_run_options, settings_of
 from prior_sg.deploy.cli.shared import Commands, add_bus, console, open_client
 from prior_sg.deploy.cli.source_options import add_source_options, read_options
@@ -12,6 +14,10 @@ from prior_sg.deploy.edge import names_in
 from prior_sg.deploy.errors import UserError
 from prior_sg.deploy.running import serve
 from prior_sg.services.errors import PriorSgError
+from prior_sg.services.runtime import extras
+
+if TYPE_CHECKING:
+    from prior_sg.deploy.running.supervisor import Supervisor
 
 
 def add_commands(commands: Commands) -> None:
@@ -27,6 +33,9 @@ def add_commands(commands: Commands) -> None:
     up.add_argument("--source", default="", help="what ingest reads; default: nothing")
     up.add_argument("--out", type=Path, default=Path("out/up"), help="folder for the database and logs")
     up.add_argument("--no-router", action="store_true", help="use the router at --connect instead of starting one")
+    up.add_argument(
+        "--api", nargs="?", type=port_in, const=API_PORT, default=None, metavar="PORT", help="also serve HTTP there"
+    )
     add_run_options(up)
     add_source_options(up)
 
@@ -69,6 +78,8 @@ def cmd_up(arguments: argparse.Namespace) -> int:
     for name in names:
         if name not in BY_NAME:
             raise UserError(f"there is no service {name!r}; known: {', '.join(BY_NAME)}")
+    if arguments.api is not None:
+        extras.require("api", "prior-sg up --api")
     with claimed_folder(arguments.out):
         return _stay_up(arguments, names)
 
@@ -95,6 +106,8 @@ def _stay_up(arguments: argparse.Namespace, names: list[str]) -> int:
     try:
         for name in sorted(names, key=lambda name: name == "ingest"):
             supervisor.start(name, arguments.workers if BY_NAME[name].job is not None else 1)
+        if arguments.api is not None:
+            _open_api(supervisor, arguments.api)
         console.print(f"router {arguments.connect}; logs in {supervisor.log_folder}; Ctrl-C stops")
         while True:
             insist()
@@ -107,6 +120,13 @@ def _stay_up(arguments: argparse.Namespace, names: list[str]) -> int:
     finally:
         supervisor.stop()
         stop_router()
+
+
+def _open_api(supervisor: "Supervisor", port: int) -> None:
+    """HTTP on loopback, as one more process; for other hosts there is `prior-sg serve-api`."""
+    arguments = ["--host", "127.0.0.1", "--port", str(port)]
+    supervisor.start_door("api", "prior_sg.deploy.serving.process", arguments)
+    console.print(f"HTTP on http://127.0.0.1:{port}")
 
 
 def cmd_task(arguments: argparse.Namespace) -> int:

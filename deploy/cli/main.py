@@ -9,7 +9,7 @@ import threading
 
 def build_parser() -> argparse.ArgumentParser:
     """All commands with their options."""
-    from prior_sg.deploy.cli import check, encoders, export, jobs, live, packing, priors, query, ros, tools
+    from prior_sg.deploy.cli import check, doors, encoders, export, jobs, live, packing, priors, query, ros, tools, view
     from prior_sg.deploy.cli.shared import Commands, Parser, with_example
 
     parser = Parser(
@@ -18,7 +18,7 @@ def build_parser() -> argparse.ArgumentParser:
         **with_example("prior-sg demo"),
     )
     commands = Commands(parser, "command", "COMMAND")
-    for module in (jobs, live, query, check, ros, packing, export, tools, priors, encoders):
+    for module in (jobs, live, view, query, doors, check, ros, packing, export, tools, priors, encoders):
         module.add_commands(commands)
     return parser
 

@@ -35,6 +35,7 @@ class Child:
     arguments: list[str]
     log_path: Path
     threads: int
+    module: str = "prior_sg.deploy.running.serve"
     process: subprocess.Popen | None = None
     started_s: float = 0.0
     deaths: int = 0
@@ -47,7 +48,7 @@ class Child:
             sys.executable,
             "-P",  # nothing in the working directory is taken for a module of ours
             "-m",
-            "prior_sg.deploy.running.serve",
+            self.module,
             self.service,
             "--parent",
             str(os.getpid()),
@@ -106,6 +107,16 @@ class Supervisor:
             child = Child(service, instance, arguments, log_path, threads)
             child.start()
             self.children.append(child)
+
+    def start_door(self, name: str, module: str, arguments: list[str]) -> None:
+        """Start a process that is no service but serves others, such as the HTTP interface."""
+        self.log_folder.mkdir(parents=True, exist_ok=True)
+        log_path = self.log_folder / f"{name}.log"
+        log_path.unlink(missing_ok=True)
+        arguments = ["--robot", self.robot, "--connect", self.connect, *arguments]
+        child = Child(name, name, arguments, log_path, 1, module)
+        child.start()
+        self.children.append(child)
 
     def pids(self) -> dict[str, int]:
         """Process id of each running instance."""

@@ -61,6 +61,7 @@ def scene_of_graph(graph: spark_dsg.DynamicSceneGraph) -> Scene:
         objects=[_object(graph, item) for item in objects],
         trajectory=np.array(about.get("trajectory_m", ()), np.float32).reshape(-1, 3),
         origin_m=tuple(about.get("origin_m", (0.0, 0.0, 0.0))),
+        revision=-1,  # of no store
         **_edges(graph, places),
         **columns,
     )

@@ -36,6 +36,7 @@ def scene_of_json(told: dict[str, Any]) -> Scene:
         trajectory=_rows(told["trajectory_m"], 3),
         predicted_ids=np.array([place["id"] for place in places if place["predicted"]], np.int64),
         origin_m=tuple(told["origin_m"]),
+        revision=-1,  # of no store
         **_openings([place for place in places if place["frontier"]]),
         **_grounds([place for place in places if place["ellipse"]]),
     )

@@ -22,14 +22,20 @@ MODULES = {  # by extra; what the build file lists there, by the names that code
     "dsg": ("spark_dsg",),
     "graph": ("networkx",),
     "fast-cut": ("maxflow",),
-    "postgres": ("psycopg", "pgvector"),
+    "postgres": ("psycopg",),
     "api": ("litestar", "uvicorn"),
     "mcp": ("mcp",),
     "view": ("viser",),
     "rerun": ("rerun",),
     "ros": ("rosbags",),
 }
-CONTAINS = {"encode": ("map",), "clip": ("encode", "map"), "export": ("clip", "encode", "map"), "ros": ("map",)}
+CONTAINS = {
+    "view": ("map",),
+    "encode": ("map",),
+    "clip": ("encode", "map"),
+    "export": ("clip", "encode", "map"),
+    "ros": ("map",),
+}
 
 
 class ExtraMissing(ServiceError):

@@ -56,6 +56,7 @@ _ALL = (
     Format("rrd", "scene.rrd", "formats.recording:write_rrd", "Rerun, with a timeline", "rerun", MOMENTS, cloud=True),
     Format("csv", "tables", "formats.tables:write_csv", "spreadsheets: a folder of tables"),
     Format("html", "scene.html", "formats.page:write_html", "one page to look at and to pass on", moments=MOMENTS),
+    Format("text", "scene.txt", "formats.plain:write_text", "language models: in few words, the most useful first"),
     Format("png", "map.png", "formats.plain:write_png", "pictures: the map, and places in 3D in NAME-3d.png", "map"),
 )
 FORMATS = {entry.name: entry for entry in _ALL}

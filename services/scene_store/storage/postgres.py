@@ -162,9 +162,10 @@ class Postgres(Storage):
 
     def nearest(self, robot: int, kind: Indexed, point_m: Point, count: int) -> list[Found]:
         """All other robots stand farther away, so that the index alone says what comes first."""
-        first = f"SELECT * FROM {kind}s ORDER BY centre <-> cube(?), number LIMIT ?"
-        sql = f"SELECT {_columns(kind)} FROM ({first}) AS first WHERE robot = ?"
-        return _found(kind, self.run(sql, (_corner(point_m, robot), count, robot)))
+        order, point = "ORDER BY centre <-> cube(?), number", _corner(point_m, robot)
+        first = f"SELECT * FROM {kind}s {order} LIMIT ?"
+        sql = f"SELECT {_columns(kind)} FROM ({first}) AS first WHERE robot = ? {order}"
+        return _found(kind, self.run(sql, (point, count, robot, point)))
 
     def overlapping(self, robot: int, kind: Indexed, min_m: Point, max_m: Point) -> list[Found]:
         sql = f"SELECT {_columns(kind)} FROM {kind}s WHERE box && cube(?, ?) ORDER BY number"

@@ -1,0 +1,253 @@
+"""Questions over HTTP. Each handler asks the store; `revision` in an answer is the scene's that it is about."""
+
+from collections.abc import Callable
+from typing import Annotated, Any, TypeVar
+
+import msgspec
+from litestar import get, post
+from litestar.datastructures import State
+from litestar.params import FromPath, FromQuery, JSONBody, QueryParameter
+
+from prior_sg.deploy.api.errors import NotInSceneError
+from prior_sg.deploy.serving.errors import FaultyRequestError
+from prior_sg.deploy.serving.parameters import FAULTS, Coordinate, Count, Distance, Label, Robot, system_of
+from prior_sg.deploy.serving.spots import ENDS, spot_in
+from prior_sg.deploy.serving.system import EVERYWHERE, LONGEST_SEARCH, MOST_QUESTIONS
+from prior_sg.schemas.queries import (
+    MOST_LISTED,
+    MOST_RANKED,
+    Answer,
+    BeliefsOf,
+    ById,
+    ByLabel,
+    ChangedSince,
+    Details,
+    InBox,
+    InRadius,
+    Nearest,
+    Neighbourhood,
+    NeighboursOf,
+    Question,
+    RegionBeliefs,
+    RouteBetween,
+    SceneAnswer,
+    What,
+    WordsInUse,
+)
+from prior_sg.schemas.status import ServiceStatus
+
+Q = TypeVar("Q")
+
+
+class Questions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Questions that are answered over one revision, in their order."""
+
+    questions: Annotated[list[Question], msgspec.Meta(max_length=MOST_QUESTIONS)]
+
+
+class Answered(msgspec.Struct, frozen=True):
+    """One answer and the revision that it is about."""
+
+    robot: str
+    revision: int
+    stamp_ns: int
+    answer: Answer
+
+
+class RegionInFull(msgspec.Struct, frozen=True):
+    """All about a region."""
+
+    robot: str
+    revision: int
+    stamp_ns: int
+    details: Details
+    candidates: RegionBeliefs
+    neighbours: Neighbourhood
+
+
+class Alive(msgspec.Struct, frozen=True):
+    """Health of the system."""
+
+    processes: list[ServiceStatus]
+    silent: dict[str, str]  # why they do not answer, by instance
+
+
+@get("/health", responses=FAULTS)
+async def health(state: State) -> Alive:
+    """Every process that is alive, and of those that do not answer, why."""
+    found = await system_of(state).health()
+    return Alive(found.processes, found.silent)
+
+
+@get("/v1/robots")
+async def robots(state: State) -> list[str]:
+    """The robot that this service was started for, and all others whose scene has changed since."""
+    return system_of(state).robots()
+
+
+@post("/v1/{robot:str}/query", status_code=200, responses=FAULTS)
+async def query(state: State, robot: Robot, data: JSONBody[Questions]) -> SceneAnswer:
+    """Any questions, answered over one revision."""
+    return await system_of(state).answers(robot, *data.questions)
+
+
+@get("/v1/{robot:str}/regions", responses=FAULTS)
+async def regions(state: State, robot: Robot, label: Label = "", limit: Count = MOST_LISTED) -> Answered:
+    """Regions, of a label where one is given, with their places in the world and probabilities."""
+    return await _listed(state, robot, "region", label, limit)
+
+
+@get("/v1/{robot:str}/objects", responses=FAULTS)
+async def objects(state: State, robot: Robot, label: Label = "", limit: Count = MOST_LISTED) -> Answered:
+    """Objects, of a label where one is given."""
+    return await _listed(state, robot, "object", label, limit)
+
+
+@get("/v1/{robot:str}/regions/{number:int}", responses=FAULTS)
+async def region(state: State, robot: Robot, number: FromPath[int]) -> RegionInFull:
+    """One region: its outline and ways out, what else it may be, and where one can go from it."""
+    questions = (
+        _asked(ById, what="region", id=number),
+        _asked(BeliefsOf, region=number),
+        _asked(NeighboursOf, what="region", id=number),
+    )
+    found = await system_of(state).answers(robot, *questions)
+    details, candidates, around = found.answers
+    _there(details)
+    return RegionInFull(found.robot, found.revision, found.stamp_ns, details, candidates, around)  # type: ignore[arg-type]
+
+
+@get("/v1/{robot:str}/objects/{number:int}", responses=FAULTS)
+async def object_(state: State, robot: Robot, number: FromPath[int]) -> Answered:
+    """One object."""
+    return _there_in(await _one(state, robot, _asked(ById, what="object", id=number)))
+
+
+@get("/v1/{robot:str}/places/{number:int}", responses=FAULTS)
+async def place(state: State, robot: Robot, number: FromPath[int]) -> Answered:
+    """One place: its radius, its beliefs, its opening to unobserved space."""
+    return _there_in(await _one(state, robot, _asked(ById, what="place", id=number)))
+
+
+@get("/v1/{robot:str}/near", responses=FAULTS)
+async def near(
+    state: State,
+    robot: Robot,
+    *,
+    x: Coordinate,
+    y: Coordinate,
+    z: Coordinate,
+    what: FromQuery[What] = "object",
+    label: Label = "",
+    k: Count = 1,
+) -> Answered:
+    """The nearest `k` of a kind, the nearest first."""
+    return await _one(state, robot, _asked(Nearest, point_m=(x, y, z), what=what, label=label, limit=k))
+
+
+@get("/v1/{robot:str}/within", responses=FAULTS)
+async def within(
+    state: State,
+    robot: Robot,
+    *,
+    x: Coordinate,
+    y: Coordinate,
+    z: Coordinate,
+    radius_m: Distance,
+    what: FromQuery[What | None] = None,
+    label: Label = "",
+    limit: Count = MOST_LISTED,
+) -> Answered:
+    """What is no farther from a point, the nearest first; without `what`, regions and objects."""
+    question = _asked(InRadius, point_m=(x, y, z), radius_m=radius_m, what=what, label=label, limit=limit)
+    return await _one(state, robot, question)
+
+
+@get("/v1/{robot:str}/route", responses=FAULTS)
+async def route(
+    state: State,
+    robot: Robot,
+    start: Annotated[str, QueryParameter(name="from", max_length=120, description=ENDS)],
+    goal: Annotated[str, QueryParameter(name="to", max_length=120, description=ENDS)],
+    clearance_m: Distance = 0.0,
+) -> Answered:
+    """The shortest way over the place graph on which nothing is closer than `clearance_m`."""
+    return await _one(
+        state, robot, _asked(RouteBetween, start=spot_in(start), goal=spot_in(goal), clearance_m=clearance_m)
+    )
+
+
+@get("/v1/{robot:str}/search", responses=FAULTS)
+async def search(
+    state: State,
+    robot: Robot,
+    q: Annotated[str, QueryParameter(min_length=1, max_length=LONGEST_SEARCH)],
+    what: FromQuery[What | None] = None,
+    k: Count = MOST_RANKED,
+) -> Answered:
+    """What answers a text such as "somewhere to sit and eat", the best first; at a score of 0.5 it is as likely right
+    as not. `note` says so where only words were compared."""
+    return _first(await system_of(state).find(robot, q, what, k))
+
+
+@get("/v1/{robot:str}/changes", responses=FAULTS)
+async def changes(state: State, robot: Robot, since: Annotated[int, QueryParameter(ge=-1)]) -> Answered:
+    """What is new, gone and renamed since a revision; `reason` where that one is not kept."""
+    return await _one(state, robot, _asked(ChangedSince, revision=since))
+
+
+@get("/v1/{robot:str}/task", responses=FAULTS)
+async def task(state: State, robot: Robot) -> Answered:
+    """The task and environment that the regions follow, with the labels that regions can have and that are in use."""
+    return await _one(state, robot, WordsInUse())
+
+
+READING = [
+    health,
+    robots,
+    query,
+    regions,
+    objects,
+    region,
+    object_,
+    place,
+    near,
+    within,
+    route,
+    search,
+    changes,
+    task,
+]
+
+
+def _asked(kind: Callable[..., Q], **fields: Any) -> Q:
+    """A question. Raises FaultyRequestError where it holds what none may hold."""
+    try:
+        return kind(**fields)
+    except ValueError as error:
+        raise FaultyRequestError(str(error)) from error
+
+
+async def _one(state: State, robot: str, question: Question) -> Answered:
+    return _first(await system_of(state).answers(robot, question))
+
+
+def _first(found: SceneAnswer) -> Answered:
+    return Answered(found.robot, found.revision, found.stamp_ns, found.answers[0])
+
+
+async def _listed(state: State, robot: str, what: What, label: str, limit: int) -> Answered:
+    if label:
+        return await _one(state, robot, ByLabel(label=label, what=what, limit=limit))
+    return await _one(state, robot, InBox(**EVERYWHERE, what=what, limit=limit))
+
+
+def _there(answer: Answer) -> None:
+    """Raise NotInSceneError for what does not exist."""
+    if isinstance(answer, Details) and answer.thing is None:
+        raise NotInSceneError(answer.reason)
+
+
+def _there_in(answered: Answered) -> Answered:
+    _there(answered.answer)
+    return answered

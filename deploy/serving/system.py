@@ -1,0 +1,192 @@
+"""The running system as servers want it: every robot through one connection, off the event loop, bounded."""
+
+import asyncio
+import contextlib
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, TypeVar
+
+import msgspec
+import numpy as np
+
+from prior_sg.deploy.api.client import Client, Health
+from prior_sg.deploy.api.errors import NotInSceneError, TaskError
+from prior_sg.deploy.api.scene import Scene
+from prior_sg.deploy.serving.errors import BusyError, FaultyRequestError
+from prior_sg.schemas.codec import DecodeError, decode
+from prior_sg.schemas.names import fault_of_robot, normal
+from prior_sg.schemas.priors import Prior, fault_of_task
+from prior_sg.schemas.queries import MOST_RANKED, AnswersTo, Question, SceneAnswer, What
+from prior_sg.schemas.scene import Scene as SceneMessage
+from prior_sg.schemas.scene import SceneRevision
+from prior_sg.schemas.topics import SCENE_REVISION
+from prior_sg.services.runtime.bus import Bus, Sample
+
+MOST_ROBOTS = 64  # whose clients are kept
+MOST_WRITTEN = 8  # forms of scenes that are kept
+READERS, WRITERS = 16, 4  # threads
+MOST_QUESTIONS, MOST_POSES, MOST_LIMIT = 64, 10_000, 10_000
+LONGEST_SEARCH = 500  # characters
+EVERYWHERE: dict[str, Any] = {"min_m": (-1e9,) * 3, "max_m": (1e9,) * 3}
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class TaskGiven:
+    """What came of a task: its prior, and its scene where the regions followed in time."""
+
+    prior: Prior
+    scene: Scene | None
+    seconds: float
+    note: str = ""  # why there is no scene
+
+
+class System:
+    """Asks with one connection; what changes something gets one of its own, for as long as it takes."""
+
+    def __init__(self, open_bus: Callable[[], Bus], robot: str) -> None:
+        self.robot = robot
+        self._open_bus, self._bus = open_bus, open_bus()
+        self._clients: OrderedDict[str, Client] = OrderedDict()
+        self._written: OrderedDict[tuple[str, str, str], bytes] = OrderedDict()
+        self._lock = threading.Lock()
+        self._seen = {robot}
+        self._changing: set[str] = set()
+        self._reading = ThreadPoolExecutor(READERS, "reader")
+        self._writing = ThreadPoolExecutor(WRITERS, "writer")
+        self.on_revision: list[Callable[[SceneRevision], None]] = []  # each is called on a foreign thread
+        self._bus.subscribe(SCENE_REVISION, SCENE_REVISION.pattern("*"), self._saw, lambda topic, number: None)
+
+    def close(self) -> None:
+        """Leave the system; what waits for it ends."""
+        self._reading.shutdown(wait=False, cancel_futures=True)
+        self._writing.shutdown(wait=False, cancel_futures=True)
+        self._bus.close()
+
+    def robots(self) -> list[str]:
+        """The robot this was started for, and every other whose scene has changed since."""
+        return sorted(self._seen)
+
+    async def answers(self, robot: str, *questions: Question) -> SceneAnswer:
+        """Answers of the store. Raises FaultyRequestError, NotInSceneError, BusError."""
+        if len(questions) > MOST_QUESTIONS:
+            raise FaultyRequestError(
+                f"{len(questions)} questions are asked at once: at most {MOST_QUESTIONS} are taken"
+            )
+        for question in questions:
+            if getattr(question, "limit", 0) > MOST_LIMIT:
+                raise FaultyRequestError(f"the limit is above {MOST_LIMIT}: ask for fewer")
+        found: SceneAnswer = await self._read(robot, lambda client: client.answers(*questions))
+        if found.revision < 0:
+            raise NotInSceneError(f"nothing is stored of a robot {robot!r}")
+        return found
+
+    async def find(self, robot: str, text: str, what: What | None = None, limit: int = MOST_RANKED) -> SceneAnswer:
+        """What answers a text, as `Client.find`. Raises as `answers`."""
+        if not text.strip() or len(text) > LONGEST_SEARCH:
+            raise FaultyRequestError(f"a text to search for has 1 to {LONGEST_SEARCH} characters")
+        regions, objects, missing = await self._read(robot, lambda client: client.likeness(text))
+        question = AnswersTo(text=text, regions=regions, objects=objects, what=what, limit=limit)
+        found = await self.answers(robot, question)
+        ranking: Any = found.answers[0]
+        if missing:
+            told = msgspec.structs.replace(ranking, note=f"{ranking.note}: {missing}".removeprefix(": "))
+            found = msgspec.structs.replace(found, answers=[told])
+        return found
+
+    async def scene(self, robot: str) -> Scene:
+        """The scene as stored now. Raises as `answers`."""
+        return await self._read(robot, lambda client: client.scene())
+
+    async def tag(self, robot: str) -> str:
+        """Another one whenever the scene is another. Raises as `answers`."""
+        now = await self.answers(robot)
+        return f"{now.revision}-{now.stamp_ns}"
+
+    async def written(self, robot: str, tag: str, form: str, write: Callable[[SceneMessage], bytes]) -> bytes:
+        """The scene as `write` puts it, once for each tag and form. Raises as `answers`."""
+        key = (robot, tag, form)
+        if key not in self._written:
+            self._written[key] = await self._read(robot, lambda client: write(client.scene().message))
+            while len(self._written) > MOST_WRITTEN:
+                self._written.popitem(last=False)
+        return self._written[key]
+
+    async def health(self) -> Health:
+        """What every process says of itself. Raises BusError."""
+        return await self._read(self.robot, lambda client: client.health())
+
+    async def give_task(
+        self, robot: str, task: str, environment: str, regions: Sequence[str], wait_s: float
+    ) -> TaskGiven:
+        """Switch the task and wait. Raises FaultyRequestError, BusyError, TaskError, NoPriorError, BusError."""
+        task, environment = normal(task), normal(environment)
+        if not task:
+            raise FaultyRequestError("the task is empty: say what the robot is to do")
+        if fault := fault_of_task(environment, task, list(regions)):
+            raise FaultyRequestError(fault)
+        return await self._change(robot, lambda client: _switch(client, task, environment, regions, wait_s))
+
+    async def correct_poses(self, robot: str, poses: dict[int, np.ndarray[Any, Any]], wait_s: float) -> float:
+        """Give keyframes other poses; seconds until the map took them. Raises as `give_task`, and PosesError."""
+        if len(poses) > MOST_POSES:
+            raise FaultyRequestError(f"{len(poses)} poses are given at once: at most {MOST_POSES} are taken")
+        return await self._change(robot, lambda client: client.correct_poses(poses, wait_s))
+
+    async def _read(self, robot: str, ask: Callable[[Client], T]) -> T:
+        client = self._client(robot)
+        return await asyncio.get_running_loop().run_in_executor(self._reading, ask, client)
+
+    async def _change(self, robot: str, change: Callable[[Client], T]) -> T:
+        """One change of a robot at a time."""
+        _check_robot(robot)
+        if robot in self._changing:
+            raise BusyError(f"{robot} is being given a task or poses: try again when that is done")
+        self._changing.add(robot)
+        try:
+            job = partial(self._with_client, robot, change)
+            return await asyncio.get_running_loop().run_in_executor(self._writing, job)
+        finally:
+            self._changing.discard(robot)
+
+    def _with_client(self, robot: str, change: Callable[[Client], T]) -> T:
+        with Client(robot=robot, bus=self._open_bus()) as client:
+            return change(client)
+
+    def _client(self, robot: str) -> Client:
+        """The client that asks for a robot; those asked for least recently are forgotten."""
+        _check_robot(robot)
+        with self._lock:
+            client = self._clients.pop(robot, None) or Client(robot=robot, bus=self._bus)
+            self._clients[robot] = client
+            while len(self._clients) > MOST_ROBOTS:
+                self._clients.popitem(last=False)
+        return client
+
+    def _saw(self, sample: Sample) -> None:
+        with contextlib.suppress(DecodeError):
+            revision = decode(SceneRevision, sample.payload)
+            if len(self._seen) < MOST_ROBOTS:
+                self._seen.add(revision.robot)
+            for told in self.on_revision:
+                told(revision)
+
+
+def _check_robot(robot: str) -> None:
+    if fault := fault_of_robot(robot):
+        raise FaultyRequestError(fault)
+
+
+def _switch(client: Client, task: str, environment: str, regions: Sequence[str], wait_s: float) -> TaskGiven:
+    found: list[Prior] = []
+    try:
+        switch = client.switch(task, environment or None, regions, wait_s, on_prior=found.append)
+    except TaskError as error:
+        if not found:
+            raise
+        return TaskGiven(found[0], None, wait_s, str(error))
+    return TaskGiven(switch.prior, switch.scene, switch.seconds)

@@ -1,0 +1,214 @@
+"""A scene in few words, for language models and people: the most useful first, within a budget of tokens (pure).
+
+Tokens are counted without a tokenizer, and rather too many than too few: a word is a token for every three of its
+letters begun, a digit, a sign and a line break are one each, and a letter outside ASCII is one for each of its bytes.
+Tokenizers of language models join more than that, except in strings of letters that are no words.
+
+Names and tasks come from outside: they are written on one line, without control characters, and shortened.
+"""
+
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from prior_sg.schemas.names import shown
+from prior_sg.schemas.objects import SceneObject
+from prior_sg.schemas.regions import NO_REGION, Region
+from prior_sg.schemas.scene import Scene
+
+MOST_TOKENS, LEAST_TOKENS = 100_000, 200
+USUAL_TOKENS = 2000
+LONGEST_NAME, LONGEST_TASK = 15, 40  # tokens
+FOR_OMISSIONS = 60  # tokens that are kept for saying what was left out
+CANDIDATES, LEAST_BELIEF = 3, 0.05
+MOST_IDS = 8  # of objects with one label in one region
+REGIONS = "Regions, with the width of the ways out of them:\n"
+PIECES = re.compile(r"[A-Za-z]+|[^ ]")
+
+
+@dataclass
+class Budget:
+    """Tokens that are left, and how many pieces of each kind found no room."""
+
+    left: int
+    omitted: dict[str, int] = field(default_factory=dict)
+
+    def take(self, text: str, kind: str) -> bool:
+        """Whether the text still fits; if so, it is paid for. `kind` is what it is, in the plural."""
+        cost = tokens_of(text)
+        if cost > self.left:
+            self.omitted[kind] = self.omitted.get(kind, 0) + 1
+            return False
+        self.left -= cost
+        return True
+
+
+def scene_text(scene: Scene, budget_tokens: int = USUAL_TOKENS) -> str:
+    """The scene as lines of text of at most `budget_tokens`. Raises ValueError below 200 and above 100 000."""
+    if not LEAST_TOKENS <= budget_tokens <= MOST_TOKENS:
+        raise ValueError(f"a budget lies between {LEAST_TOKENS} and {MOST_TOKENS} tokens, not at {budget_tokens}")
+    head = "".join(_head(scene))
+    budget = Budget(budget_tokens - tokens_of(head) - FOR_OMISSIONS)
+    body = [*_camera(scene, budget), *_regions(scene, budget), *_elsewhere(scene, budget), *_frontiers(scene, budget)]
+    return head + "".join(body) + _omissions(budget.omitted)
+
+
+def tokens_of(text: str) -> int:
+    """How many tokens a text has, counted as above."""
+    return sum(_cost(piece) for piece in PIECES.findall(text))
+
+
+def _cost(piece: str) -> int:
+    if piece.isascii():
+        return -(-len(piece) // 3)
+    return len(piece.encode())
+
+
+def _head(scene: Scene) -> Iterator[str]:
+    """What it is about; at most 130 tokens."""
+    task, environment = _short(scene.task, LONGEST_TASK), _short(scene.environment, LONGEST_NAME)
+    yield f'Task: "{task}" in "{environment}".\n' if task else "No task yet.\n"
+    yield f"{len(scene.regions)} regions, {len(scene.objects)} objects, {len(scene.place_ids)} places; "
+    yield "positions (x, y, z) in metres, z up; # is an id, p a probability.\n"
+
+
+def _camera(scene: Scene, budget: Budget) -> Iterator[str]:
+    if len(scene.trajectory) and budget.take(
+        line := f"The camera was last at {_point(scene.trajectory[-1])}.\n", "other lines"
+    ):
+        yield line
+
+
+def _regions(scene: Scene, budget: Budget) -> list[str]:
+    """A line for each region that has room; then, as far as there is room, its ways out, contents and candidates."""
+    if not scene.regions or not budget.take(REGIONS, "regions"):
+        return []
+    ranked = sorted(scene.regions, key=lambda region: (region.predicted, -region.area_m2 * region.probability))
+    lines = {region.id: line for region in ranked if budget.take(line := _summary(region) + "\n", "regions")}
+    listed = [region for region in ranked if region.id in lines]
+    names = {region.id: _name(region) for region in scene.regions}
+    objects = {item.id: item for item in scene.objects}
+    parts: tuple[Callable[[Region], str], ...] = (
+        lambda region: _ways(region, names),
+        lambda region: _contents(region, objects),
+        lambda region: _candidates(scene, region),
+    )
+    for write in parts:
+        for region in listed:
+            if (part := write(region)) and budget.take(part, "details of regions"):
+                lines[region.id] = lines[region.id].removesuffix("\n") + part + "\n"
+    return [REGIONS, *lines.values()]
+
+
+def _summary(region: Region) -> str:
+    guess = " predicted from its surroundings" if region.predicted else ""
+    zone = f" of {_short(region.parent)}" if region.parent else ""
+    where = f"{region.area_m2:.1f} m2 around {_point(region.position_m)}"
+    return f"- {_name(region)}{zone}: p {region.probability:.2f}{guess}, {where}"
+
+
+def _ways(region: Region, names: dict[int, str]) -> str:
+    """The widest way to each neighbour."""
+    widest: dict[int, tuple[float, bool]] = {}
+    for way in region.transitions:
+        widest[way.region] = max(widest.get(way.region, (0.0, False)), (way.clearance_m, way.door))
+    told = [
+        f"{names[other]} ({'door' if door else 'opening'} {2 * clearance_m:.1f} m)"
+        for other, (clearance_m, door) in sorted(widest.items())
+        if other in names
+    ]
+    told += [names[other] for other in sorted(set(region.neighbour_ids) - set(widest)) if other in names]
+    return f"; to {', '.join(told)}" if told else ""
+
+
+def _contents(region: Region, objects: dict[int, SceneObject]) -> str:
+    """The objects in it by label, those of most objects first."""
+    held = [objects[number] for number in region.object_ids if number in objects]
+    return f"; holds {_by_label(held)}" if held else ""
+
+
+def _by_label(items: list[SceneObject]) -> str:
+    found: dict[str, list[int]] = {}
+    for item in items:
+        found.setdefault(_short(item.label), []).append(item.id)
+    unnamed, told = found.pop("", []), []
+    for label, numbers in sorted(found.items(), key=lambda entry: -len(entry[1])):
+        more = f" and {len(numbers) - MOST_IDS} more" if len(numbers) > MOST_IDS else ""
+        told.append(f"{label} {' '.join(f'#{number}' for number in numbers[:MOST_IDS])}{more}")
+    return ", ".join(told + ([f"{len(unnamed)} unnamed objects"] if unnamed else []))
+
+
+def _candidates(scene: Scene, region: Region) -> str:
+    """What else it may be, by the mean belief of its places."""
+    rows = scene.place_regions == region.id
+    if not rows.any():
+        return ""
+    beliefs = scene.posteriors[rows].astype(np.float32).mean(axis=0)
+    best = [
+        f"{_short(scene.labels[column])} {beliefs[column]:.2f}"
+        for column in np.argsort(-beliefs, kind="stable")
+        if scene.labels[column] != region.label and beliefs[column] >= LEAST_BELIEF
+    ][:CANDIDATES]
+    if region.unknown >= LEAST_BELIEF:
+        best.append(f"unknown {region.unknown:.2f}")
+    return f"; or {', '.join(best)}" if best else ""
+
+
+def _elsewhere(scene: Scene, budget: Budget) -> Iterator[str]:
+    """Objects in no region, and places without one."""
+    held = {number for region in scene.regions for number in region.object_ids}
+    loose = [item for item in scene.objects if item.id not in held]
+    if loose and budget.take(line := f"In no region: {_by_label(loose)}.\n", "other lines"):
+        yield line
+    bare = int((scene.place_regions == NO_REGION).sum())
+    if bare and budget.take(line := f"{bare} places belong to no region yet.\n", "other lines"):
+        yield line
+
+
+def _frontiers(scene: Scene, budget: Budget) -> Iterator[str]:
+    """Openings to unobserved space, the largest first."""
+    if not len(scene.frontier_ids) or not budget.take(title := "Openings to unobserved space:\n", "openings"):
+        return
+    yield title
+    row_of = {place: row for row, place in enumerate(scene.place_ids.tolist())}
+    region_of = {region.id: _name(region) for region in scene.regions}
+    for column in np.argsort(-scene.frontier_areas_m2, kind="stable").tolist():
+        row = row_of.get(int(scene.frontier_ids[column]))
+        if row is None:
+            continue
+        holder = region_of.get(int(scene.place_regions[row]), "no region")
+        towards = _point(scene.frontier_directions[column])
+        line = f"- {scene.frontier_areas_m2[column]:.1f} m2 in {holder} at {_point(scene.positions_m[row])}"
+        if budget.take(line := f"{line} towards {towards}\n", "openings"):
+            yield line
+
+
+def _omissions(omitted: dict[str, int]) -> str:
+    """At most FOR_OMISSIONS tokens."""
+    if not omitted:
+        return ""
+    return f"Left out: {', '.join(f'{count} {kind}' for kind, count in omitted.items())}.\n"
+
+
+def _name(region: Region) -> str:
+    return f"{_short(region.label) or 'unnamed region'} #{region.id}"
+
+
+def _short(text: str, tokens: int = LONGEST_NAME) -> str:
+    """On one line, without what a terminal would obey, and no longer than so many tokens."""
+    plain = shown(" ".join(text.split())).replace('"', "'")
+    if tokens_of(plain) <= tokens:
+        return plain
+    kept = ""
+    for piece in re.findall(r"[A-Za-z]{1,3}|.", plain):
+        if tokens_of(kept + piece) > tokens - len("…".encode()):
+            break
+        kept += piece
+    return kept.rstrip() + "…"
+
+
+def _point(point_m: tuple[float, float, float] | np.ndarray) -> str:
+    x, y, z = (round(float(value), 1) + 0.0 for value in point_m)
+    return f"({x:.1f}, {y:.1f}, {z:.1f})"
