@@ -3,6 +3,7 @@
 A transform `parent_from_child` places a frame in its parent; stamps are nanoseconds.
 """
 
+import math
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -14,6 +15,7 @@ from prior_sg.services.geometry import inverse, pose_from_quaternion
 from prior_sg.services.ingest.core.poses import PoseError
 
 LONGEST_GAP_NS = 1_000_000_000  # between two stamps over which is interpolated
+LONGEST_QUATERNION = 1e6  # one beyond, or below its inverse, is no rotation but a damaged message
 NEARLY_PARALLEL = 1 - 1e-9  # cosine of half an angle beyond which an arc is a line
 FIXED_FRAMES = ("map", "world", "odom")  # by preference
 
@@ -42,9 +44,9 @@ class Stamped:
     quaternion_xyzw: tuple[float, float, float, float]
 
     def is_motion(self) -> bool:
-        """Whether the numbers are finite and the quaternion has a direction."""
-        length = float(np.linalg.norm(self.quaternion_xyzw))
-        return bool(np.isfinite((*self.position_m, length)).all()) and length > 1e-6
+        """Whether the numbers are finite and the quaternion is one of a rotation, if not normalised."""
+        length = math.hypot(*self.quaternion_xyzw)
+        return bool(np.isfinite(self.position_m).all()) and 1 / LONGEST_QUATERNION < length < LONGEST_QUATERNION
 
 
 def transforms_of(message: Any) -> Iterator[Stamped]:
