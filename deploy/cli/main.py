@@ -20,6 +20,7 @@ def build_parser() -> argparse.ArgumentParser:
         packing,
         priors,
         query,
+        ros,
         tools,
         view,
     )
@@ -31,7 +32,7 @@ def build_parser() -> argparse.ArgumentParser:
         **with_example("prior-sg demo"),
     )
     commands = Commands(parser, "command", "COMMAND")
-    for module in (jobs, live, view, query, doors, check, packing, export, tools, priors, encoders, keys):
+    for module in (jobs, live, view, query, doors, check, ros, packing, export, tools, priors, encoders, keys):
         module.add_commands(commands)
     return parser
 

@@ -20,9 +20,9 @@ from prior_sg.schemas.frames import Intrinsics
 from prior_sg.services.geometry import back_project, transform
 from prior_sg.services.ingest.core.frames import BadFrame, RawFrame
 from prior_sg.services.ingest.core.lidar import depth_image
+from prior_sg.services.ingest.core.pairing import associate
 from prior_sg.services.ingest.sources import SourceError, open_source
 from prior_sg.services.ingest.sources.scannet import resampled
-from prior_sg.services.ingest.sources.tum import associate
 
 ROOM = np.array(((0.5, -1.0, 0.0), (5.5, 3.0, 2.6)))  # lower and upper corner, metres, z up
 PILLAR = np.array(((3.2, 1.6, 0.0), (3.9, 2.0, 1.9)))
