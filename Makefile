@@ -5,17 +5,30 @@ LLM := .venv-llm
 LLM_PORT ?= 18080
 WORKERS ?= 2
 
-.PHONY: demo test test-llm check bench clean
+# One process compiles for all others, whatever the caller's shell says.
+export PYTHONDONTWRITEBYTECODE :=
+
+.PHONY: demo test coverage test-llm check loops bench clean
 .DEFAULT_GOAL := demo
 
 demo: $(VENV)/installed
 	$(BIN)/prior-sg demo
 
-test: check
+test: $(VENV)/installed-dev
+	$(MAKE) --no-print-directory -j 2 check loops
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
+
+# Shares of the cores that tests run; measuring makes them half as slow again.
+coverage: $(VENV)/installed-dev
 	$(BIN)/coverage erase
 	PSG_TEST_COVERAGE=1 $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
 	$(BIN)/coverage combine --quiet
 	$(BIN)/coverage report --include='services/**/*.py,schemas/*.py' --omit='services/*/service.py,services/runtime/**'
+
+# Tests that compile most inner loops.
+loops: $(VENV)/installed-dev
+	$(BIN)/python -m pytest tests/test_pipeline.py tests/services/segmenter/test_region_cost.py \
+		-k 'could_not_use or neighbours'
 
 # A real language model of 270 M parameters behind a server on loopback. Building the server takes many minutes, once.
 test-llm: $(VENV)/installed-dev $(LLM)/installed
@@ -34,16 +47,25 @@ check: $(VENV)/installed-dev
 bench: $(VENV)/installed-dev
 	$(BIN)/prior-sg bench all --json
 
-$(VENV)/installed: pyproject.toml constraints.txt
-	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed; set PYTHON=...")'
-	$(PYTHON) -m venv $(VENV)
-	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[encode,dsg,fast-cut]'
-	find schemas services deploy -name '*.nb[ci]' -delete # loops compiled for another version may name what it lacks now
+INSTALL := $(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt
+# Loops compiled for another version may name what it lacks now.
+FORGET_LOOPS := find schemas services deploy -name '*.nb[ci]' -delete
+
+$(VENV)/installed: pyproject.toml constraints.txt | $(BIN)/pip
+	$(INSTALL) -e '.[encode,dsg,fast-cut,view]'
+	$(FORGET_LOOPS)
 	touch $@
 
-$(VENV)/installed-dev: $(VENV)/installed
-	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
-	touch $@
+# Holds all of the other. Bytecode is written for what is used, when it is used.
+$(VENV)/installed-dev: pyproject.toml constraints.txt | $(BIN)/pip
+	$(INSTALL) --no-compile -e '.[dev]'
+	$(FORGET_LOOPS)
+	touch $(VENV)/installed $@
+
+$(BIN)/pip: # one that finds versions in half the time of those that come with Python
+	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed; set PYTHON=...")'
+	$(PYTHON) -m venv $(VENV)
+	$(INSTALL) --upgrade pip
 
 $(LLM)/installed:
 	$(PYTHON) -m venv $(LLM)

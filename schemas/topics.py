@@ -9,6 +9,7 @@ Delivery is one word:
 """
 
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -59,6 +60,10 @@ class Topic:
             fields["digest"] = message.digest()  # type: ignore[attr-defined]
         return self.key.format(**{name: key_part(text) for name, text in fields.items() if f"{{{name}}}" in self.key})
 
+    def fault_of(self, key: str, message: Message) -> str:
+        """Why this message has no business on the key it came on, as a sentence; empty when it belongs there."""
+        return _fault_of(key, lambda: self.key_of(message))
+
     def pattern(self, robot: str) -> str:
         """The key expression that matches this topic of `robot` (`*` = of all robots)."""
         return self.key.format(robot=robot, digest="*", question="*")
@@ -77,6 +82,18 @@ class Query:
         """The key this request is asked on. Raises ValueError where a field cannot be part of one."""
         fields = {name: getattr(request, name) for name in request.__struct_fields__ if f"{{{name}}}" in self.key}
         return self.key.format(**{name: "/".join(map(key_part, text.split("/"))) for name, text in fields.items()})
+
+    def fault_of(self, key: str, request: Message) -> str:
+        """Why this request has no business on the key it came on, as a sentence; empty when it belongs there."""
+        return _fault_of(key, lambda: self.key_of(request))
+
+
+def _fault_of(key: str, own_key: Callable[[], str]) -> str:
+    try:
+        own = own_key()
+    except ValueError as error:
+        return str(error)
+    return "" if key == own else f"it came on {key} and says it belongs on {own}"
 
 
 KEYFRAME = Topic("KEYFRAME", Keyframe, f"{ROOT}/{{robot}}/keyframe", "every", 2, recorded=True, cache=32)
@@ -190,6 +207,18 @@ def called_with(key: str) -> tuple[type[Message] | None, type[Message] | None]:
 def worker_keys(job: Topic, worker: str, group: str = "") -> tuple[str, str]:
     """The queryable and the liveliness token of one worker of a job's pool; `*` as worker gives the patterns.
 
-    The token also names the worker's group: workers of one group do the same work, each job goes to one of each group.
+    A worker answers on `queryable/*`, whose last part is the robot that gives the job (`job_key`). The token also names
+    the worker's group: workers of one group do the same work, each job goes to one of each group.
     """
     return f"{job.key}/run/{worker}", "/".join((f"{job.key}/live/{worker}", *([group] if group else [])))
+
+
+def job_key(job: Topic, worker: str, robot: str) -> str:
+    """Where a robot (`*` = any) gives a job to a worker."""
+    return f"{worker_keys(job, worker)[0]}/{robot}"
+
+
+def fault_of_job(job: Topic, key: str, message: Message) -> str:
+    """Why this job has no business on the key it came on, as a sentence; empty when it belongs there."""
+    robot = getattr(message, "robot", "")
+    return "" if key.rpartition("/")[2] == robot else f"it came on {key} and is of the robot {robot!r}"

@@ -19,6 +19,11 @@ def user_cache() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or expanded("~/.cache")) / "prior-sg"
 
 
+def user_settings() -> Path:
+    """Where what a user has set up for this program lies; it need not exist."""
+    return Path(os.environ.get("XDG_CONFIG_HOME") or expanded("~/.config")) / "prior-sg"
+
+
 def temporary_cache(name: str) -> Path:
     """A folder of this user's alone below the temporary folder, the same for every process. Raises OSError."""
     folder = _private(Path(tempfile.gettempdir()) / f"prior-sg-{os.getuid()}") / name

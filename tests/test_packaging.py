@@ -95,6 +95,7 @@ def with_core_only(*arguments):
         (["demo"], "encode"),
         (["eval", "x", "--environment", "y"], "encode"),
         (["topics"], "map"),
+        (["ros", "topics", "x.bag"], "ros"),
         (["priors", "list"], "map"),
     ],
 )

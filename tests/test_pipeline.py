@@ -36,7 +36,7 @@ from prior_sg.schemas.topics import (
     PYRAMID,
     REGION_DELTA,
     TOPICS,
-    worker_keys,
+    job_key,
 )
 from prior_sg.services.runtime.client import BusClient
 from prior_sg.services.runtime.jobs.dispatcher import CREDITS
@@ -112,7 +112,7 @@ class Trouble(threading.Thread):
                         )
         for worker in [name for name, service in client.alive().items() if service == "feature_pyramid"]:
             for payload in GARBAGE:
-                client.bus.call(worker_keys(ENCODE, worker)[0], payload, 5.0, lambda answer: None)
+                client.bus.call(job_key(ENCODE, worker, "garbage"), payload, 5.0, lambda answer: None)
 
     def command(self, *arguments):
         command = [sys.executable, "-m", "prior_sg.deploy.cli.main", *arguments, "--connect", self.endpoint]

@@ -16,7 +16,7 @@ from prior_sg.deploy.api.errors import NotInSceneError, PosesError, TaskError
 from prior_sg.deploy.api.kept import kept
 from prior_sg.deploy.api.scene import Scene
 from prior_sg.deploy.settings import DEFAULT_CONNECT, DEFAULT_ROBOT
-from prior_sg.schemas.codec import DecodeError, Message, decode
+from prior_sg.schemas.codec import DecodeError, Message
 from prior_sg.schemas.features import TextEmbeddings, TextRequest
 from prior_sg.schemas.frames import PoseUpdate
 from prior_sg.schemas.priors import Prior, PriorList, PriorRequest, Task
@@ -39,7 +39,7 @@ from prior_sg.schemas.topics import (
     SCENE_REVISION,
     TEXT,
 )
-from prior_sg.services.runtime.bus import Bus, BusError, Sample
+from prior_sg.services.runtime.bus import Bus, BusError, Sample, message_in
 from prior_sg.services.runtime.client import BusClient
 from prior_sg.services.runtime.zenoh_bus import ZenohBus
 
@@ -184,7 +184,7 @@ class Client(Asking):
             raise TaskError(f"{self.robot} has no environment yet; name one (--environment) with the task")
         task = Task(
             robot=self.robot,
-            stamp_ns=time.time_ns(),
+            stamp_ns=self._client.task_stamp_ns(self.robot),
             environment=environment,
             task=text,
             regions=list(regions or ()),
@@ -219,7 +219,7 @@ class Client(Asking):
 
         def see(sample: Sample) -> None:
             with contextlib.suppress(DecodeError):
-                entry = decode(Consumed, sample.payload)
+                entry: Consumed = message_in(sample)
                 if (entry.service, entry.topic, entry.writer) == ("place_graph", POSE_UPDATE.name, self._client.writer):
                     taken.put(entry.sequence)
 
@@ -263,7 +263,7 @@ class Client(Asking):
 
     def _saw(self, sample: Sample) -> None:
         with contextlib.suppress(DecodeError):
-            message = decode(sample.topic.type, sample.payload)
+            message: Message = message_in(sample)
             with self._lock:
                 for follower in self._followers[sample.topic.name]:
                     follower.put(message)
@@ -283,7 +283,7 @@ class _Arrivals:
     """When the regions of a task arrived, by the prior they follow."""
 
     def __init__(self, task: Task) -> None:
-        self._task = task
+        self._task, self._given_ns = task, time.time_ns()
         self._since_s = time.monotonic()
         self._found_s: dict[str, float] = {}
         self._changed = threading.Condition()
@@ -291,8 +291,8 @@ class _Arrivals:
     def see(self, sample: Sample) -> None:
         """A delta sent after the task was given counts; the history may hold older ones of the same task."""
         with contextlib.suppress(DecodeError):
-            delta = decode(RegionDelta, sample.payload)
-            if sample.sent_ns > self._task.stamp_ns and delta.task == self._task.task:
+            delta: RegionDelta = message_in(sample)
+            if sample.sent_ns > self._given_ns and delta.task == self._task.task:
                 with self._changed:
                     self._found_s.setdefault(delta.prior_digest, time.monotonic())
                     self._changed.notify()

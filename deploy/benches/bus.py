@@ -1,21 +1,28 @@
 """What the typed bus costs on top of bare Zenoh: two processes, as every writer and reader are, joined by a router.
 
 Both ways carry the same bytes: typed messages are encoded, published, validated and handed to a handler; bare ones are
-put and handed to a callback. They take turns, and the median of their ratios counts.
+put and handed to a callback. They take turns, and the median of their ratios counts. So does a third, typed and by TLS
+with keys from both processes to the router: twice what a robot and an edge have between them.
 """
 
 import multiprocessing
 import os
 import statistics
+import tempfile
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from multiprocessing.connection import Connection
+from pathlib import Path
 from typing import Any
 
 import msgspec
 import zenoh
 
+from prior_sg.deploy.keys.authority import Authority
+from prior_sg.deploy.keys.routing import beyond_this_host
+from prior_sg.deploy.settings import use_keys
 from prior_sg.schemas.codec import decode, encode
 from prior_sg.schemas.frames import Keyframe
 from prior_sg.schemas.topics import KEYFRAME
@@ -31,23 +38,39 @@ TIMEOUT_S = 60.0
 
 def bus_bench(keyframe: Keyframe) -> tuple[dict, dict]:
     """Typed publish → handler through a router, as share of bare Zenoh put → callback of the same size."""
-    endpoint = free_endpoint("tcp/127.0.0.1:0")
-    stop = open_router(endpoint)
     metrics: dict[str, float] = {}
-    try:
+    with _routers() as (endpoint, tls):
         for name, (size, number) in SIZES.items():
             half = os.urandom(size // 2)
             message = msgspec.structs.replace(keyframe, color=half, depth=half)
-            rates = [
-                (_rate(endpoint, message, number, True), _rate(endpoint, message, number, False)) for _ in range(TURNS)
-            ]
-            metrics[f"throughput_ratio_{name}"] = statistics.median(typed / bare for typed, bare in rates)
-            metrics[f"messages_per_s_{name}"] = statistics.median(typed for typed, _ in rates)
-            metrics[f"bare_messages_per_s_{name}"] = statistics.median(bare for _, bare in rates)
-    finally:
-        stop()
+            ways = ((endpoint, True), (endpoint, False), (tls, True))
+            rates = [[_rate(where, message, number, typed) for where, typed in ways] for _ in range(TURNS)]
+            metrics[f"throughput_ratio_{name}"] = statistics.median(typed / bare for typed, bare, _ in rates)
+            metrics[f"messages_per_s_{name}"] = statistics.median(typed for typed, _, _ in rates)
+            metrics[f"bare_messages_per_s_{name}"] = statistics.median(bare for _, bare, _ in rates)
+            metrics[f"tls_messages_per_s_{name}"] = statistics.median(secured for _, _, secured in rates)
+            metrics[f"tls_ratio_{name}"] = statistics.median(secured / typed for typed, _, secured in rates)
     metrics["throughput_ratio"] = min(value for name, value in metrics.items() if name.startswith("throughput"))
     return metrics, {"path": "process, router, process on loopback", "turns": TURNS}
+
+
+@contextmanager
+def _routers() -> Iterator[tuple[str, str]]:
+    """A plain router, and the TLS endpoint of another; this process and its children get keys for that."""
+    plain, local = free_endpoint("tcp/127.0.0.1:0"), free_endpoint("tcp/127.0.0.1:0")
+    tls = free_endpoint("tls/127.0.0.1:0")
+    with tempfile.TemporaryDirectory() as folder:
+        authority = Authority.create(Path(folder))
+        authority.add("edge", "edge")
+        authority.add("robot", "bench")
+        use_keys(str(authority.bundle("edge")))
+        stops = [open_router(plain), open_router(local, beyond_this_host([tls], []))]
+        use_keys(str(authority.bundle("bench")))
+        try:
+            yield plain, tls
+        finally:
+            for stop in stops:
+                stop()
 
 
 def _rate(endpoint: str, message: Keyframe, number: int, typed: bool) -> float:

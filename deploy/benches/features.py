@@ -39,6 +39,7 @@ from prior_sg.services.runtime.zenoh_bus import ZenohBus, open_router
 BATCHES = (1, 4, 16)
 ROUNDS = 3
 POOL_FRAMES = 30
+ROBOT = "bench"
 SMALL = "conse/efficientnet-lite0/minilm-l6-v2"  # of the attacked pool: more jobs, so more can go wrong
 PERIOD_S = 1.0  # between attacks
 WINDOW = 8  # jobs outstanding, as ingest has them
@@ -56,8 +57,8 @@ class Pool:
     jobs: JobPool = field(init=False)
 
     def __post_init__(self) -> None:
-        self.bus.subscribe(PYRAMID, PYRAMID.pattern("bench"), self._saw, lambda topic, number: None)
-        self.jobs = JobPool(self.bus, ENCODE, time.monotonic, self._ended)
+        self.bus.subscribe(PYRAMID, PYRAMID.pattern(ROBOT), self._saw, lambda topic, number: None)
+        self.jobs = JobPool(self.bus, ENCODE, ROBOT, time.monotonic, self._ended)
 
     def _saw(self, sample: Sample) -> None:
         pyramid = decode(Pyramid, sample.payload)
@@ -112,7 +113,7 @@ def pool(workers: int, settings: list[str]) -> Iterator[Pool]:
 def numbered(keyframes: list[Keyframe]) -> Iterator[Keyframe]:
     """The keyframes over and over, with numbers that rise."""
     for number, keyframe in enumerate(itertools.cycle(keyframes)):
-        yield msgspec.structs.replace(keyframe, robot="bench", frame_id=number)
+        yield msgspec.structs.replace(keyframe, robot=ROBOT, frame_id=number)
 
 
 def sample_crops(keyframes: list[Keyframe], count: int, side_px: int) -> np.ndarray:

@@ -73,6 +73,13 @@ def bus() -> tuple[dict, dict]:
     return bus_bench(_sample_keyframes()[0])
 
 
+def view() -> tuple[dict, dict]:
+    """The live page; see `prior_sg.deploy.benches.view`."""
+    from prior_sg.deploy.benches.view import view_bench  # needs the extra `view`
+
+    return view_bench()
+
+
 def e2e() -> tuple[dict, dict]:
     """Keyframe in hand → region delta that follows from it, encoder time excluded, without transport."""
     keyframes = _sample_keyframes()
@@ -114,6 +121,7 @@ BENCHES: dict[str, Callable[[], tuple[dict, dict]]] = {
 LONG: dict[str, Callable[[float], tuple[dict, dict]]] = {  # no part of `all`; the pool lasts as long as it is told to
     "pool": attacked_pool,
     "store_crashes": lambda seconds: crashes(),
+    "view": lambda seconds: view(),  # needs an extra and a browser
 }
 
 

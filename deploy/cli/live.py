@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from prior_sg.deploy.cli.check import before_start
 from prior_sg.deploy.cli.doors import API_PORT, port_in
 from prior_sg.deploy.cli.jobs import add_run_options, settings_of
-from prior_sg.deploy.cli.shared import Commands, add_bus, console, open_client
+from prior_sg.deploy.cli.shared import Commands, add_bus, add_router, console, open_client
 from prior_sg.deploy.cli.source_options import add_source_options, read_options
 from prior_sg.deploy.edge import names_in
 from prior_sg.deploy.errors import UserError
@@ -33,6 +33,7 @@ def add_commands(commands: Commands) -> None:
     up.add_argument("--source", default="", help="what ingest reads; default: nothing")
     up.add_argument("--out", type=Path, default=Path("out/up"), help="folder for the database and logs")
     up.add_argument("--no-router", action="store_true", help="use the router at --connect instead of starting one")
+    add_router(up)
     up.add_argument(
         "--api", nargs="?", type=port_in, const=API_PORT, default=None, metavar="PORT", help="also serve HTTP there"
     )
@@ -86,6 +87,7 @@ def cmd_up(arguments: argparse.Namespace) -> int:
 
 def _stay_up(arguments: argparse.Namespace, names: list[str]) -> int:
     from prior_sg.deploy.interrupts import insist
+    from prior_sg.deploy.keys.routing import beyond_this_host
     from prior_sg.deploy.running.job import require_files
     from prior_sg.deploy.running.supervisor import Supervisor
     from prior_sg.deploy.settings import check_settings
@@ -93,6 +95,11 @@ def _stay_up(arguments: argparse.Namespace, names: list[str]) -> int:
     from prior_sg.services.runtime.zenoh_bus import open_router
 
     require_files()
+    beyond = beyond_this_host(arguments.listen, arguments.join)
+    if beyond is not None and (own := beyond.bundle.own).role == "robot" and own.name != arguments.robot:
+        raise UserError(f"these keys are of {own.name}, which writes nothing of {arguments.robot}; use --robot")
+    if beyond is not None and arguments.no_router:
+        raise UserError("--listen and --join are of the router that `up` starts; leave out --no-router")
     settings = [f"scene_store.path={arguments.out / 'scene.sqlite'}", f"ingest.speed={arguments.speed}"]
     if arguments.source:
         before_start(arguments.source, read_options(arguments), console)
@@ -101,14 +108,15 @@ def _stay_up(arguments: argparse.Namespace, names: list[str]) -> int:
     check_settings(arguments.config, settings)
     if arguments.no_router:
         open_client(arguments.connect).bus.close()  # finds out at once whether a router is there
-    stop_router = (lambda: None) if arguments.no_router else open_router(arguments.connect)
+    stop_router = (lambda: None) if arguments.no_router else open_router(arguments.connect, beyond)
     supervisor = Supervisor(arguments.connect, arguments.robot, arguments.out / "logs", settings, arguments.config)
     try:
         for name in sorted(names, key=lambda name: name == "ingest"):
             supervisor.start(name, arguments.workers if BY_NAME[name].job is not None else 1)
         if arguments.api is not None:
             _open_api(supervisor, arguments.api)
-        console.print(f"router {arguments.connect}; logs in {supervisor.log_folder}; Ctrl-C stops")
+        listening = " and ".join((arguments.connect, *arguments.listen))
+        console.print(f"router {listening}; logs in {supervisor.log_folder}; Ctrl-C stops")
         while True:
             insist()
             for event in supervisor.check():

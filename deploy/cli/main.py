@@ -9,7 +9,21 @@ import threading
 
 def build_parser() -> argparse.ArgumentParser:
     """All commands with their options."""
-    from prior_sg.deploy.cli import check, doors, encoders, export, jobs, live, packing, priors, query, tools
+    from prior_sg.deploy.cli import (
+        check,
+        doors,
+        encoders,
+        export,
+        jobs,
+        keys,
+        live,
+        packing,
+        priors,
+        query,
+        ros,
+        tools,
+        view,
+    )
     from prior_sg.deploy.cli.shared import Commands, Parser, with_example
 
     parser = Parser(
@@ -18,7 +32,7 @@ def build_parser() -> argparse.ArgumentParser:
         **with_example("prior-sg demo"),
     )
     commands = Commands(parser, "command", "COMMAND")
-    for module in (jobs, live, query, doors, check, packing, export, tools, priors, encoders):
+    for module in (jobs, live, view, query, doors, check, ros, packing, export, tools, priors, encoders, keys):
         module.add_commands(commands)
     return parser
 
@@ -57,6 +71,7 @@ def _run(argv: list[str] | None) -> int:
     from prior_sg.deploy.cli.shared import check_memory
     from prior_sg.deploy.edge import check_arguments, check_encoding
     from prior_sg.deploy.interrupts import interrupt
+    from prior_sg.deploy.settings import use_keys
     from prior_sg.deploy.terminal import forgive
     from prior_sg.services.runtime import extras
 
@@ -64,6 +79,7 @@ def _run(argv: list[str] | None) -> int:
     check_encoding(sys.argv[1:] if argv is None else argv)
     arguments = build_parser().parse_args(argv)
     check_arguments(arguments)
+    use_keys(getattr(arguments, "keys", ""))
     check_memory(arguments.needs)
     extras.require(arguments.needs, f"prior-sg {arguments.command}")
     if threading.current_thread() is threading.main_thread() and arguments.command != "serve":

@@ -15,7 +15,7 @@ from prior_sg.deploy.edge import names_in
 from prior_sg.deploy.running.inprocess import InProcess
 from prior_sg.deploy.settings import resolved_config
 from prior_sg.deploy.terminal import Terminal, line
-from prior_sg.schemas.codec import DecodeError, decode
+from prior_sg.schemas.codec import DecodeError
 from prior_sg.schemas.priors import ObjectPrior, Prior, PriorRevision, Provenance, Task
 from prior_sg.schemas.topics import PRIOR, PRIOR_REVISION
 from prior_sg.services.prior_gateway.core.compose import Library, NoPrior
@@ -24,7 +24,7 @@ from prior_sg.services.prior_gateway.outside.archive import PREFERRED, PriorShel
 from prior_sg.services.prior_gateway.outside.library import environments, load
 from prior_sg.services.prior_gateway.outside.signing import Signer
 from prior_sg.services.registry import BY_NAME
-from prior_sg.services.runtime.bus import LocalBus, Sample
+from prior_sg.services.runtime.bus import LocalBus, Sample, message_in
 from prior_sg.services.runtime.client import BusClient, NoPriorError
 
 LIBRARY_SIGN = "made by the curated library of this version"
@@ -216,7 +216,7 @@ def revise(arguments: argparse.Namespace, console: Terminal) -> int:
 
     def see(sample: Sample) -> None:
         try:
-            prior = decode(Prior, sample.payload)
+            prior: Prior = message_in(sample)
         except DecodeError:
             return
         if prior.answers(task) and prior.provenance.parent_digest and sample.sent_ns > given_ns:

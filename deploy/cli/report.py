@@ -1,6 +1,7 @@
 """What a run leaves for people: tables on the terminal, files in the output folder."""
 
 import math
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -81,6 +82,7 @@ def write(
         formats.save(material, out / name, kind)
     names = ", ".join((*files, "map-3d.png", result.log_path.name))
     console.print(f"written to {out}: {names} ({result.seconds:.0f} s)")
+    console.print(f"look at it: prior-sg view {shlex.quote(str(out))}")
 
 
 def compare(

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from prior_sg.deploy.errors import UserError
-from prior_sg.deploy.settings import DEFAULT_ROBOT, connect_in_force
+from prior_sg.deploy.settings import DEFAULT_ROBOT, add_keys, connect_in_force
 from prior_sg.deploy.terminal import Terminal
 from prior_sg.schemas.names import shown
 
@@ -59,8 +59,19 @@ def check_memory(extra: str) -> None:
 def add_bus(parser: argparse.ArgumentParser, robot: bool = True) -> None:
     """Options of whatever talks to running services."""
     parser.add_argument("--connect", default=connect_in_force(), help="Zenoh router (default: %(default)s)")
+    add_keys(parser)
     if robot:
         parser.add_argument("--robot", default=DEFAULT_ROBOT, help="name of the robot (default: %(default)s)")
+
+
+def add_router(parser: argparse.ArgumentParser) -> None:
+    """Options of whatever starts a router that reaches beyond this host."""
+    parser.add_argument(
+        "--listen", action="append", default=[], metavar="tls/HOST:PORT", help="let those with keys join this router"
+    )
+    parser.add_argument(
+        "--join", action="append", default=[], metavar="tls/HOST:PORT", help="join this router to that of an edge"
+    )
 
 
 def add_settings(parser: argparse.ArgumentParser) -> None:

@@ -73,6 +73,16 @@ OPTIONS = (
     Option("--origin", "origin", "keep|auto|X,Y,Z", "new zero of the world; auto: recentred when kilometres away"),
     Option("--up", "world_up", "X,Y,Z", "direction that points up in the source's world", listed=True),
     Option("--floor", "floor_m", "METRES", "height of the floor in the source's world, along up"),
+    Option("--color-topic", "color_topic", "TOPIC", "colour images of a ROS recording (see `prior-sg ros topics`)"),
+    Option("--depth-topic", "depth_topic", "TOPIC", "its depth images"),
+    Option("--info-topic", "info_topic", "TOPIC", "camera info of its colour images"),
+    Option("--pose-topic", "pose_topic", "TOPIC", "its odometry, poses or transforms; default: tf, else one of these"),
+    Option("--fixed-frame", "fixed_frame", "FRAME", "the world, of tf; default: map, world, odom or the root"),
+    Option("--pose-frame", "pose_frame", "FRAME", "the frame whose poses --pose-topic has"),
+    Option(
+        "--sync-tolerance", "sync_tolerance_s", "SECONDS", "most between stamps of one frame's colour, depth and pose"
+    ),
+    Option("--clock", "clock", "CLOCK", "stamps of a ROS recording: of its", choices=("header", "received")),
 )
 
 

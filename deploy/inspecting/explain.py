@@ -50,17 +50,24 @@ def costs_by_source(reply: PosteriorReply) -> dict[str, list[float]]:
     return costs | {"neighbours": list(reply.pull)}
 
 
+def gains(reply: PosteriorReply) -> tuple[str, dict[str, float]]:
+    """The runner-up, and by how much each source prefers the label to it; "" and nothing where there is no other."""
+    own = reply.labels.index(reply.label)
+    others = [column for column in range(len(reply.labels)) if column != own]
+    if not others:
+        return "", {}
+    rival = max(others, key=lambda column: reply.posterior[column])
+    return reply.labels[rival], {source: costs[rival] - costs[own] for source, costs in costs_by_source(reply).items()}
+
+
 def reason(reply: PosteriorReply) -> str:
     """What sets the label apart from the runner-up, the strongest reason first."""
-    order = sorted(range(len(reply.labels)), key=lambda column: -reply.posterior[column])
-    own = reply.labels.index(reply.label)
-    others = [column for column in order if column != own]
-    if not others:
+    rival, by_source = gains(reply)
+    if not rival:
         return f"the prior knows no region but {reply.label}"
-    rival = others[0]
-    gains = {source: costs[rival] - costs[own] for source, costs in costs_by_source(reply).items()}
-    parts = ", ".join(f"{source} {gain:+.2f}" for source, gain in sorted(gains.items(), key=lambda pair: -abs(pair[1])))
-    return f"{reply.label} before {reply.labels[rival]} by {sum(gains.values()):.2f}: {parts}"
+    ordered = sorted(by_source.items(), key=lambda pair: -abs(pair[1]))
+    parts = ", ".join(f"{source} {gain:+.2f}" for source, gain in ordered)
+    return f"{reply.label} before {rival} by {sum(by_source.values()):.2f}: {parts}"
 
 
 def label_table(reply: PosteriorReply) -> Table:

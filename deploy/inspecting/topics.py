@@ -72,11 +72,13 @@ def compose() -> str:
         "  init: true",
         "  restart: unless-stopped",
         "  depends_on: [zenohd]",
-        "  environment: { PSG_CONNECT: tcp/zenohd:7447 }",
+        "  network_mode: host  # the router listens on loopback only (docs/security.md)",
+        "  environment: { PSG_CONNECT: tcp/127.0.0.1:7447 }",
         "",
         "services:",
         "  zenohd:",
         "    image: eclipse/zenoh:1.10.2",
+        "    network_mode: host",
         "    init: true",
         "    restart: unless-stopped",
         "    command: -c /config.json5",
@@ -86,10 +88,10 @@ def compose() -> str:
         robot = ", --robot, '${PSG_ROBOT:-robot1}'" if service.scope == "robot" else ""
         lines += ["", f"  {service.name}:", "    <<: *service", f"    command: [serve, {service.name}{robot}]"]
         if service.name == "ingest":
-            lines += ["    environment:", "      PSG_CONNECT: tcp/zenohd:7447", "      PSG_INGEST__SOURCE: /data"]
+            lines += ["    environment:", "      PSG_CONNECT: tcp/127.0.0.1:7447", "      PSG_INGEST__SOURCE: /data"]
             lines += ["    volumes: ['${PSG_DATA:-./data}:/data:ro']"]
         if service.name == "scene_store":
-            lines += ["    environment:", "      PSG_CONNECT: tcp/zenohd:7447"]
+            lines += ["    environment:", "      PSG_CONNECT: tcp/127.0.0.1:7447"]
             lines += ["      PSG_SCENE_STORE__PATH: /var/lib/prior-sg/scene.sqlite"]
             lines += ["    volumes: ['scene:/var/lib/prior-sg']"]
     return "\n".join([*lines, "", "volumes:", "  scene:", ""])

@@ -24,7 +24,7 @@ from prior_sg.deploy.running.recorder import Recorder, Settling
 from prior_sg.deploy.running.supervisor import Supervisor
 from prior_sg.deploy.settings import DEFAULT_CONNECT, DEFAULT_ROBOT, check_settings
 from prior_sg.deploy.terminal import Description, Terminal
-from prior_sg.schemas.codec import DecodeError, Message, decode, encode
+from prior_sg.schemas.codec import DecodeError, Message, encode
 from prior_sg.schemas.features import Pyramid
 from prior_sg.schemas.frames import IngestState, Keyframe
 from prior_sg.schemas.objects import Detections
@@ -36,7 +36,7 @@ from prior_sg.schemas.status import Loss
 from prior_sg.schemas.topics import INGEST_STATE, KEYFRAME, PLACE_DELTA, PYRAMID, REGION_DELTA, SCENE, VOXEL_MAP
 from prior_sg.services.losses import line, merged
 from prior_sg.services.registry import SERVICES
-from prior_sg.services.runtime.bus import Bus, BusError, LocalBus, Sample
+from prior_sg.services.runtime.bus import Bus, BusError, LocalBus, Sample, message_in
 from prior_sg.services.runtime.client import BusClient, NoPriorError
 from prior_sg.services.runtime.endpoints import parse_endpoint
 from prior_sg.services.runtime.zenoh_bus import ZenohBus, open_free_router
@@ -230,7 +230,7 @@ class Run:
 
     def _saw_ingest(self, sample: Sample) -> None:
         with contextlib.suppress(DecodeError):
-            self.counts.ingest = decode(IngestState, sample.payload)
+            self.counts.ingest = message_in(sample)
 
     def stream(self, started_s: float) -> Result:
         """Start everything, follow the stream to its end, read the result."""
@@ -305,7 +305,7 @@ class Run:
         job = self.job
         task = Task(
             robot=job.robot,
-            stamp_ns=time.time_ns(),
+            stamp_ns=self.client.task_stamp_ns(job.robot),
             environment=job.environment,
             task=job.task,
             regions=job.regions,

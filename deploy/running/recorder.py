@@ -8,11 +8,11 @@ from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
-from prior_sg.schemas.codec import DecodeError, Message, decode
+from prior_sg.schemas.codec import DecodeError, Message
 from prior_sg.schemas.status import Consumed
 from prior_sg.schemas.topics import TOPICS, Topic
 from prior_sg.services.registry import SERVICES
-from prior_sg.services.runtime.bus import Sample
+from prior_sg.services.runtime.bus import Sample, message_in
 from prior_sg.services.runtime.client import BusClient
 from prior_sg.services.runtime.record import LogError, LogWriter
 
@@ -76,7 +76,7 @@ class Recorder:
     def _add(self, sample: Sample) -> None:
         """Record what is valid; what is not never reached any service's state either."""
         try:
-            message = decode(sample.topic.type, sample.payload)
+            message = message_in(sample)
         except DecodeError:
             self.malformed[sample.topic.name] += 1
             return

@@ -14,7 +14,7 @@ from pathlib import Path
 from prior_sg import services
 from prior_sg.deploy.edge import check_arguments
 from prior_sg.deploy.errors import UserError
-from prior_sg.deploy.settings import DEFAULT_ROBOT, connect_in_force, resolved_config
+from prior_sg.deploy.settings import DEFAULT_ROBOT, add_keys, connect_in_force, resolved_config, use_keys
 from prior_sg.deploy.terminal import complain
 from prior_sg.services.runtime import extras
 from prior_sg.services.runtime.bus import BusError
@@ -42,6 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("service", choices=service_names(), help="which service to run")
     parser.add_argument("--robot", default=DEFAULT_ROBOT, help="name of the robot whose streams it serves")
     parser.add_argument("--connect", default=connect_in_force(), help="Zenoh router")
+    add_keys(parser)
     parser.add_argument("--instance", default="", help="name of this process; default: a random one")
     parser.add_argument("--config", default="", help="TOML file with a section per service")
     parser.add_argument("--set", action="append", default=[], metavar="SERVICE.FIELD=VALUE", help="one setting")
@@ -78,6 +79,7 @@ async def _stop_with_parent(host: Host, parent: int) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Exit status of one service process."""
     instance = arguments.instance or f"{arguments.service}-{uuid.uuid4().hex[:8]}"
+    use_keys(arguments.keys)
     start_logging(arguments.service, instance, arguments.log_level)
     try:
         with contextlib.suppress(ImportError):

@@ -17,7 +17,7 @@ from prior_sg.deploy.api.client import Client, Health
 from prior_sg.deploy.api.errors import NotInSceneError, TaskError
 from prior_sg.deploy.api.scene import Scene
 from prior_sg.deploy.serving.errors import BusyError, FaultyRequestError
-from prior_sg.schemas.codec import DecodeError, decode
+from prior_sg.schemas.codec import DecodeError
 from prior_sg.schemas.names import fault_of_robot, normal
 from prior_sg.schemas.priors import Prior, fault_of_task
 from prior_sg.schemas.queries import (
@@ -32,7 +32,7 @@ from prior_sg.schemas.queries import (
 from prior_sg.schemas.scene import Scene as SceneMessage
 from prior_sg.schemas.scene import SceneRevision
 from prior_sg.schemas.topics import SCENE_REVISION
-from prior_sg.services.runtime.bus import Bus, Sample
+from prior_sg.services.runtime.bus import Bus, Sample, message_in
 
 MOST_ROBOTS = 64  # whose clients are kept
 MOST_WRITTEN = 8  # forms of scenes that are kept
@@ -184,7 +184,7 @@ class System:
 
     def _saw(self, sample: Sample) -> None:
         with contextlib.suppress(DecodeError):
-            revision = decode(SceneRevision, sample.payload)
+            revision: SceneRevision = message_in(sample)
             if len(self._seen) < MOST_ROBOTS:
                 self._seen.add(revision.robot)
             for told in self.on_revision:

@@ -7,6 +7,7 @@ import msgspec
 import numpy as np
 import spark_dsg
 
+from prior_sg.deploy.showing.colors import label_colors
 from prior_sg.deploy.showing.export import (
     adjacent_regions,
     frontiers_of,
@@ -14,7 +15,6 @@ from prior_sg.deploy.showing.export import (
     objects_with_places,
     surfaces_of,
 )
-from prior_sg.deploy.showing.map import label_colors
 from prior_sg.schemas.objects import SceneObject
 from prior_sg.schemas.regions import Region
 from prior_sg.schemas.scene import Scene

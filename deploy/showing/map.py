@@ -5,20 +5,17 @@ small axes in the corner say so. Everything is drawn at twice the size and scale
 not.
 """
 
-import colorsys
-import hashlib
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
+from prior_sg.deploy.showing.colors import UNLABELLED, Color, label_colors
 from prior_sg.deploy.truth import voxel_owners
 from prior_sg.schemas.names import shown
 from prior_sg.schemas.objects import SceneObject
 from prior_sg.schemas.places import VoxelMap
 from prior_sg.schemas.scene import Scene
-
-Color = tuple[int, int, int]  # red, green, blue
 
 LONGEST_LINE = 300  # characters of a text that are looked at
 WIDTH_PX, MARGIN_PX, LEGEND_PX, TITLE_PX, FOOT_PX = 1600, 44, 330, 96, 64
@@ -32,45 +29,7 @@ REGION_OPACITY = 0.62
 FURNITURE_M = 3.0  # a long sofa or kitchen counter
 
 INK, MUTED, WALL, FURNITURE = (31, 35, 40), (107, 114, 128), (75, 82, 92), (176, 182, 190)
-FREE, UNLABELLED, EDGE, PATH = (241, 243, 245), (208, 213, 219), (70, 76, 84), (20, 20, 24)
-SALT = b"12994"  # with it, the commonest rooms of homes and offices ask for different colours
-PALETTE = (
-    (78, 121, 167),
-    (242, 142, 43),
-    (89, 161, 79),
-    (225, 87, 89),
-    (176, 122, 161),
-    (63, 184, 175),
-    (237, 201, 72),
-    (255, 157, 167),
-    (156, 117, 95),
-    (124, 196, 240),
-    (168, 208, 91),
-    (208, 84, 155),
-    (106, 90, 205),
-    (38, 112, 108),
-)
-
-
-def label_colors(scene: Scene) -> dict[str, Color]:
-    """A colour per label, distinct within the scene; a label asks for the same colour in every scene."""
-    labels = sorted({*scene.labels, *(region.label for region in scene.regions)})
-    taken: dict[str, int] = {}
-    slots = max(len(PALETTE), len(labels))
-    for label in labels:
-        digest = hashlib.blake2b(label.encode(), digest_size=4, salt=SALT).digest()
-        slot = int.from_bytes(digest, "little") % len(PALETTE)
-        while slot in taken.values():
-            slot = (slot + 1) % slots
-        taken[label] = slot
-    return {label: _palette(slot) for label, slot in taken.items()}
-
-
-def _palette(slot: int) -> Color:
-    if slot < len(PALETTE):
-        return PALETTE[slot]
-    red, green, blue = colorsys.hls_to_rgb(slot * 0.618 % 1, 0.6, 0.5)
-    return round(255 * red), round(255 * green), round(255 * blue)
+FREE, EDGE, PATH = (241, 243, 245), (70, 76, 84), (20, 20, 24)
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,7 @@ ZONES: tuple[Color, ...] = (
     (190, 160, 90),
 )
 GRAPH_PX, CELL_PX, MARGIN_PX, TITLE_PX = 760, 26, 24, 64
+SMALL_GRAPH_PX = 440  # beside other things on a page
 LABEL_PX, HEAD_PX = 150, 130  # room for the names of rows and, slanted, of columns
 SHOWN_EDGE = 0.25  # P(ri <-> rj) below which no line is drawn
 MOST_OBJECTS = 36  # columns of the containment matrix
@@ -91,8 +92,12 @@ class Svg:
             f"{html.escape(shown(text))}</text>"
         )
 
+    def document(self) -> str:
+        """The whole picture."""
+        return self._head + "".join(self._parts) + "</svg>\n"
+
     def save(self, path: Path) -> None:
-        path.write_text(self._head + "".join(self._parts) + "</svg>\n", encoding="utf-8")
+        path.write_text(self.document(), encoding="utf-8")
 
 
 class Png:
@@ -161,7 +166,7 @@ def draw(prior: Prior, path: Path) -> None:
     made = prior.provenance
     canvas.text((MARGIN_PX, 28), f"{prior.environment}: {prior.task or 'no task'}", 18, INK)
     canvas.text((MARGIN_PX, 50), f"{made.source}, {prior.digest()[:12]}", 12, FAINT)
-    _graph(canvas, prior, ((width - GRAPH_PX) / 2, TITLE_PX))
+    _graph(canvas, prior, ((width - GRAPH_PX) / 2, TITLE_PX), GRAPH_PX)
     names = [region.name for region in prior.regions]
     top = TITLE_PX + GRAPH_PX
     _matrix(canvas, (MARGIN_PX, top), "P(ri - rj): regions that touch", (names, names), prior.adjacency)
@@ -170,6 +175,13 @@ def draw(prior: Prior, path: Path) -> None:
     things = [prior.objects[column].name for column in columns]
     _matrix(canvas, (MARGIN_PX, top + matrix_px), title, (names, things), prior.containment[:, columns])
     canvas.save(path)
+
+
+def graph_svg(prior: Prior) -> str:
+    """The graph alone, for a page."""
+    canvas = Svg(SMALL_GRAPH_PX, SMALL_GRAPH_PX)
+    _graph(canvas, prior, (0.0, 0.0), SMALL_GRAPH_PX)
+    return canvas.document()
 
 
 def merits(prior: Prior) -> np.ndarray:
@@ -208,9 +220,9 @@ def layout(adjacency: np.ndarray) -> np.ndarray:
     return at / np.maximum(at.max(axis=0), 1e-9)
 
 
-def _graph(canvas: Canvas, prior: Prior, corner: Point) -> None:
+def _graph(canvas: Canvas, prior: Prior, corner: Point, side_px: float) -> None:
     """Discs as large as P(r | E0), coloured by zone; lines as dark as P(ri <-> rj); each region's telling objects."""
-    space = GRAPH_PX - 190
+    space = side_px - 190
     at = layout(prior.adjacency) * space + np.array(corner) + (95, 70)
     zones = list(dict.fromkeys(region.parent for region in prior.regions if region.parent))
     for i in range(len(prior.regions)):

@@ -10,8 +10,9 @@ import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
-from typing import Protocol
+from typing import Any, Protocol
 
+from prior_sg.schemas.codec import DecodeError, decode
 from prior_sg.schemas.topics import Topic
 from prior_sg.services.errors import PriorSgError
 
@@ -38,10 +39,19 @@ class Sample:
     sent_ns: int
 
 
+def message_in(sample: Sample) -> Any:
+    """The message of the topic's type that a sample holds. Raises DecodeError, also for one of another key."""
+    message = decode(sample.topic.type, sample.payload)
+    if fault := sample.topic.fault_of(sample.key, message):
+        raise DecodeError(fault)
+    return message
+
+
 class Request(Protocol):
     """A question received by a server; it must be answered exactly once, from any thread."""
 
     payload: bytes
+    key: str  # on which it was asked
 
     def reply(self, payload: bytes) -> None:
         """Answer."""
@@ -117,6 +127,7 @@ class LocalRequest:
     """A request on the local bus."""
 
     payload: bytes
+    key: str
     on_answer: OnAnswer
 
     def reply(self, payload: bytes) -> None:
@@ -188,7 +199,7 @@ class LocalBus:
         if server is None:
             on_answer(Answer(None, "nobody"))
         else:
-            server(LocalRequest(payload, on_answer))
+            server(LocalRequest(payload, key, on_answer))
 
     def announce(self, key: str) -> None:
         """Be seen."""

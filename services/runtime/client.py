@@ -9,14 +9,15 @@ from types import TracebackType
 from typing import Any, TypeVar
 
 from prior_sg.schemas.codec import DecodeError, Message, decode, encode
-from prior_sg.schemas.priors import Prior, PriorRequest, Task
+from prior_sg.schemas.priors import Prior, PriorRequest, Task, TaskInForce, TaskRequest
 from prior_sg.schemas.status import ServiceStatus, StatusRequest
-from prior_sg.schemas.topics import PRIOR, PRIORS, TASK, Query, Topic, alive_key, status_key
+from prior_sg.schemas.topics import PRIOR, PRIORS, TASK, TASK_IN_FORCE, Query, Topic, alive_key, status_key
 from prior_sg.services.errors import PriorSgError
-from prior_sg.services.runtime.bus import Answer, Bus, BusError, Sample, pack_header
+from prior_sg.services.runtime.bus import Answer, Bus, BusError, Sample, message_in, pack_header
 
 R = TypeVar("R", bound=Message)
 POLL_S = 0.5
+STAMP_TIMEOUT_S = 2.0
 PATIENT_POLLS = 4
 
 
@@ -86,6 +87,15 @@ class BusClient:
         except DecodeError as error:
             raise BusError(f"{name}: the answer is not valid: {error}") from error
 
+    def task_stamp_ns(self, robot: str) -> int:
+        """The stamp of a task given now: after the one in force, whatever the clock of the host that gave it said."""
+        now_ns = time.time_ns()
+        try:
+            known: TaskInForce = self.ask(TASK_IN_FORCE, TaskRequest(robot=robot), STAMP_TIMEOUT_S)
+        except BusError:  # no store is there that knows of one
+            return now_ns
+        return now_ns if known.task is None else max(now_ns, known.task.stamp_ns + 1)
+
     def give_task(self, task: Task, timeout_s: float, waiting: Callable[[str], None] = lambda reason: None) -> Prior:
         """Publish a task and wait for the prior that answers it; a model may take minutes, and `waiting` is told why
         meanwhile. Raises NoPriorError, BusError."""
@@ -95,7 +105,7 @@ class BusClient:
 
         def see(sample: Sample) -> None:
             with contextlib.suppress(DecodeError):
-                prior = decode(Prior, sample.payload)
+                prior: Prior = message_in(sample)
                 if sample.sent_ns >= given_ns and prior.answers(task):
                     found.append(prior)
                     arrived.set()

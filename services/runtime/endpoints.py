@@ -1,6 +1,7 @@
 """Endpoints of the bus: how they are written, which are free here, and why none can listen."""
 
 import errno
+import ipaddress
 import re
 import socket
 from dataclasses import dataclass
@@ -19,7 +20,9 @@ KINDS = {
 }
 OF_PATHS = ("unixsock-stream", "unixpipe")
 WRITTEN = "--connect takes PROTOCOL/HOST:PORT, for example tcp/127.0.0.1:7447 or tcp/[::1]:7447"
+KEYS_NEEDED = "make keys with `prior-sg keys init` and `keys add`, and name them with --keys (docs/security.md)"
 OTHER = "choose another with --connect"
+SECURED = ("tls",)
 OS_ERROR = re.compile(r"os error (\d+)", re.IGNORECASE)
 
 
@@ -61,6 +64,32 @@ def check_endpoint(text: str) -> None:
     """That a client can try to connect there. Raises BusError."""
     if not _of_path(text) and parse_endpoint(text).port == 0:
         raise BusError(f"{text} has the port 0, which only `prior-sg run` takes; name the port of the router")
+
+
+def on_loopback(text: str) -> bool:
+    """Whether only this host's processes reach an endpoint. A name other than `localhost` counts as elsewhere. Raises
+    BusError.
+    """
+    if _of_path(text):
+        return True
+    host = parse_endpoint(text).host
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def secured(text: str) -> bool:
+    """Whether an endpoint is encrypted and both ends show certificates."""
+    return text.partition("/")[0] in SECURED
+
+
+def check_reach(text: str, with_keys: bool) -> None:
+    """That an endpoint is on loopback, or secured and keys are there. Raises BusError."""
+    if secured(text) and not with_keys:
+        raise BusError(f"{text} takes those with keys only; {KEYS_NEEDED}")
+    if not secured(text) and not on_loopback(text):
+        raise BusError(f"{text} is beyond this host, where anybody could write: use tls/HOST:PORT; {KEYS_NEEDED}")
 
 
 def check_host(text: str) -> None:

@@ -27,8 +27,15 @@ MODULES = {  # by extra; what the build file lists there, by the names that code
     "mcp": ("mcp",),
     "view": ("viser",),
     "rerun": ("rerun",),
+    "ros": ("rosbags",),
 }
-CONTAINS = {"encode": ("map",), "clip": ("encode", "map"), "export": ("clip", "encode", "map")}
+CONTAINS = {
+    "view": ("map",),
+    "encode": ("map",),
+    "clip": ("encode", "map"),
+    "export": ("clip", "encode", "map"),
+    "ros": ("map",),
+}
 
 
 class ExtraMissing(ServiceError):

@@ -42,6 +42,7 @@ CHUNK_BYTES = 1 << 20
 FLUSH_NS = 1_000_000_000  # of received time: what a killed process can lose
 SEQUENCE_MASK = 0xFFFFFFFF  # MCAP sequences are 32 bit
 DAMAGE = (McapError, ValueError, struct.error, zstandard.ZstdError, RuntimeError, MemoryError, OverflowError)
+ROS_PROFILE = b"ros2"
 
 logger = logging.getLogger(__name__)
 
@@ -209,6 +210,13 @@ def contents(path: str | Path) -> list[Content]:
 def foreign_topics(path: str | Path) -> list[str]:
     """Topics that other programs wrote into an MCAP file. Raises LogError."""
     return sorted({channel.topic for channel, _ in _channels(path) if "topic" not in channel.metadata})
+
+
+def holds_ros(path: str | Path) -> bool:
+    """Whether an MCAP file says of itself that ROS 2 wrote it. Raises LogError."""
+    with _opened(path) as file:
+        head = file.read(1 + 8 + 4 + len(ROS_PROFILE))  # opcode, length of the record, length of the profile
+    return head[:1] == bytes([Opcode.HEADER]) and head[9:] == len(ROS_PROFILE).to_bytes(4, "little") + ROS_PROFILE
 
 
 def is_whole(path: str | Path) -> bool:

@@ -33,30 +33,43 @@ from prior_sg.services.runtime.bus import (
     unpack_header,
 )
 from prior_sg.services.runtime.endpoints import (
+    KEYS_NEEDED,
     cannot_listen,
     check_endpoint,
     check_host,
+    check_reach,
     free_endpoint,
     number_in,
+    on_loopback,
+    secured,
     without_places,
 )
+from prior_sg.services.runtime.keys import Beyond, Bundle, bundle_in_force
 
 log = logging.getLogger(__name__)
 HEARTBEAT_S = 0.3
 CLOSE_TIMEOUT_S = 3.0
 LEASE_MS = 2000
 ATTEMPTS = 5
-TRANSPORT = {
+CONNECT_MS = 3000
+RETRY = {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 1.5}
+TRANSPORT: dict[str, Any] = {
     "link": {"tx": {"lease": LEASE_MS, "keep_alive": 4}, "rx": {"buffer_size": 4194304}},
     "shared_memory": {"enabled": False},  # asks for a /dev/shm that can be written, which containers may lack
 }
+
+
+def _transport(bundle: Bundle | None) -> dict[str, Any]:
+    if bundle is None:
+        return TRANSPORT
+    return TRANSPORT | {"link": TRANSPORT["link"] | {"tls": bundle.transport()}}
 
 
 class EndpointTakenError(BusError):
     """Somebody else listens there."""
 
 
-def client_config(endpoint: str) -> zenoh.Config:
+def client_config(endpoint: str, bundle: Bundle | None = None) -> zenoh.Config:
     """Client of one router; dead neighbours are noticed within two seconds."""
     return zenoh.Config.from_json5(
         json.dumps(
@@ -64,43 +77,60 @@ def client_config(endpoint: str) -> zenoh.Config:
                 "mode": "client",
                 "connect": {
                     "endpoints": [endpoint],
-                    "timeout_ms": 3000,
-                    "retry": {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 1.5},
+                    "timeout_ms": CONNECT_MS,
+                    "retry": RETRY,
                 },
                 "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
                 "timestamping": {"enabled": True},
-                "transport": TRANSPORT,
+                "transport": _transport(bundle if secured(endpoint) else None),
             }
         )
     )
 
 
-def router_config(endpoint: str) -> zenoh.Config:
-    """A router on one endpoint of this host, reachable from nowhere else when the endpoint is on loopback."""
-    return zenoh.Config.from_json5(
-        json.dumps(
-            {
-                "mode": "router",
-                "listen": {"endpoints": [endpoint]},
-                "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
-                "timestamping": {"enabled": True},
-                "transport": TRANSPORT,
-            }
-        )
-    )
+def router_settings(endpoint: str, beyond: Beyond | None = None) -> dict[str, Any]:
+    """Zenoh's settings of a router: for the processes of its host on loopback, and `beyond` for those with keys."""
+    settings: dict[str, Any] = {
+        "mode": "router",
+        "listen": {"endpoints": [endpoint, *(beyond.listen if beyond else ())]},
+        "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
+        "timestamping": {"enabled": True},
+        "transport": _transport(beyond.bundle if beyond else None),
+    }
+    if beyond is not None:
+        joined = {"endpoints": list(beyond.join), "timeout_ms": 0, "exit_on_failure": False, "retry": RETRY}
+        settings |= {"access_control": beyond.access, "connect": joined}
+    return settings
 
 
-def open_router(endpoint: str) -> Callable[[], None]:
-    """Start a router in this process; returns the function that stops it. Raises BusError."""
+def check_router(endpoint: str, beyond: Beyond | None) -> None:
+    """That nobody without keys reaches the router from another host. Raises BusError."""
     check_endpoint(endpoint)
+    if secured(endpoint) or not on_loopback(endpoint):
+        raise BusError(
+            f"{endpoint} is beyond this host: keep --connect on loopback, and let others join by "
+            f"`prior-sg router --listen tls/HOST:PORT`; {KEYS_NEEDED}"
+        )
+    for other in (*beyond.listen, *beyond.join) if beyond else ():
+        check_endpoint(other)
+        if not secured(other):
+            raise BusError(f"{other} is not encrypted; write it as tls/HOST:PORT")
+    if beyond is not None and beyond.listen and beyond.bundle.own.role != "edge":
+        raise BusError(f"{beyond.bundle.own.name} has no key of an edge, so nobody would join it; leave out --listen")
+
+
+def open_router(endpoint: str, beyond: Beyond | None = None) -> Callable[[], None]:
+    """Start a router in this process; returns the function that stops it. Raises BusError."""
+    check_router(endpoint, beyond)
     zenoh.init_log_from_env_or("error")
     try:
-        session = zenoh.open(router_config(endpoint))
+        session = zenoh.open(zenoh.Config.from_json5(json.dumps(router_settings(endpoint, beyond))))
     except zenoh.ZError as error:
         said = str(error)
         number = number_in(said)
         kind = EndpointTakenError if number == errno.EADDRINUSE else BusError
-        raise kind(cannot_listen(endpoint, number, without_places(said))) from error
+        where = " and ".join((endpoint, *(beyond.listen if beyond else ())))
+        raise kind(cannot_listen(where, number, without_places(said))) from error
     return lambda: _close_within(session, CLOSE_TIMEOUT_S)
 
 
@@ -132,14 +162,14 @@ class ZenohRequest:
 
     def __init__(self, query: zenoh.Query) -> None:
         self._query = query
-        request, self._reply = called_with(str(query.key_expr))
+        self.key = str(query.key_expr)
+        request, self._reply = called_with(self.key)
         self.payload = _payload(request, query.payload, query.encoding)
 
     def reply(self, payload: bytes) -> None:
         """Answer; a caller that has gone away is no error."""
-        key = str(self._query.key_expr)
         with self._query:
-            _quietly(lambda: self._query.reply(key, payload, encoding=_encoding(self._reply)))
+            _quietly(lambda: self._query.reply(self.key, payload, encoding=_encoding(self._reply)))
 
     def refuse(self, reason: str) -> None:
         """Decline."""
@@ -160,13 +190,20 @@ class ZenohBus:
     @staticmethod
     def _open(endpoint: str, wait_s: float) -> zenoh.Session:
         check_endpoint(endpoint)
+        bundle = bundle_in_force()
+        check_reach(endpoint, with_keys=bundle is not None)
         deadline = time.monotonic() + wait_s
         while True:
             try:
-                return zenoh.open(client_config(endpoint))
+                return zenoh.open(client_config(endpoint, bundle))
             except zenoh.ZError as error:
                 if time.monotonic() > deadline:
                     check_host(endpoint)
+                    if bundle is not None and secured(endpoint):
+                        raise BusError(
+                            f"no router answers on {endpoint}, or it takes not the keys in {bundle.folder} "
+                            f"(of {bundle.own.name}, until {bundle.own.until}); ask who keeps the authority"
+                        ) from error
                     raise BusError(
                         f"no router answers on {endpoint}; start one with `prior-sg up`, or name another with --connect"
                     ) from error

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from prior_sg.deploy.json_text import json_text
+from prior_sg.deploy.showing.colors import UNLABELLED, label_colors
 from prior_sg.deploy.showing.export import DECIMALS
-from prior_sg.deploy.showing.map import UNLABELLED, label_colors
 from prior_sg.deploy.showing.material import Material
 from prior_sg.schemas.objects import SceneObject
 from prior_sg.schemas.regions import Region

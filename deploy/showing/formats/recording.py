@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from prior_sg.deploy.showing.map import UNLABELLED, label_colors
+from prior_sg.deploy.showing.colors import UNLABELLED, label_colors
 from prior_sg.deploy.showing.material import Material, Moment
 from prior_sg.schemas.regions import Region
 from prior_sg.schemas.scene import Scene

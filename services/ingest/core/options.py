@@ -13,6 +13,7 @@ PoseConvention = Literal["world_from_camera", "camera_from_world"]
 QuaternionOrder = Literal["xyzw", "wxyz"]
 CameraAxes = Literal["opencv", "opengl", "ros", "ned"]
 StampUnit = Literal["s", "ms", "us", "ns"]
+StampClock = Literal["header", "received"]
 LensModel = Literal["pinhole", "opencv", "fisheye"]
 COEFFICIENTS: dict[str, tuple[int, ...]] = {"pinhole": (0,), "opencv": (4, 5, 8), "fisheye": (4,)}
 ORIGIN_KEPT, ORIGIN_AUTO = "keep", "auto"
@@ -41,6 +42,14 @@ class ReadOptions(msgspec.Struct, frozen=True, kw_only=True):
     intrinsics: list[float] = msgspec.field(default_factory=list)  # fx fy cx cy, pixels; then width height, if other
     camera_model: Literal["", LensModel] = ""  # of the lens; opencv = radial and tangential, fisheye = Kannala-Brandt
     distortion: list[float] = msgspec.field(default_factory=list)  # its coefficients, as OpenCV orders them
+    color_topic: str = ""  # of a ROS recording; empty = chosen by type, frame and name, as are the next three
+    depth_topic: str = ""
+    info_topic: str = ""  # the colour camera's info
+    pose_topic: str = ""  # odometry, poses or transforms; empty = tf where it moves the camera, else one of them
+    fixed_frame: str = ""  # of tf: the world; empty = map, world, odom or the root
+    pose_frame: str = ""  # the frame whose poses pose_topic has; empty = as its messages say, else the camera's
+    sync_tolerance_s: float = 0.02  # most between stamps of colour, depth and pose that belong together
+    clock: StampClock = "header"  # stamps of a ROS recording: of the messages' headers, or of their arrival
 
     def __post_init__(self) -> None:
         if self.depth_scale_m is not None and not (math.isfinite(self.depth_scale_m) and self.depth_scale_m > 0):
@@ -49,6 +58,8 @@ class ReadOptions(msgspec.Struct, frozen=True, kw_only=True):
             raise ValueError(f"position_scale_m must be a positive number of metres, got {self.position_scale_m}")
         if not (math.isfinite(self.rate_hz) and self.rate_hz >= 0):
             raise ValueError(f"rate_hz must be a number of frames per second, got {self.rate_hz}")
+        if not (math.isfinite(self.sync_tolerance_s) and self.sync_tolerance_s > 0):
+            raise ValueError(f"sync_tolerance_s must be a positive number of seconds, got {self.sync_tolerance_s}")
         if not 0 <= self.depth_min_m < (self.depth_max_m or math.inf):
             raise ValueError("depth_min_m must be at least 0 and below depth_max_m")
         if self.intrinsics and not (

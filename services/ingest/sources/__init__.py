@@ -15,6 +15,7 @@ from prior_sg.services.ingest.sources import (
     icl_nuim,
     recording,
     replica,
+    ros,
     scannet,
     seven_scenes,
     tartanground,
@@ -26,7 +27,7 @@ from prior_sg.services.ingest.sources.normalise import finish
 
 __all__ = ["LAYOUT_NAMES", "ReadOptions", "Source", "SourceError", "open_source"]
 
-LAYOUTS = (dataset, seven_scenes, tum, icl_nuim, replica, scannet, hm3d, tartanground, coda, generic)
+LAYOUTS = (dataset, seven_scenes, tum, icl_nuim, replica, scannet, hm3d, tartanground, coda, generic, ros)
 LAYOUT_NAMES = (*(layout.NAME for layout in LAYOUTS), recording.NAME)
 
 
@@ -48,10 +49,11 @@ def open_source(
     path = Path(path)
     options = _with(options or ReadOptions(), world_up, floor_m, robot)
     if not path.exists():
-        raise SourceError(f"the source {path} does not exist: give a dataset folder, a 7-Scenes folder or an MCAP log")
+        known = "a dataset folder, a 7-Scenes folder, a ROS bag or an MCAP log"
+        raise SourceError(f"the source {path} does not exist: give {known}")
     if options.layout:
         return _as_told(path, options)
-    if path.is_file() and path.suffix == ".mcap":
+    if path.is_file() and path.suffix == ".mcap" and not ros.fits(path):
         return recording.load(path, options)
     for layout in LAYOUTS:
         if layout.fits(path):

@@ -6,8 +6,9 @@ from pathlib import Path
 from prior_sg.services.ingest.sources import dataset, generic, pose_lists
 
 FOLDERS_LOOKED_AT, NAMED = 200, 5
+RECORDINGS = (".mcap", ".db3", ".bag")
 KINDS = {
-    (".bag", ".db3"): "it is a ROS bag: export its images, depth and poses into a folder first",
+    (".zstd",): "it is a packed part of a ROS bag: give the folder that holds it and its metadata.yaml",
     (".zip", ".tar", ".gz", ".tgz", ".xz", ".bz2", ".7z", ".rar"): "it is an archive: unpack it and give the folder",
     (".ply", ".pcd", ".obj", ".glb", ".stl", ".las", ".laz"): "it holds geometry without images: give the recording",
     (".mp4", ".avi", ".mov", ".mkv", ".webm"): "it is a film without depth and poses: give a folder with these",
@@ -26,7 +27,8 @@ def hint(path: Path, fits: Callable[[Path], bool]) -> str:
     inner = [child.name for child in children[:FOLDERS_LOOKED_AT] if child.is_dir() and fits(child)]
     if inner:
         return f"these folders in it are sources, give one of them: {', '.join(inner[:NAMED])}"
-    return _lacking(path)
+    files = [child.name for child in children if child.suffix in RECORDINGS]
+    return f"it holds recordings, give one of them: {', '.join(files[:NAMED])}" if files else _lacking(path)
 
 
 def _lacking(path: Path) -> str:

@@ -23,6 +23,7 @@ import numpy as np
 
 from prior_sg.schemas.frames import Intrinsics
 from prior_sg.services.ingest.core.options import ReadOptions
+from prior_sg.services.ingest.core.pairing import associate
 from prior_sg.services.ingest.core.poses import Convention
 from prior_sg.services.ingest.sources.base import (
     CAMERA,
@@ -92,26 +93,6 @@ def load(path: Path, options: ReadOptions) -> Found:
         why=(f"{COLORS}, {DEPTHS} and {POSES} lie in it",),
         notes=tuple(filter(None, (said, poses_said, depth_shift, pose_shift))),
     )
-
-
-def associate(first_ns: Sequence[int], second_ns: Sequence[int], within_ns: int) -> dict[int, int]:
-    """Index in `second_ns` (rising) of each index in `first_ns` that finds one: closest first, each used once."""
-    second = np.asarray(second_ns, np.int64)
-    first = np.asarray(first_ns, np.int64)
-    begins = np.searchsorted(second, first - within_ns, side="right")
-    ends = np.searchsorted(second, first + within_ns, side="left")
-    pairs = sorted(
-        (abs(int(first[i] - second[j])), i, j)
-        for i, (begin, end) in enumerate(zip(begins, ends, strict=True))
-        for j in range(begin, end)
-    )
-    partner: dict[int, int] = {}
-    used: set[int] = set()
-    for _, i, j in pairs:
-        if i not in partner and j not in used:
-            partner[i] = j
-            used.add(j)
-    return partner
 
 
 def _partners(colors: Stamped, others: Stamped, offset_s: float | None) -> tuple[dict[int, int], str]:

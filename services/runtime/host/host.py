@@ -19,10 +19,11 @@ import psutil
 
 from prior_sg.schemas.codec import DecodeError, Message, decode, encode, versions
 from prior_sg.schemas.status import Consumed, JobDone, ServiceStatus, Started, StatusRequest, Tick, TopicCount
-from prior_sg.schemas.topics import JOURNAL, Query, Topic, alive_key, status_key, worker_keys
+from prior_sg.schemas.topics import JOURNAL, Query, Topic, alive_key, fault_of_job, status_key, worker_keys
 from prior_sg.services.refusals import InputRefused
 from prior_sg.services.runtime.bus import Bus, Request, Sample
 from prior_sg.services.runtime.host.asks import Asks, Reply
+from prior_sg.services.runtime.host.door import Door
 from prior_sg.services.runtime.host.flow import Progress
 from prior_sg.services.runtime.host.inbox import Inbox
 from prior_sg.services.runtime.host.outbox import Outbox
@@ -58,6 +59,7 @@ class Host:
     def __init__(self, service: Service, bus: Bus, cfg: Any, identity: Identity) -> None:
         self.service, self.bus, self.cfg, self.identity = service, bus, cfg, identity
         self.inbox = Inbox(wake=self._wake)
+        self._door = Door(self.inbox)
         self.stopping = asyncio.Event()
         self._loop = asyncio.get_running_loop()
         self._waiting = asyncio.Event()
@@ -129,7 +131,8 @@ class Host:
         for topic in service.writes:
             if topic.delivery == "job":
                 limit = service.job_limit(self.cfg)
-                self._pools[topic] = JobPool(self.bus, topic, time.monotonic, self._job_ended(topic), limit=limit)
+                ended = self._job_ended(topic)
+                self._pools[topic] = JobPool(self.bus, topic, robot, time.monotonic, ended, limit=limit)
         for topic in service.reads:
             self.bus.subscribe(topic, topic.pattern(robot), self.inbox.offer, self._missed)
         if service.drive is not None:
@@ -137,7 +140,7 @@ class Host:
             self.bus.watch(alive_key("*", "*"), self._saw_alive)
         if service.job is not None:
             run_key, live_key = worker_keys(service.job, self.identity.instance, service.job_group(self.cfg))
-            self.bus.serve(run_key, self._offer_work)
+            self.bus.serve(f"{run_key}/*", self._offer_work)
             self.bus.announce(live_key)
         self.bus.announce(alive_key(service.name, self.identity.instance))
 
@@ -177,7 +180,15 @@ class Host:
                 self._loop.call_soon_threadsafe(item.done)
 
     def _handle_sample(self, sample: Sample) -> None:
-        message = self._decoded(sample.topic.type, sample.payload, sample.topic.name, sample.key, sample.writer)
+        topic, key = sample.topic, sample.key
+        message = self._door.admitted(
+            topic.type,
+            sample.payload,
+            name=topic.name,
+            key=key,
+            fault_of=partial(topic.fault_of, key),
+            writer=sample.writer,
+        )
         if message is None:
             return
         counts = self.inbox.of(sample.topic.name)
@@ -196,7 +207,8 @@ class Host:
 
     def _handle_reply(self, reply: Reply) -> None:
         query = reply.ask.query
-        message = self._decoded(query.reply, reply.payload, query.name, query.key, "")
+        fault_of = partial(_fault_of_reply, reply.ask.request)
+        message = self._door.admitted(query.reply, reply.payload, name=query.name, key=query.key, fault_of=fault_of)
         if message is None:
             self._asks.ask_later(reply.ask)
             return
@@ -205,10 +217,13 @@ class Host:
         self._outbox.journal(query.name, inline=reply.payload)
 
     def _handle_question(self, question: Question) -> None:
-        query = question.query
-        request = self._decoded(query.request, question.request.payload, query.name, query.key, "")
+        query, key = question.query, question.request.key
+        fault_of = partial(query.fault_of, key)
+        request = self._door.admitted(
+            query.request, question.request.payload, name=query.name, key=key, fault_of=fault_of
+        )
         if request is None:
-            question.request.refuse(f"the request is not a valid {query.request.__name__}")
+            question.request.refuse(f"the request is not a valid {query.request.__name__} for {key}")
             return
         self.inbox.of(query.name).consumed += 1
         try:
@@ -247,7 +262,8 @@ class Host:
         job = self.service.job
         assert job is not None
         if self._slots.acquire(blocking=False):
-            message = self._decoded(job.type, request.payload, job.name, job.key, "")
+            fault_of = partial(fault_of_job, job, request.key)
+            message = self._door.admitted(job.type, request.payload, name=job.name, key=request.key, fault_of=fault_of)
             self.inbox.put(Work(request, message))
         else:
             request.refuse("busy")
@@ -257,25 +273,12 @@ class Host:
         waiting = (item.message for item in self.inbox.waiting() if isinstance(item, Work))
         return [message for message in waiting if message is not None]
 
-    def _decoded(self, kind: type[Message], payload: bytes, name: str, key: str, writer: str) -> Message | None:
-        """The message, or None after counting and logging that it is malformed."""
-        try:
-            return decode(kind, payload)
-        except DecodeError as error:
-            self.inbox.of(name).malformed += 1
-            log.warning(
-                "malformed message dropped",
-                extra={"topic": name, "key": key, "writer": writer, "why": str(error)[:200]},
-            )
-            return None
-
     def _take(self, message: Message, name: str, key: str, writer: str) -> None:
         """Step with an input from outside: an absurd one is counted and logged, and the service goes on."""
         try:
             self._step(message)
         except InputRefused as error:
-            self.inbox.of(name).malformed += 1
-            log.warning("message refused", extra={"topic": name, "key": key, "writer": writer, "why": str(error)[:200]})
+            self._door.refused(name, key, str(error), writer)
 
     def _step(self, message: Message) -> None:
         started_s = time.monotonic()
@@ -328,16 +331,15 @@ class Host:
         log.warning("samples lost", extra={"topic": topic.name, "number": number})
 
     def _saw_consumed(self, sample: Sample) -> None:
-        try:
-            entry = decode(Consumed, sample.payload)
-            if entry.topic == "START":
-                self._progress.reader(entry.instance, decode(Started, entry.inline).reads)
-            else:
+        admitted = partial(self._door.admitted, name=JOURNAL.name, key=sample.key, writer=sample.writer)
+        match admitted(Consumed, sample.payload, fault_of=partial(JOURNAL.fault_of, sample.key)):
+            case Consumed(topic="START") as entry:
+                started = admitted(Started, entry.inline, fault_of=lambda started: "")
+                if isinstance(started, Started):
+                    self._progress.reader(entry.instance, started.reads)
+            case Consumed() as entry:
                 own = entry.writer == self._outbox.writer
                 self._progress.consumed(entry.instance, entry.topic, entry.sequence if own else -1)
-        except DecodeError as error:
-            self.inbox.of(JOURNAL.name).malformed += 1
-            log.warning("malformed message dropped", extra={"topic": JOURNAL.name, "why": str(error)[:200]})
         self._progress.changed(self._loop)
 
     def _saw_alive(self, key: str, alive: bool) -> None:
@@ -375,3 +377,9 @@ class Host:
 
     async def _on_thread(self, function: Callable[..., Any], *arguments: Any) -> Any:
         return await self._loop.run_in_executor(self._thread, function, *arguments)
+
+
+def _fault_of_reply(request: Message, reply: Message) -> str:
+    """Why this is no answer to the request: it speaks of another robot."""
+    asked, told = (getattr(message, "robot", None) for message in (request, reply))
+    return "" if None in (asked, told) or asked == told else f"asked about {asked!r}, told about {told!r}"

@@ -9,7 +9,7 @@ import threading
 from collections.abc import Callable, Hashable
 from functools import partial
 
-from prior_sg.schemas.topics import Topic, worker_keys
+from prior_sg.schemas.topics import Topic, job_key, worker_keys
 from prior_sg.services.runtime.bus import Answer, Bus
 from prior_sg.services.runtime.jobs.board import Board, Ended
 from prior_sg.services.runtime.jobs.dispatcher import Job
@@ -20,7 +20,7 @@ DEFAULT_TIMEOUT_S = 60.0
 
 
 class JobPool:
-    """Dispatches the jobs of one topic over a bus. `on_ended` comes on a foreign thread, once per job.
+    """Dispatches a robot's jobs of one topic over a bus. `on_ended` comes on a foreign thread, once per job.
 
     With `limit`, at most so many jobs wait and the oldest is skipped for a newer one; 0 = none is skipped.
     """
@@ -29,13 +29,14 @@ class JobPool:
         self,
         bus: Bus,
         topic: Topic,
+        robot: str,
         clock_s: Callable[[], float],
         on_ended: Callable[[Ended], None],
         *,
         limit: int = 0,
         timeout_s: float = DEFAULT_TIMEOUT_S,
     ) -> None:
-        self._bus, self._topic, self._clock_s, self._on_ended = bus, topic, clock_s, on_ended
+        self._bus, self._topic, self._robot, self._clock_s, self._on_ended = bus, topic, robot, clock_s, on_ended
         self._timeout_s = timeout_s
         self._board = Board(limit=limit)
         self._lock = threading.RLock()
@@ -94,7 +95,7 @@ class JobPool:
             self._set_timer()
         self._tell(ended)
         for name, job in assignments:
-            key = worker_keys(self._topic, name)[0]
+            key = job_key(self._topic, name, self._robot)
             self._bus.call(key, job.payload, self._timeout_s, partial(self._answered, name, job))
 
     def _answered(self, name: str, job: Job, answer: Answer) -> None:

@@ -143,10 +143,15 @@ def test_the_library_has_a_prior_for_the_labels(world):
 
 
 def brute_depth(world, pose, rays_camera):
-    """Depth at which rays enter the first of all voxels that are not nothing, each tried."""
+    """Depth at which rays enter the first of all voxels that are not nothing, each tried that reaches into the view."""
     solid = world.origin_m + np.argwhere(world.grid != NOTHING) * world.voxel_m
     eye_m = pose[:3, 3]
-    solid = solid[np.abs(solid - eye_m).max(axis=1) < 7]
+    x, y, z = ((solid + world.voxel_m / 2 - eye_m) @ pose[:3, :3]).T
+    slack = 2 * world.voxel_m  # more than from a voxel's middle to its corners
+    wide, high = np.abs(rays_camera[:, :2]).max(axis=0)
+    solid = solid[
+        (np.abs(z - 2.5) < 2.5 + slack) & (np.abs(x) < wide * z + 3 * slack) & (np.abs(y) < high * z + 3 * slack)
+    ]
     depths_m = []
     for ray in rays_camera @ pose[:3, :3].T:
         with np.errstate(divide="ignore"):

@@ -142,7 +142,7 @@ def test_a_matrix_that_is_no_camera_of_a_scan_is_one_sentence(tmp_path, last):
 @pytest.mark.parametrize(
     ("name", "reason"),
     [
-        ("a.bag", "ROS bag"),
+        ("a.db3.zstd", "packed part of a ROS bag"),
         ("a.zip", "unpack it"),
         ("a.PLY", "geometry"),
         ("a.mp4", "film"),

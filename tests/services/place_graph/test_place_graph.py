@@ -1,6 +1,7 @@
 """Map, distances, Voronoi diagram and places, against SciPy, brute force, geometry by hand and exact floor plans."""
 
 import csv
+import functools
 import heapq
 import itertools
 import json
@@ -221,6 +222,7 @@ def by_definition(label: np.ndarray, max_distance: float) -> tuple[np.ndarray, n
     offset = np.zeros((*label.shape, 3), np.int8)
     d2[label == OCCUPIED] = 0
     queue = [(0, (0, 0, 0), tuple(voxel)) for voxel in np.argwhere(label == OCCUPIED).tolist()]
+    free = set(map(tuple, np.argwhere(label == FREE).tolist()))
     settled: dict = {}
     while queue:
         reach, backwards, voxel = heapq.heappop(queue)  # of equal distances the largest offset comes first
@@ -228,14 +230,23 @@ def by_definition(label: np.ndarray, max_distance: float) -> tuple[np.ndarray, n
             continue
         settled[voxel] = own = tuple(-b for b in backwards)
         d2[voxel], offset[voxel] = reach, own
-        for step in itertools.product((-1, 0, 1), repeat=3):
-            other = tuple(v + s for v, s in zip(voxel, step, strict=True))
-            further = tuple(o + s for o, s in zip(own, step, strict=True))
-            if any(o * s < 0 for o, s in zip(own, step, strict=True)) or not any(step) or label[other] != FREE:
-                continue
-            if other not in settled and (reach := sum(f * f for f in further)) <= max_distance**2:
-                heapq.heappush(queue, (reach, tuple(-f for f in further), other))
+        for reach, further, step in onwards(own, max_distance):
+            other = (voxel[0] + step[0], voxel[1] + step[1], voxel[2] + step[2])
+            if other in free and other not in settled:
+                heapq.heappush(queue, (reach, further, other))
     return d2, offset
+
+
+@functools.cache
+def onwards(own: tuple[int, int, int], max_distance: float) -> list:
+    """Squared distance, negated offset and step of all neighbours to which an offset may be handed on."""
+    found = []
+    for step in itertools.product((-1, 0, 1), repeat=3):
+        further = tuple(o + s for o, s in zip(own, step, strict=True))
+        back = any(o * s < 0 for o, s in zip(own, step, strict=True))
+        if any(step) and not back and (reach := sum(f * f for f in further)) <= max_distance**2:
+            found.append((reach, tuple(-f for f in further), step))
+    return found
 
 
 def observed(grid: VoxelGrid) -> np.ndarray:

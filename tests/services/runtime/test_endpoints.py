@@ -1,6 +1,7 @@
 """Which endpoints are taken, which are free, and what is said of the others."""
 
 import errno
+import json
 import socket
 import time
 from pathlib import Path
@@ -10,8 +11,14 @@ import zenoh
 
 from prior_sg.services.runtime import zenoh_bus
 from prior_sg.services.runtime.bus import BusError
-from prior_sg.services.runtime.endpoints import cannot_listen, check_endpoint, free_endpoint, parse_endpoint
-from prior_sg.services.runtime.zenoh_bus import ZenohBus, client_config, open_router, router_config
+from prior_sg.services.runtime.endpoints import (
+    cannot_listen,
+    check_endpoint,
+    free_endpoint,
+    on_loopback,
+    parse_endpoint,
+)
+from prior_sg.services.runtime.zenoh_bus import ZenohBus, client_config, open_router, router_settings
 
 ROUTER_FILE = Path(__file__).parents[3] / "deploy" / "router.json5"
 NONSENSE = (
@@ -62,7 +69,6 @@ def test_port_0_is_for_a_run_only():
         "127.0.0.1",
         "127.0.0.2",
         "localhost",
-        "0.0.0.0",
         pytest.param("[::1]", marks=pytest.mark.skipif("not has_ipv6()")),
     ],
 )
@@ -92,9 +98,8 @@ def test_a_taken_port_gives_another_and_a_router_there_says_so():
 
 
 def test_an_address_of_another_host_is_told_from_a_taken_port():
-    for use in (free_endpoint, open_router):
-        with pytest.raises(BusError, match="no address of this host"):
-            use("tcp/192.0.2.1:7447")
+    with pytest.raises(BusError, match="no address of this host"):
+        free_endpoint("tcp/192.0.2.1:7447")
     with pytest.raises(BusError, match="not known here"):
         free_endpoint("tcp/nosuchhost.invalid:7447")
 
@@ -116,7 +121,7 @@ def test_causes_are_told_apart(number, said):
 def test_no_zenoh_of_ours_asks_for_shared_memory():
     for config in (
         client_config("tcp/127.0.0.1:1"),
-        router_config("tcp/127.0.0.1:1"),
+        zenoh.Config.from_json5(json.dumps(router_settings("tcp/127.0.0.1:1"))),
         zenoh.Config.from_file(str(ROUTER_FILE)),
     ):
         assert config.get_json("transport/shared_memory/enabled") == "false"
@@ -131,3 +136,30 @@ def test_a_port_taken_after_it_was_found_free_is_no_end(monkeypatch):
         endpoint, stop = zenoh_bus.open_free_router("tcp/127.0.0.1:0")
         stop()
     assert found == [] and endpoint.startswith("tcp/127.0.0.1:")
+
+
+@pytest.mark.parametrize(
+    ("endpoint", "local"),
+    [
+        ("tcp/127.0.0.1:1", True),
+        ("tcp/127.8.9.1:1", True),
+        ("tcp/localhost:1", True),
+        ("tcp/[::1]:1", True),
+        ("unixsock-stream//tmp/x", True),
+        ("tcp/0.0.0.0:1", False),
+        ("tcp/[::]:1", False),
+        ("udp/10.0.0.1:1", False),
+        ("tcp/localhost.example.org:1", False),
+    ],
+)
+def test_what_others_reach_is_refused_without_keys(endpoint, local):
+    assert on_loopback(endpoint) == local
+    if not local:
+        for use in (open_router, ZenohBus):
+            with pytest.raises(BusError, match="prior-sg keys init"):
+                use(endpoint)
+
+
+def test_a_router_file_of_one_host_listens_to_it_only():
+    endpoints = json.loads(zenoh.Config.from_file(str(ROUTER_FILE)).get_json("listen/endpoints"))
+    assert endpoints and all(map(on_loopback, endpoints))

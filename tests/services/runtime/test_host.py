@@ -12,9 +12,9 @@ import zenoh
 from prior_sg.schemas.codec import Message, decode, encode
 from prior_sg.schemas.frames import Intrinsics, Keyframe
 from prior_sg.schemas.places import MapRequest, SnapshotRequest, VoxelMap
-from prior_sg.schemas.priors import Task
-from prior_sg.schemas.status import Consumed, JobDone, Tick
-from prior_sg.schemas.topics import ENCODE, JOURNAL, KEYFRAME, PLACE_SNAPSHOT, TASK, VOXEL_MAP
+from prior_sg.schemas.priors import Task, TaskInForce
+from prior_sg.schemas.status import Consumed, JobDone, Started, Tick
+from prior_sg.schemas.topics import ENCODE, JOURNAL, KEYFRAME, PLACE_SNAPSHOT, TASK, TASK_IN_FORCE, VOXEL_MAP, job_key
 from prior_sg.services.refusals import InputRefused
 from prior_sg.services.runtime.bus import Hub, LocalBus, pack_header
 from prior_sg.services.runtime.client import BusClient
@@ -296,6 +296,67 @@ def test_malformed_questions_are_refused(new_bus):
     asyncio.run(main())
 
 
+def of(message, robot):
+    return msgspec.structs.replace(message, robot=robot)
+
+
+def test_a_message_counts_for_the_robot_of_its_key_only(new_bus, caplog):
+    async def main():
+        services = [(READER, Config(), "a"), (ANSWERER, Config(), "b"), (WORKER, Config(), "w")]
+        async with running(new_bus, *services) as (reader, answerer, worker):
+            bus = await asyncio.to_thread(new_bus)
+            forged = of(keyframe(1), "other")
+            bus.put(KEYFRAME, KEYFRAME.key_of(keyframe(1)), encode(forged), pack_header("x", 0, 0))
+            bus.put(KEYFRAME, KEYFRAME.key_of(keyframe(1)), encode(keyframe(2)), pack_header("y", 0, 0))
+            answers = []
+            bus.call(VOXEL_MAP.key_of(MapRequest(robot="r")), encode(MapRequest(robot="other")), 2.0, answers.append)
+            bus.call(job_key(ENCODE, "w", "r"), encode(forged), 2.0, answers.append)
+            bus.call(job_key(ENCODE, "w", "r"), encode(keyframe(3)), 2.0, answers.append)
+            await until(lambda: reader._state == [2] and len(answers) == 3)
+            assert [answer.payload for answer in answers if answer.payload] == [b"done"] and worker._state == [3]
+            refused = (reader, "KEYFRAME"), (answerer, "VOXEL_MAP"), (worker, "ENCODE")
+            assert [host.inbox.of(name).malformed for host, name in refused] == [1, 1, 1]
+            await asyncio.to_thread(bus.close)
+
+    asyncio.run(main())
+    told = [record.why for record in caplog.records if record.getMessage().startswith("message on a key")]
+    assert "it came on psg/r/keyframe and says it belongs on psg/other/keyframe" in told and len(told) == 3
+
+
+def test_a_reader_of_another_robot_is_not_waited_for(new_bus):
+    def entry(robot):
+        started = Started(robot=robot, service="x", instance="x", epoch=1, config=b"", reads=["KEYFRAME"])
+        return Consumed(robot=robot, service="x", instance="x", order=0, topic="START", inline=encode(started))
+
+    async def main():
+        async with running(new_bus, (SOURCE, Config(frames=1), "s"), (WORKER, Config(), "w")) as (source, _):
+            bus = await asyncio.to_thread(new_bus)
+            bus.put(JOURNAL, JOURNAL.pattern("r"), encode(entry("other")), pack_header("x", 0, 0))
+            await until(lambda: source.inbox.of("JOURNAL").malformed == 1)
+            assert source._state["lead"] == []
+            bus.put(JOURNAL, JOURNAL.pattern("r"), encode(entry("r")), pack_header("x", 1, 0))
+            await until(lambda: source._state["lead"] == [0])
+            await asyncio.to_thread(bus.close)
+
+    asyncio.run(main())
+
+
+def telling_other(state, request, cfg):
+    return of(answer(state, request, cfg), "other")
+
+
+LIAR = Service("liar", "", "robot", Config, lambda cfg, me: [], reader_step, answers={VOXEL_MAP: telling_other})
+
+
+def test_an_answer_about_another_robot_is_asked_again(new_bus):
+    async def main():
+        async with running(new_bus, (LIAR, Config(), "b"), (ASKER, Config(), "a")) as (_, asker):
+            await until(lambda: asker.inbox.of("VOXEL_MAP").malformed >= 1)
+            assert asker._state == []
+
+    asyncio.run(main())
+
+
 def test_the_client_asks_and_sees_health(new_bus):
     async def main():
         async with running(new_bus, (ANSWERER, Config(), "b1")):
@@ -305,6 +366,26 @@ def test_the_client_asks_and_sees_health(new_bus):
                 assert (await asyncio.to_thread(client.alive))["b1"] == "answerer"
                 status = await asyncio.to_thread(client.status, "answerer", "b1")
                 assert status.service == "answerer" and status.resident_mb > 1
+
+    asyncio.run(main())
+
+
+def task_ahead(state, request, cfg):
+    return TaskInForce(robot="r", task=Task(robot="r", stamp_ns=2**62, environment="e", task="t"))
+
+
+AHEAD = Service("ahead", "", "robot", Config, lambda cfg, me: [], reader_step, answers={TASK_IN_FORCE: task_ahead})
+
+
+def test_a_task_is_stamped_after_the_one_in_force_though_that_was_given_by_a_clock_ahead():
+    hub = Hub()
+
+    async def main():
+        with BusClient(LocalBus(hub)) as client:
+            before_ns = time.time_ns()
+            assert before_ns <= await asyncio.to_thread(client.task_stamp_ns, "r") <= time.time_ns()
+            async with running(lambda: LocalBus(hub), (AHEAD, Config(), "a")):
+                assert await asyncio.to_thread(client.task_stamp_ns, "r") == 2**62 + 1
 
     asyncio.run(main())
 

@@ -1,0 +1,1 @@
+"""Certificates of those who take part, and what each may do."""

@@ -1,0 +1,290 @@
+"""The live page: one thread draws what has changed, no faster than the link and the machine follow."""
+
+import contextlib
+import io
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import viser
+
+from prior_sg.deploy.showing.prior import graph_svg
+from prior_sg.deploy.viewing import search, words
+from prior_sg.deploy.viewing.drawing import DARK, LIGHT, Painter
+from prior_sg.deploy.viewing.footprint import floor_m
+from prior_sg.deploy.viewing.panel import CUT_M, Asked, Panel
+from prior_sg.deploy.viewing.picking import Picked, pick, typical_place
+from prior_sg.deploy.viewing.search import NOTHING_KNOWN
+from prior_sg.deploy.viewing.sources import Likeness, Source
+from prior_sg.deploy.viewing.stage import SafeServer, Stage
+from prior_sg.schemas.regions import NO_REGION
+from prior_sg.schemas.scene import Scene
+from prior_sg.services.errors import PriorSgError
+
+SHARE = 4.0  # drawing takes at most one part in so many of the time
+PLAY_S, FRAME_S = 20.0, 0.1  # a whole history, and one step of it
+HEALTH_S, POLL_S, TYPING_S = 5.0, 0.5, 0.5
+MOST_CATCH_UP_S = 5.0
+
+
+@dataclass(frozen=True)
+class Options:
+    """How the page is served."""
+
+    host: str = "127.0.0.1"
+    port: int = 8080
+    dark: bool = True
+    interval_s: float = 0.2  # between updates, at least
+    max_mbit: float = 0.0  # per second to each viewer, on average; 0 = no limit
+
+
+@dataclass
+class Wanted:
+    """What viewers have asked to see."""
+
+    moment: int | None = None  # None = the newest
+    text: str = ""  # searched for
+    picked: Picked | None = None
+    cut_m: float = CUT_M
+    playing: bool = False
+    told: dict[str, str] = field(default_factory=dict)  # notes by part of the panel
+
+
+class Page:
+    """Serves one source until `close`."""
+
+    def __init__(self, source: Source, options: Options) -> None:
+        self._source, self._options = source, options
+        self._painter = Painter(DARK if options.dark else LIGHT)
+        self._wanted = Wanted()
+        self._wake, self._closed = threading.Event(), threading.Event()
+        self._scene: Scene | None = None
+        self._meant: dict[tuple[str, str], Likeness] = {}  # by text and prior
+        self._asking = threading.Lock()
+        self.sent_bytes = 0
+        self.server = SafeServer(options.host, options.port)
+        self.server.gui.configure_theme(
+            dark_mode=options.dark, show_logo=False, show_share_button=False, brand_color=(78, 121, 167)
+        )
+        self.stage = Stage(self.server, self._painter.theme)
+        self.panel = Panel(self.server, self._asked(), source.live)
+        self.panel.build()
+        self.server.scene.on_click()(self._clicked)
+        self._threads = [
+            threading.Thread(target=work, name=work.__name__, daemon=True)
+            for work in (self._draw, self._watch, self._play, self._watch_health)
+        ]
+        for thread in self._threads:
+            thread.start()
+
+    @property
+    def address(self) -> str:
+        """Where browsers find it."""
+        return f"http://{self._options.host}:{self.server.get_port()}"
+
+    def close(self) -> None:
+        """End the threads and the server."""
+        self._closed.set()
+        self._wake.set()
+        for thread in self._threads:
+            thread.join(2 * MOST_CATCH_UP_S)
+        with contextlib.redirect_stdout(io.StringIO()):
+            self.server.stop()
+
+    def _asked(self) -> Asked:
+        return Asked(
+            task=lambda task, environment: self._later(self._give_task, task, environment),
+            search=self._search,
+            moment=lambda moment: self._want(moment=moment, playing=False),
+            follow=lambda: self._want(moment=None, playing=False),
+            play=self._start_playing,
+            layer=self.stage.switch,
+            cut=lambda height: self._want(cut_m=height),
+            frame=self.stage.frame,
+            forget=lambda: self._want(picked=None),
+        )
+
+    def _want(self, **changes: object) -> None:
+        for name, value in changes.items():
+            setattr(self._wanted, name, value)
+        self._wake.set()
+
+    def _search(self, text: str) -> None:
+        """Words are compared at once; what they mean is asked when nobody has typed for a moment."""
+        self._want(text=text)
+        self._later(self._find_meaning, text)
+
+    def _find_meaning(self, text: str) -> None:
+        scene = self._scene
+        if self._closed.wait(TYPING_S) or scene is None or text != self._wanted.text or not text.strip():
+            return
+        key = (text, scene.prior_digest)
+        with self._asking:
+            if key in self._meant or text != self._wanted.text:
+                return
+            try:
+                self._meant[key] = self._source.likeness(scene, text)
+            except PriorSgError as error:
+                self._meant[key] = Likeness({}, {}, str(error))
+        self._wake.set()
+
+    def _later(self, work: Callable[..., None], *arguments: object) -> None:
+        threading.Thread(target=work, args=arguments, daemon=True).start()
+
+    def _draw(self) -> None:
+        """Draw when something has changed; then wait as long as that took several times over, or the link needs."""
+        while not self._closed.is_set():
+            self._wake.wait()
+            self._wake.clear()
+            if self._closed.is_set():
+                return
+            since_s = time.monotonic()
+            try:
+                sent = self.refresh()
+                self.panel.write("told", self._wanted.told.get("told", ""))
+            except PriorSgError as error:
+                sent = 0
+                self.panel.write("told", words.note(str(error)))
+            took_s = time.monotonic() - since_s
+            link_s = 8e-6 * sent / self._options.max_mbit if self._options.max_mbit else 0.0
+            rest_s = max(self._options.interval_s - took_s, min((SHARE - 1) * took_s, MOST_CATCH_UP_S), link_s)
+            self._closed.wait(rest_s)
+
+    def refresh(self) -> int:
+        """Bring the page up to date; about how many bytes that sent."""
+        wanted, stamps = self._wanted, self._source.stamps()
+        scene = self._source.scene(wanted.moment)
+        self._scene = scene
+        until_ns = scene.stamp_ns if wanted.moment is not None else np.inf
+        found = search.find(scene, wanted.text, self._meant.get((wanted.text, scene.prior_digest), NOTHING_KNOWN))
+        picked = NO_REGION if wanted.picked is None else wanted.picked.region
+        picture = self._painter.draw(scene, replace(found.lit, picked=picked))
+        ground_m = floor_m(scene, np.arange(len(scene.place_ids)))
+        picture |= self._source.cloud.picture(ground_m + wanted.cut_m, until_ns)
+        sent = self.stage.show(picture).nbytes
+        self.stage.look(self._source.camera(until_ns))
+        self._frame(scene, ground_m)
+        self._write(scene, found, len(stamps))
+        self.sent_bytes += sent
+        return sent
+
+    def _frame(self, scene: Scene, ground_m: float) -> None:
+        if len(scene.place_ids):
+            reach = scene.radii_m[:, None]
+            low_m = (scene.positions_m - reach).min(axis=0)
+            high_m = (scene.positions_m + reach).max(axis=0)
+            low_m[2], high_m[2] = ground_m, min(high_m[2], ground_m + CUT_M)
+            self.stage.set_bounds(low_m.astype(float), high_m.astype(float))
+
+    def _write(self, scene: Scene, found: search.Found, count: int) -> None:
+        panel, wanted = self.panel, self._wanted
+        panel.write("headline", words.headline(scene, self._source.title))
+        panel.write("legend", words.legend(scene, self._painter.label_colors(scene)))
+        panel.write("answers", words.answers(found.rows) + (words.note(found.said) if found.said else ""))
+        panel.write("selected", self._selected(scene, wanted.picked))
+        newest = max(count - 1, 0)
+        moment = newest if wanted.moment is None else min(wanted.moment, newest)
+        panel.set_moments(count, moment)
+        panel.write("moment", words.note(_when(self._source.stamps(), moment)) if count > 1 else "")
+        prior = self._source.prior(scene.prior_digest)
+        if prior is not None:
+            panel.write("prior", words.card(graph_svg(prior)))
+
+    def _selected(self, scene: Scene, picked: Picked | None) -> str:
+        """The story of what was clicked, as far as it is there at this moment."""
+        if picked is None:
+            return ""
+        region = words.region_of(scene, picked.region)
+        why = self._wanted.told.get("why", "")
+        if picked.itself:
+            there = picked.place in scene.place_ids
+            return (words.place_story(scene, picked.place) if there else words.note("not there at this time")) + why
+        return (words.region_story(scene, region) if region else words.note("not there at this time")) + why
+
+    def _clicked(self, event: viser.SceneClickEvent) -> None:
+        scene = self._scene
+        if scene is None:
+            return
+        origin, direction = np.array(event.ray_origin), np.array(event.ray_direction)
+        picked = pick(scene, self._painter.ground(scene), origin, direction, self.stage.is_on("places"))
+        self._wanted.told.pop("why", None)
+        self._want(picked=picked)
+        if picked is not None:
+            self._explain(scene, picked)
+
+    def _explain(self, scene: Scene, picked: Picked) -> None:
+        """Ask for the votes of the place, or of one in the middle of the region."""
+
+        def tell(html: str) -> None:
+            if self._wanted.picked == picked:
+                self._wanted.told["why"] = html
+                self._wake.set()
+
+        place = picked.place if picked.itself else typical_place(scene, picked.region)
+        if place is None:
+            return
+        try:
+            tell(words.explanation(self._source.explain(place, lambda text: tell(words.note(text)))))
+        except PriorSgError as error:
+            tell(words.note(str(error)))
+
+    def _give_task(self, task: str, environment: str) -> None:
+        def tell(text: str) -> None:
+            self._wanted.told["told"] = words.note(text)
+            self._wake.set()
+
+        if not task.strip():
+            tell("write what the robot is to do")
+            return
+        self.panel.busy(True)
+        tell("asking for the prior of this task")
+        self._want(moment=None, playing=False)
+        try:
+            tell(self._source.switch(task.strip(), environment.strip(), tell))
+        except PriorSgError as error:
+            tell(str(error))
+        finally:
+            self.panel.busy(False)
+
+    def _start_playing(self) -> None:
+        newest = len(self._source.stamps()) - 1
+        if self._wanted.playing or newest < 1:
+            self._want(playing=False)
+            return
+        at_end = self._wanted.moment is None or self._wanted.moment >= newest
+        self._want(moment=0 if at_end else self._wanted.moment, playing=True)
+
+    def _play(self) -> None:
+        while not self._closed.wait(FRAME_S):
+            wanted, newest = self._wanted, len(self._source.stamps()) - 1
+            if not wanted.playing or wanted.moment is None:
+                continue
+            step = max(1, round(newest * FRAME_S / PLAY_S))
+            done = wanted.moment + step >= newest
+            self._want(moment=None if done else wanted.moment + step, playing=not done)
+
+    def _watch(self) -> None:
+        """Wake the drawing when the source has something new."""
+        points = -1
+        self._wake.set()
+        while not self._closed.is_set():
+            if self._source.wait(POLL_S) or len(self._source.cloud) != points:
+                points = len(self._source.cloud)
+                self._wake.set()
+
+    def _watch_health(self) -> None:
+        while self._source.live and not self._closed.is_set():
+            try:
+                self.panel.write("health", words.health_table(self._source.health()))
+            except PriorSgError as error:
+                self.panel.write("health", words.note(str(error)))
+            self._closed.wait(HEALTH_S)
+
+
+def _when(stamps: list[int], moment: int) -> str:
+    """Where a moment lies in the history."""
+    if moment >= len(stamps) - 1:
+        return f"now, after {len(stamps)} changes"
+    return f"change {moment + 1} of {len(stamps)}, {(stamps[-1] - stamps[moment]) * 1e-9:.1f} s before the newest"

@@ -1,0 +1,80 @@
+"""What a search lights up (pure)."""
+
+from dataclasses import dataclass, replace
+
+from prior_sg.deploy.viewing.drawing import Lit
+from prior_sg.deploy.viewing.sources import Likeness
+from prior_sg.schemas.queries import AnswersTo, Ranking
+from prior_sg.schemas.scene import Scene
+from prior_sg.services.scene_store.core.queries.answering import answer
+from prior_sg.services.scene_store.core.queries.index import Index
+
+MOST_ANSWERS = 5
+NOTHING_KNOWN = Likeness({}, {})
+LIKELY = 0.5  # a score from which an answer is rather right than wrong
+AS_GOOD = 0.6  # of the best answer's score: what answers so well is lit, too
+
+
+@dataclass(frozen=True)
+class Found:
+    """Answers, best first: kind, name and score; and what of the map stands out."""
+
+    rows: list[tuple[str, str, float | None]]
+    lit: Lit
+    said: str  # a sentence; empty when there is nothing to say
+
+
+def ranked(scene: Scene, text: str, likeness: Likeness) -> Ranking:
+    """What answers a text by what its labels mean; where nothing is known of that, by their words."""
+    asked = AnswersTo(text=text, regions=likeness.regions, objects=likeness.objects, limit=3 * MOST_ANSWERS)
+    found = answer(Index(scene, 0), asked)
+    if not isinstance(found, Ranking):
+        raise TypeError(f"AnswersTo is answered by {type(found).__name__}")
+    return found
+
+
+def found_in(ranking: Ranking, scene: Scene, text: str) -> Found:
+    """Answers as the page shows them; where there are none, names that begin like the text, while it is being typed."""
+    things = [thing for thing in ranking.things if thing.what != "place" and thing.score]
+    if not things:
+        return begun(scene, text)
+    best = things[0].score or 0.0
+    bright = [thing for thing in things if (thing.score or 0.0) >= AS_GOOD * best]
+    lit = Lit(
+        regions=frozenset(thing.id for thing in bright if thing.what == "region"),
+        objects=frozenset(thing.id for thing in bright if thing.what == "object"),
+    )
+    said = ranking.note or ("" if best >= LIKELY else "nothing answers this for sure; these come nearest")
+    return Found([(thing.what, thing.label, thing.score) for thing in things[:MOST_ANSWERS]], lit, said)
+
+
+def begun(scene: Scene, text: str) -> Found:
+    """Regions and objects with a word that begins so, the most probable first."""
+    start = text.strip().casefold()
+    named = [
+        *((one.probability, "region", one.label, one.id) for one in scene.regions if _begins(one.label, start)),
+        *(
+            (one.probability * one.known, "object", one.label, one.id)
+            for one in scene.objects
+            if _begins(one.label, start)
+        ),
+    ]
+    best = sorted(named, key=lambda one: -one[0])[:MOST_ANSWERS]
+    lit = Lit(
+        regions=frozenset(number for _, kind, _, number in best if kind == "region"),
+        objects=frozenset(number for _, kind, _, number in best if kind == "object"),
+    )
+    said = "" if best else f"nothing here answers {text.strip()!r}"
+    return Found([(kind, name, score) for score, kind, name, _ in best], lit, said)
+
+
+def find(scene: Scene, text: str, likeness: Likeness = NOTHING_KNOWN) -> Found:
+    """What of a scene answers a text; nothing where it is empty. It says what was missing to know better."""
+    if not text.strip():
+        return Found([], Lit(), "")
+    found = found_in(ranked(scene, text, likeness), scene, text)
+    return replace(found, said=": ".join(part for part in (found.said, likeness.missing) if part))
+
+
+def _begins(name: str, start: str) -> bool:
+    return bool(start) and any(word.startswith(start) for word in [name.casefold(), *name.casefold().split()])

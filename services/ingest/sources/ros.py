@@ -1,0 +1,168 @@
+"""Recordings of ROS: rosbag2 folders and their files (.db3, .mcap), and bags of ROS 1 (.bag).
+
+sensor_msgs/Image, CompressedImage    colour (raw, JPEG, PNG) and depth (16UC1 in millimetres, 32FC1 in metres, raw or
+                                      compressedDepth with PNG)
+sensor_msgs/CameraInfo                the cameras; of images named …rect… the projection matrix counts
+tf2_msgs/TFMessage                    /tf and /tf_static; or nav_msgs/Odometry, geometry_msgs/TransformStamped,
+                                      PoseStamped, PoseWithCovarianceStamped
+
+Which topics are read is chosen by type, frame and name, and noted. Each colour image gets the depth image whose stamp
+is closest within --sync-tolerance, each used once; colour and depth without a partner are left out, and counted. The
+pose is interpolated to the colour image's stamp: the camera's frame in the fixed frame through the tree of transforms,
+or the pose of a topic, and from its frame to the camera's through the tree. The frame of an image has x right, y down,
+z forward (REP 103, "optical"); --axes says otherwise. The world is z up (REP 105). Depth of another frame than colour's
+is drawn into the colour camera through the transform between the two, and colour undistorted for it; without such a
+transform it is taken as registered where both cameras are the same. Region truth: regions.json in a rosbag2 folder.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from prior_sg.services.ingest.core.options import ReadOptions
+from prior_sg.services.ingest.core.pairing import associate
+from prior_sg.services.ingest.core.poses import Convention, PoseError
+from prior_sg.services.ingest.core.ros.topics import (
+    NAMED,
+    Chosen,
+    Topic,
+    chosen,
+    pose_topics,
+)
+from prior_sg.services.ingest.core.ros.transforms import Track
+from prior_sg.services.ingest.sources.base import (
+    MILLIMETRE,
+    Entry,
+    Found,
+    SourceError,
+    truth_beside,
+)
+from prior_sg.services.ingest.sources.ros_bag import Bag, is_recording
+from prior_sg.services.ingest.sources.ros_pictures import pictures
+from prior_sg.services.ingest.sources.ros_recorded import Recorded
+
+NAME = "ros"
+LOOKS = "a recording of ROS (a rosbag2 folder with metadata.yaml, .db3, .mcap or .bag)"
+MOST = 0.9  # share of the images of the slower stream that normally find a partner
+Posed = Callable[[int], np.ndarray]  # fixed_from_camera at a stamp; raises PoseError
+
+
+def fits(path: Path) -> bool:
+    """Whether a path is a recording of ROS, and no log of ours."""
+    return is_recording(path)
+
+
+def load(path: Path, options: ReadOptions) -> Found:
+    """A recording of ROS. Raises SourceError, and ExtraMissing where rosbags is not installed."""
+    if options.quaternion:
+        raise SourceError("messages of ROS name the parts of a quaternion: leave out --quaternion")
+    bag = Bag(path)
+    topics = bag.topics()
+    try:
+        choice, posing = chosen(topics, options), pose_topics(topics, options)
+    except ValueError as error:
+        raise SourceError(f"{path}: {error}") from error
+    recorded = Recorded(bag, options, topics, choice, posing)
+    camera, images, how = pictures(recorded)
+    posed, said = _poses(recorded)
+    convention = Convention().changed(options)
+    pairs, left_out = _pairs(recorded)
+    entries = []
+    for number, (color, depth) in enumerate(pairs):
+        stamp_ns = recorded.colors.stamps_ns[color]
+        shown_ns = round(number * options.frame_ns(1)) if options.rate_hz else stamp_ns
+        entries.append(
+            Entry(number, shown_ns, partial(_pose, posed, convention, stamp_ns), partial(images, color, depth))
+        )
+    return Found(
+        NAME,
+        path,
+        camera,
+        MILLIMETRE,
+        entries,
+        ground_truth=truth_beside(path) if path.is_dir() else None,
+        convention=convention,
+        why=(f"it is a recording of ROS {1 if bag.is_ros1 else 2}",),
+        notes=tuple(filter(None, (f"{choice.said()}, {said}", _others(choice), how, *left_out))),
+    )
+
+
+def _pairs(recorded: Recorded) -> tuple[list[tuple[int, int]], list[str]]:
+    """Indices of colour and depth images that belong together, and notes on those that do not. Raises SourceError."""
+    bag, colors, depths = recorded.bag, recorded.colors, recorded.depths
+    for name, index in ((recorded.choice.color.name, colors), (recorded.choice.depth.name, depths)):
+        if index.stamps_ns and not any(index.stamps_ns):
+            raise SourceError(f"{bag.path}: the headers of {name} have no stamps; give --clock received")
+    partner = associate(colors.stamps_ns, depths.stamps_ns, recorded.within_ns)
+    pairs = sorted(partner.items())
+    within = f"{recorded.within_ns / 1e6:g} ms"
+    if not pairs:
+        away_s = (depths.stamps_ns[0] - colors.stamps_ns[0]) / 1e9 if depths.stamps_ns and colors.stamps_ns else 0.0
+        raise SourceError(
+            f"{bag.path}: no colour image has a depth image within {within}; depth begins {away_s:+.3f} s after "
+            "colour: give --sync-tolerance SECONDS or --clock received"
+        )
+    notes = recorded.lost()
+    fewer = min(len(colors.stamps_ns), len(depths.stamps_ns))
+    if len(pairs) < max(len(colors.stamps_ns), len(depths.stamps_ns)):
+        mend = "" if len(pairs) >= MOST * fewer else " (--sync-tolerance SECONDS takes more)"
+        notes.append(
+            f"{len(pairs)} of {len(colors.stamps_ns)} colour and {len(depths.stamps_ns)} depth images belong together "
+            f"within {within}: the others are left out{mend}"
+        )
+    return pairs, notes
+
+
+def _others(choice: Chosen) -> str:
+    if not choice.others:
+        return ""
+    return f"further images are not read: {', '.join(choice.others[:NAMED])} (--color-topic, --depth-topic)"
+
+
+def _pose(posed: Posed, convention: Convention, stamp_ns: int) -> np.ndarray:
+    return convention.of_matrix(posed(stamp_ns))
+
+
+def _poses(recorded: Recorded) -> tuple[Posed, str]:
+    """How the camera's pose is found, and a phrase on it. Raises SourceError."""
+    camera, tree, options = recorded.choice.color.frame, recorded.tree, recorded.options
+    try:
+        if not recorded.told:
+            fixed = options.fixed_frame or tree.fixed_frame(camera)
+            if options.fixed_frame and not tree.connects(options.fixed_frame, camera):
+                raise PoseError(f"tf does not connect {camera} with {fixed}, which is asked for")
+            if fixed:
+                within_ns = recorded.within_ns
+                return (lambda stamp_ns: tree.at(fixed, camera, stamp_ns, within_ns)), f"poses of {camera} in {fixed}"
+        if not recorded.posing:
+            where = tree.ancestors(camera)[-1]
+            raise PoseError(
+                f"nothing says how the camera moves: in tf its frame {camera!r} stays where it is in {where!r}, and "
+                "there is no topic of odometry or poses"
+            )
+        return _of_topic(recorded, recorded.posing[0], camera)
+    except PoseError as error:
+        raise SourceError(f"{recorded.bag.path}: {error}") from error
+
+
+def _of_topic(recorded: Recorded, topic: Topic, camera: str) -> tuple[Posed, str]:
+    """Poses of a topic, carried on to the camera's frame. Raises PoseError."""
+    samples, tree, within_ns = recorded.poses[topic.name], recorded.tree, recorded.within_ns
+    track = Track(samples)
+    if not len(track.stamps_ns):
+        raise PoseError(f"{topic.name} has no poses that can be read")
+    bodies = {sample.child for sample in samples}
+    if len(bodies) > 1:
+        raise PoseError(f"{topic.name} has poses of several frames: {', '.join(sorted(bodies)[:NAMED])}")
+    body = recorded.options.pose_frame or bodies.pop() or camera
+    if not tree.connects(body, camera):
+        raise PoseError(
+            f"{topic.name} has poses of {body!r}, and tf does not connect it with the camera's {camera!r}; "
+            f"give --pose-frame {camera} when they are the camera's own"
+        )
+    said = f"poses of {topic.name} ({topic.type.rpartition('/')[2]} of {body or 'the camera'})"
+    if body == camera:
+        return (lambda stamp_ns: track.at(stamp_ns, within_ns)), said
+    return (lambda stamp_ns: track.at(stamp_ns, within_ns) @ tree.at(body, camera, stamp_ns, within_ns)), said

@@ -1,0 +1,153 @@
+"""Recordings of ROS, opened with rosbags: what they hold, and single messages of them."""
+
+import struct
+import weakref
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from prior_sg.services.ingest.core.ros import topics as ros_topics
+from prior_sg.services.ingest.core.ros.images import encoding_of, shown_by
+from prior_sg.services.ingest.core.ros.topics import Topic
+from prior_sg.services.ingest.core.ros.transforms import frame_name
+from prior_sg.services.ingest.sources.base import FrameError
+from prior_sg.services.ingest.sources.tables import SourceError
+from prior_sg.services.runtime import extras
+from prior_sg.services.runtime.record import LogError, holds_ros
+
+BAG, STORAGES, METADATA = ".bag", (".db3", ".mcap"), "metadata.yaml"
+MENDING = {BAG: "rosbag reindex", ".mcap": "mcap recover"}  # by ending; else a folder's
+BAGFILE = b"rosbag2_bagfile_information"
+TRANSFORMS = "geometry_msgs/TransformStamped[] transforms"  # rosbags brings no such message for ROS 1
+
+
+def is_recording(path: Path) -> bool:
+    """Whether a path is a ROS 1 bag, a folder of rosbag2, or one of its files; logs of ours are not."""
+    if path.is_dir():
+        return (path / METADATA).is_file() and BAGFILE in (path / METADATA).read_bytes()[:4096]
+    if path.suffix == ".mcap":
+        try:
+            return holds_ros(path)
+        except LogError:
+            return False
+    return path.suffix in (BAG, *STORAGES)
+
+
+@contextmanager
+def readable(path: Path) -> Iterator[None]:
+    """What any parser says of a damaged recording, as one sentence. Raises SourceError."""
+    try:
+        yield
+    except (SourceError, extras.ExtraMissing):
+        raise
+    except Exception as error:  # rosbags, its parsers and decompressors raise nearly everything
+        mend = MENDING.get(path.suffix, "ros2 bag reindex")
+        raise SourceError(
+            f"{path} cannot be read as a recording of ROS: {_said(error)}; `{mend}` may mend one that was cut off"
+        ) from error
+
+
+def _said(error: Exception) -> str:
+    return " ".join(str(error).split())[:200].rstrip(".") or type(error).__name__
+
+
+@dataclass
+class Index:
+    """Where the messages of one topic lie, in the order of their stamps."""
+
+    stamps_ns: list[int] = field(default_factory=list)  # as the clock that was asked for has them
+    received_ns: list[int] = field(default_factory=list)
+    headers_ns: list[int] = field(default_factory=list)
+
+
+class Bag:
+    """A recording that stays open as long as somebody holds it."""
+
+    def __init__(self, path: Path) -> None:
+        """Raises SourceError, and ExtraMissing where rosbags is not installed."""
+        extras.require("ros", f"{path}, a recording of ROS,")
+        from rosbags.rosbag1 import Reader as Reader1
+        from rosbags.rosbag2 import Reader as Reader2
+        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+        self.path, self.is_ros1 = path, path.suffix == BAG
+        self._store = get_typestore(Stores.ROS1_NOETIC if self.is_ros1 else Stores.ROS2_JAZZY)
+        if self.is_ros1:
+            for name in ros_topics.TF_TYPES:
+                self._store.register(get_types_from_msg(TRANSFORMS, name))
+        with readable(path):
+            self._reader: Any = Reader1(path) if self.is_ros1 else Reader2(path)
+            self._reader.open()
+            self._close = weakref.finalize(self, self._reader.close)
+            self._connections: dict[str, list[Any]] = {}
+            for connection in self._reader.connections:
+                self._connections.setdefault(connection.topic, []).append(connection)
+
+    def topics(self) -> list[Topic]:
+        """All topics by name; of images and cameras with what their first message says. Raises SourceError."""
+        with readable(self.path):
+            return [self._topic(name) for name in sorted(self._connections)]
+
+    def messages(self, names: Sequence[str]) -> Iterator[tuple[str, int, bytes]]:
+        """Topic, time of arrival (ns) and data of all messages of some topics, by arrival. Raises SourceError."""
+        wanted = [connection for name in names for connection in self._connections[name]]
+        with readable(self.path):
+            for connection, received_ns, data in self._reader.messages(connections=wanted) if wanted else ():
+                yield connection.topic, received_ns, data
+
+    def decode(self, name: str, data: bytes) -> Any:
+        """A message of a topic. Raises FrameError."""
+        decode = self._store.deserialize_ros1 if self.is_ros1 else self._store.deserialize_cdr
+        try:
+            return decode(data, self._connections[name][0].msgtype)
+        except Exception as error:  # rosbags says nothing of what it raises for damaged data
+            raise FrameError(f"a message of {name} cannot be read: {_said(error)}") from error
+
+    def message(self, name: str, index: Index, position: int) -> Any:
+        """The message of a topic at a place of its index. Raises FrameError."""
+        received_ns, header_ns = index.received_ns[position], index.headers_ns[position]
+        span = {"connections": self._connections[name], "start": received_ns, "stop": received_ns + 1}
+        try:
+            found = [data for _, _, data in self._reader.messages(**span)]
+        except Exception as error:
+            raise FrameError(f"a message of {name} cannot be read: {_said(error)}") from error
+        data = next((data for data in found if self.stamp_ns(data) == header_ns), None)
+        if data is None:
+            raise FrameError(f"a message of {name} lies in a damaged part of the recording")
+        return self.decode(name, data)
+
+    def stamp_ns(self, data: bytes) -> int:
+        """The stamp of a message that begins with a header. Raises FrameError."""
+        try:
+            if self.is_ros1:
+                seconds, rest = struct.unpack_from("<II", data, 4)
+            else:
+                seconds, rest = struct.unpack_from("<iI" if data[1] & 1 else ">iI", data, 4)
+        except (struct.error, IndexError) as error:
+            raise FrameError("a message has no header") from error
+        return seconds * 1_000_000_000 + rest
+
+    def _topic(self, name: str) -> Topic:
+        connections = self._connections[name]
+        count = sum(connection.msgcount for connection in connections)
+        kind, duration_s = connections[0].msgtype, self._reader.duration / 1e9
+        topic = Topic(name, kind, count, count / duration_s if count > 1 and duration_s > 0 else 0.0)
+        if kind not in (ros_topics.IMAGE, ros_topics.COMPRESSED, ros_topics.CAMERA_INFO) or not count:
+            return topic
+        return self._looked_at(topic)
+
+    def _looked_at(self, topic: Topic) -> Topic:
+        """With what the first message says that can be read."""
+        for _, data in zip(range(3), self._reader.messages(connections=self._connections[topic.name]), strict=False):
+            try:
+                message = self.decode(topic.name, data[2])
+            except FrameError:
+                continue
+            frame = frame_name(message.header.frame_id)
+            if topic.type == ros_topics.CAMERA_INFO:
+                return Topic(topic.name, topic.type, topic.count, topic.rate_hz, frame=frame)
+            said = encoding_of(message), frame, shown_by(message)
+            return Topic(topic.name, topic.type, topic.count, topic.rate_hz, *said)
+        return topic

@@ -1,0 +1,56 @@
+"""`prior-sg keys` and `router`, as a user meets them."""
+
+import json
+import os
+
+import pytest
+import zenoh
+
+from prior_sg.deploy.cli.main import main
+from prior_sg.services.runtime.keys import VARIABLE
+
+
+@pytest.fixture
+def said(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
+    monkeypatch.setenv(VARIABLE, "")
+
+    def say(*words):
+        status = main(list(words))
+        out = capsys.readouterr()
+        return status, " ".join((out.out + out.err).split())
+
+    return say
+
+
+def test_keys_are_made_listed_replaced_and_revoked(said, tmp_path):
+    assert "run `prior-sg keys init`" in said("keys", "add", "robot", "robot7")[1]
+    for words in (["init"], ["add", "edge", "edge1"], ["add", "robot", "robot7"], ["rotate", "robot7"]):
+        assert said("keys", *words)[0] == 0
+    said("keys", "add", "viewer", "anna")
+    status, told = said("keys", "revoke", "anna")
+    assert status == 0 and "routers of edge1 must know" in told
+    listed = json.loads(said("keys", "list", "--json")[1])
+    assert [(one["name"], one["issue"], one.get("revoked", False)) for one in listed] == [
+        ("edge1", 1, False),
+        ("robot7", 2, False),
+        ("anna", 1, True),
+    ]
+    assert (tmp_path / "prior-sg/keys/bundles/robot7/key.pem").stat().st_mode & 0o777 == 0o600
+
+
+def test_a_router_for_others_needs_keys_and_can_be_written_for_zenohd(said, tmp_path):
+    assert "prior-sg keys init" in said("router", "--listen", "tls/0.0.0.0:7448")[1]
+    said("keys", "init")
+    said("keys", "add", "edge", "edge1")
+    said("keys", "add", "robot", "robot7")
+    bundles, file = tmp_path / "prior-sg/keys/bundles", tmp_path / "router.json5"
+    words = ("router", "--listen", "tls/0.0.0.0:7448", "--write", str(file))
+    assert "no key of an edge" in said(*words, "--keys", str(bundles / "robot7"))[1]
+    assert said(*words, "--keys", str(bundles / "edge1"))[0] == 0
+    config = zenoh.Config.from_file(str(file))
+    assert config.get_json("access_control/default_permission") == '"deny"'
+    assert config.get_json("transport/shared_memory/enabled") == "false"
+    assert os.environ[VARIABLE] == str(bundles / "edge1")
+    words = ("up", "ingest", "--robot", "robot8", "--join", "tls/127.0.0.1:7448", "--out", str(tmp_path / "out"))
+    assert "these keys are of robot7" in said(*words, "--keys", str(bundles / "robot7"))[1]

@@ -1,0 +1,144 @@
+import re
+import shutil
+import socket
+import time
+from collections.abc import Callable, Iterator
+
+import msgspec
+import numpy as np
+import pytest
+
+from prior_sg.deploy.cli.main import main
+from prior_sg.deploy.viewing.held import Held
+from prior_sg.deploy.viewing.page import Options, Page
+from prior_sg.deploy.viewing.stage import pose_for
+from tests.help.homes import home
+
+CHROMIUM = shutil.which("chromium") or ""
+SOFTWARE = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-background-networking")
+
+
+@pytest.fixture
+def shown() -> Iterator[tuple[Held, Page]]:
+    source = Held(home(), "test")
+    page = Page(source, Options(port=18190, interval_s=0.02))
+    yield source, page
+    page.close()
+    source.close()
+
+
+def until(true: Callable[[], bool], patience_s: float = 20.0) -> None:
+    end_s = time.monotonic() + patience_s
+    while not true():
+        assert time.monotonic() < end_s
+        time.sleep(0.05)
+
+
+@pytest.mark.skipif(not CHROMIUM, reason="Chromium is not installed")
+def test_the_page_opens_without_errors_finds_things_and_keeps_colours(shown: tuple[Held, Page]) -> None:
+    sync_api = pytest.importorskip("playwright.sync_api")
+    source, page = shown
+    errors: list[str] = []
+    with sync_api.sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=CHROMIUM, args=list(SOFTWARE))
+        tab = browser.new_page(viewport={"width": 360, "height": 240})
+        tab.set_default_timeout(30_000)
+        tab.on("console", lambda said: errors.append(said.text) if said.type == "error" else None)
+        tab.on("pageerror", lambda error: errors.append(str(error)))
+        tab.goto(page.address)
+        tab.get_by_text("serve drinks", exact=True).wait_for()
+        tab.locator('input.mantine-TextInput-input[value=""]').first.fill("stove")
+        tab.get_by_text("stove", exact=True).wait_for()
+        until(lambda: "/answers/objects" in page.stage.picture)
+        before = colors(page)
+        source.put(grown())
+        tab.get_by_text("3 regions", exact=False).wait_for()
+        assert {name: color for name, color in colors(page).items() if name in before} == before
+        browser.close()
+    assert errors == []
+
+
+def colors(page: Page) -> dict[str, tuple[int, int, int]]:
+    return {name: shape.color for name, shape in page.stage.picture.items() if re.match("/regions/.*/floor", name)}
+
+
+def grown():
+    """The bedroom is divided: half of its places make an attic."""
+    scene = home()
+    owners = scene.place_regions.copy()
+    owners[8:] = 9
+    attic = msgspec.structs.replace(scene.regions[1], id=9, label="attic", position_m=(6.5, 1.5, 1.0))
+    return msgspec.structs.replace(scene, regions=[*scene.regions, attic], place_regions=owners)
+
+
+@pytest.mark.parametrize(
+    ("host", "origin", "refused"),
+    [
+        ("127.0.0.1", None, False),
+        ("localhost", "http://localhost:18190", False),
+        ("127.0.0.1", "https://elsewhere.example", True),
+        ("elsewhere.example", "http://elsewhere.example:18190", True),  # a name that leads to this machine
+    ],
+)
+def test_pages_of_other_sites_are_refused(shown: tuple[Held, Page], host: str, origin: str, refused: bool) -> None:
+    client = pytest.importorskip("websockets.sync.client")
+    import viser
+    from websockets.exceptions import ConnectionClosed
+
+    page = shown[1]
+    port = page.server.get_port()
+    with client.connect(
+        f"ws://{host}:{port}",
+        sock=socket.create_connection(("127.0.0.1", port)),
+        subprotocols=[f"viser-v{viser.__version__}"],
+        origin=origin and origin.replace("18190", str(port)),
+        max_size=None,
+    ) as spoken:
+        if refused:
+            with pytest.raises(ConnectionClosed):
+                spoken.recv(timeout=5)
+            assert spoken.close_code == 1008
+        else:
+            assert spoken.recv(timeout=5)
+
+
+def test_links_through_others_cannot_be_asked_for(shown: tuple[Held, Page]) -> None:
+    assert shown[1].server.request_share_url() is None
+
+
+def test_names_from_outside_are_shown_and_not_run(shown: tuple[Held, Page]) -> None:
+    source, page = shown
+    evil = '<img src=x onerror="alert(1)">'
+    region = msgspec.structs.replace(home().regions[0], label=evil)
+    source.put(home(regions=[region, home().regions[1]], task=evil, environment=evil))
+    until(lambda: "&lt;img" in page.panel.text("legend"))
+    assert "<img" not in page.panel.text("legend") + page.panel.text("headline")
+
+
+def test_other_machines_are_refused_in_a_sentence(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["view", "somewhere", "--host", "0.0.0.0"]) == 1
+    said = capsys.readouterr().err
+    assert "ssh -L" in said and said.count("\n") <= 3
+
+
+def test_a_folder_that_is_no_run_is_told(tmp_path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["view", str(tmp_path)]) == 1
+    assert "log.mcap" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("aspect", [0.46, 1.6, 3.0])
+@pytest.mark.parametrize("free", [(1.0, 1.0), (0.7, 1.0), (1.0, 0.42)])
+@pytest.mark.parametrize("size", [(10.0, 4.0, 2.0), (4.0, 10.0, 2.0)])
+def test_the_whole_map_is_in_the_free_part_of_the_window(aspect: float, free: tuple, size: tuple) -> None:
+    low_m, high_m = np.array((1.0, 2.0, 0.0)), np.array((1.0, 2.0, 0.0)) + size
+    eye, target = pose_for(low_m, high_m, aspect, free)
+    forward = (target - eye) / np.linalg.norm(target - eye)
+    right = np.cross(forward, (0, 0, 1))
+    right /= np.linalg.norm(right)
+    up = np.cross(right, forward)
+    corners = np.array([np.where([i >> axis & 1 for axis in range(3)], high_m, low_m) for i in range(8)]) - eye
+    half_high = np.tan(np.deg2rad(38.0) / 2)
+    x = corners @ right / (corners @ forward) / half_high / aspect
+    y = corners @ up / (corners @ forward) / half_high
+    assert x.min() > -1.001 and x.max() < 2 * free[0] - 1 + 0.001
+    assert y.max() < 1.001 and y.min() > 1 - 2 * free[1] - 0.001

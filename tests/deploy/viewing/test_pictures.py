@@ -1,0 +1,199 @@
+import msgspec
+import numpy as np
+import pytest
+
+from prior_sg.deploy.showing.colors import PALETTE, LabelColors
+from prior_sg.deploy.viewing import drawing
+from prior_sg.deploy.viewing.cloud import Cloud, points_of
+from prior_sg.deploy.viewing.drawing import BLOCK, Lit, Painter
+from prior_sg.deploy.viewing.footprint import Footprint, footprints
+from prior_sg.deploy.viewing.picking import pick, typical_place
+from prior_sg.deploy.viewing.search import find
+from prior_sg.deploy.viewing.shapes import Mesh, difference
+from prior_sg.deploy.viewing.sources import Likeness
+from prior_sg.deploy.viewing.words import headline
+from tests.help.homes import home, keyframe, region
+
+
+def area_m2(ground: Footprint) -> float:
+    a, b, c = (ground.vertices[ground.faces[:, corner], :2].astype(float) for corner in range(3))
+    return float(np.abs((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]).sum() / 2)
+
+
+def test_footprint_of_a_single_place_is_its_disc() -> None:
+    scene = home()
+    alone = msgspec.structs.replace(scene, place_regions=np.array([3] + [-1] * 9))
+    ground = footprints(alone)[3]
+    assert area_m2(ground) == pytest.approx(np.pi * 1.14**2, rel=0.04)
+    radii = np.linalg.norm(ground.outline[..., :2].reshape(-1, 2) - (1.0, 1.0), axis=1)
+    assert np.abs(radii - 1.14).max() < 0.05
+    assert ground.vertices[:, 2] == pytest.approx(0.0, abs=1e-6)
+
+
+def test_footprints_of_neighbours_touch_and_never_overlap() -> None:
+    ground = footprints(home())
+    kitchen, bedroom = ground[3], ground[7]
+    assert kitchen.vertices[:, 0].max() < 4.35 and bedroom.vertices[:, 0].min() > 4.15
+    assert kitchen.vertices[:, 0].max() <= bedroom.vertices[:, 0].min() + 0.06
+
+
+def test_a_region_under_another_has_a_name_and_no_ground() -> None:
+    scene = home()
+    radii_m = scene.radii_m.copy()
+    radii_m[0] = 0.2
+    owners = scene.place_regions.copy()
+    owners[0] = 5
+    positions_m = scene.positions_m.copy()
+    positions_m[0] = positions_m[1] + np.array((0.0, 0.0, 0.5))
+    lost = region(5, "niche", 0.4, (1.0, 1.0, 1.0))
+    picture = Painter().draw(
+        msgspec.structs.replace(
+            scene, radii_m=radii_m, place_regions=owners, positions_m=positions_m, regions=[*scene.regions, lost]
+        )
+    )
+    assert [name for name in picture if name.startswith("/regions/5/")] == ["/regions/5/name"]
+
+
+def test_storeys_do_not_compete() -> None:
+    scene = home()
+    above = scene.positions_m.copy()
+    above[6:] = scene.positions_m[:4] + np.array((0, 0, 3))
+    ground = footprints(msgspec.structs.replace(scene, positions_m=above))
+    assert area_m2(ground[7]) == pytest.approx(area_m2(footprints(msgspec.structs.replace(scene))[7]), rel=0.1)
+    assert float(ground[7].vertices[0, 2]) == pytest.approx(3.0)
+
+
+def test_nothing_is_sent_for_an_equal_scene_and_little_for_a_small_change() -> None:
+    painter, scene = Painter(), home()
+    before = painter.draw(scene)
+    assert difference(before, painter.draw(home())).changed == {}
+    renamed = msgspec.structs.replace(scene.regions[0], probability=0.5)
+    after = painter.draw(msgspec.structs.replace(scene, regions=[renamed, scene.regions[1]]))
+    assert list(difference(before, after).changed) == ["/regions/3/name"]
+    gone = painter.draw(msgspec.structs.replace(scene, objects=scene.objects[:1]))
+    assert set(difference(before, gone).removed) == {"/objects/names/2", "/unnamed/boxes/0"}
+
+
+def test_only_the_block_of_a_new_place_is_sent() -> None:
+    ids = np.array([*range(10, 19), BLOCK + 1])
+    painter, edges = Painter(), np.array([(10, 11), (18, BLOCK + 1)])
+    scene = home(place_ids=ids, edges=edges, clearances_m=np.ones(2, np.float32), frontier_ids=ids[:1])
+    moved = scene.positions_m.copy()
+    moved[-1] += 0.01
+    changed = difference(painter.draw(scene), painter.draw(msgspec.structs.replace(scene, positions_m=moved))).changed
+    assert {name for name in changed if name.startswith(("/places", "/edges"))} == {"/places/1", "/edges/1"}
+
+
+def test_a_label_keeps_its_colour_while_regions_come_and_go() -> None:
+    painter, scene = Painter(), home()
+    kitchen = painter.draw(scene)["/regions/3/floor"]
+    many = [region(20 + k, f"room {k}", 0.5, (2.0, 1.5, 1.0)) for k in range(30)]
+    assert len(set(painter.label_colors(home(regions=[*scene.regions, *many])).values())) == 32
+    again = painter.draw(scene)["/regions/3/floor"]
+    assert isinstance(kitchen, Mesh) and isinstance(again, Mesh)
+    assert kitchen.color == again.color
+
+
+def test_colours_of_labels_that_left_are_used_again() -> None:
+    colors = LabelColors()
+    colors.of(f"old {k}" for k in range(len(PALETTE)))
+    assert set(colors.of(f"new {k}" for k in range(len(PALETTE))).values()) == set(PALETTE)
+
+
+def test_predicted_regions_are_faint_and_dashed_and_say_so() -> None:
+    scene, painter = home(), Painter()
+    plain = painter.draw(scene)
+    predicted = msgspec.structs.replace(scene.regions[0], predicted=True)
+    faint = painter.draw(msgspec.structs.replace(scene, regions=[predicted, scene.regions[1]]))
+    assert faint["/regions/3/floor"].opacity < plain["/regions/3/floor"].opacity / 2
+    assert len(faint["/regions/3/outline"].points_m) < 0.7 * len(plain["/regions/3/outline"].points_m)
+    assert faint["/regions/3/name"].text == "kitchen 90 %, predicted"
+
+
+def test_unknown_places_are_grey() -> None:
+    unknown = np.zeros(10, np.float16)
+    unknown[0] = 1.0
+    colors = Painter().draw(home(unknown=unknown))["/places/0"].colors.astype(int)
+    assert np.ptp(colors[0]) < 15 < np.ptp(colors[1])
+
+
+def test_answers_are_lit_and_the_rest_is_dimmed() -> None:
+    scene, painter = home(), Painter()
+    found = find(scene, "stove")
+    assert found.rows[0][:2] == ("object", "stove") and found.lit.objects == {1}
+    lit = painter.draw(scene, found.lit)
+    assert "/answers/objects" in lit and "/answers/names/1" in lit
+    assert lit["/regions/7/floor"].opacity < painter.draw(scene)["/regions/7/floor"].opacity / 2
+    assert find(scene, "bedr").lit == Lit(regions=frozenset({7}))
+    assert find(scene, "").lit == Lit()
+    assert "nothing" in find(scene, "submarine").said
+
+
+def test_what_a_text_means_comes_before_its_words_and_doubts_are_said() -> None:
+    scene = home()
+    meant = find(scene, "somewhere to sleep", Likeness({"bedroom": 0.9, "kitchen": 0.05}, {"bed": 0.8}))
+    assert meant.rows[0][:2] == ("region", "bedroom") and meant.lit.regions == {7} and meant.said == ""
+    doubted = find(scene, "somewhere to sleep", Likeness({"bedroom": 0.3, "kitchen": 0.2}, {}))
+    assert "for sure" in doubted.said
+    assert "no worker" in find(scene, "stove", Likeness({}, {}, "no worker embeds it")).said
+
+
+@pytest.mark.parametrize(
+    ("above", "place", "region_", "itself"),
+    [((2.0, 1.0), 12, 3, True), ((2.5, 1.4), 12, 3, False), ((6.2, 1.4), 18, 7, False), ((20.0, 20.0), None, 0, False)],
+)
+def test_a_click_means_the_dot_under_it_or_the_region(above: tuple, place: int, region_: int, itself: bool) -> None:
+    scene = home()
+    picked = pick(scene, footprints(scene), np.array((*above, 9.0)), np.array((0.0, 0.0, -1.0)), dots=True)
+    if place is None:
+        assert picked is None
+        return
+    assert picked is not None
+    assert (picked.region, picked.itself) == (region_, itself)
+    assert picked.place == place or not itself
+
+
+def test_without_dots_a_click_means_the_region() -> None:
+    scene = home()
+    picked = pick(scene, footprints(scene), np.array((2.0, 1.0, 9.0)), np.array((0.0, 0.0, -1.0)), dots=False)
+    assert picked is not None and not picked.itself and typical_place(scene, picked.region) in (12, 13)
+
+
+def test_points_lie_where_the_depth_says_and_are_sent_once() -> None:
+    frame = keyframe()
+    points_m, colors = points_of(frame)
+    assert len(points_m) == len(colors) > 0
+    assert points_m[:, 0] == pytest.approx(3.0, abs=1e-5)
+    left = points_m[:, 1] > 1.0
+    assert (colors[left] == (255, 0, 0)).all() and (colors[~left] == (0, 0, 255)).all()
+    cloud = Cloud()
+    cloud.add(frame)
+    before = cloud.picture()
+    cloud.add(msgspec.structs.replace(frame, frame_id=frame.frame_id + 100))  # sees nothing new
+    assert difference(before, cloud.picture()).changed == {}
+    moved = frame.world_from_camera.copy()
+    moved[:3, 3] += (1.0, 0.0, 0.0)
+    cloud.move({frame.frame_id: moved})
+    shifted = cloud.picture()[next(iter(before))].points_m - before[next(iter(before))].points_m
+    assert shifted == pytest.approx(np.tile((1.0, 0.0, 0.0), (len(shifted), 1)), abs=1e-4)
+
+
+def test_points_above_the_cut_and_later_ones_are_left_out() -> None:
+    frame = keyframe()
+    cloud = Cloud()
+    cloud.add(frame)
+    heights = np.concatenate([shape.points_m[:, 2] for shape in cloud.picture().values()])
+    middle_m = float(np.median(heights))
+    low = np.concatenate([shape.points_m[:, 2] for shape in cloud.picture(middle_m).values()])
+    assert low.max() <= middle_m and len(low) < len(heights)
+    assert cloud.picture(until_ns=frame.stamp_ns - 1) == {}
+
+
+def test_of_very_many_edges_some_are_drawn_and_the_page_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = home()
+    assert len(Painter().draw(scene)["/edges/0"].points_m) == 3
+    assert "edges" not in headline(scene, "test")
+    monkeypatch.setattr(drawing, "MOST_EDGES", 2)
+    fewer = home(edges=np.array([(10, 11), (10, 12), (11, 12)]))
+    assert len(Painter().draw(fewer)["/edges/0"].points_m) == 1  # the one whose ids have an even sum
+    assert "one of 2 edges is drawn" in headline(scene, "test")

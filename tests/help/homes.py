@@ -1,0 +1,89 @@
+"""Two rooms and a doorway, as scenes."""
+
+import cv2
+import msgspec
+import numpy as np
+
+from prior_sg.schemas.frames import Intrinsics, Keyframe
+from prior_sg.schemas.objects import SceneObject
+from prior_sg.schemas.regions import Region
+from prior_sg.schemas.scene import Scene
+
+LABELS = ["bedroom", "kitchen"]
+
+
+def home(**changes: object) -> Scene:
+    """A kitchen (x in 0..4) and a bedroom (x in 5..8) beside each other on one floor, a row of places in each."""
+    kitchen = [(x, y, 1.0) for x in (1.0, 2.0, 3.0) for y in (1.0, 2.0)]
+    bedroom = [(x, y, 1.0) for x in (5.5, 6.5) for y in (1.0, 2.0)]
+    positions_m = np.array(kitchen + bedroom, np.float32)
+    count, first = len(positions_m), len(kitchen)
+    posteriors = np.zeros((count, 2), np.float16)
+    posteriors[:first], posteriors[first:] = (0.1, 0.9), (0.7, 0.3)
+    scene = Scene(
+        robot="robot1",
+        stamp_ns=10**9,
+        environment="residential home",
+        task="serve drinks",
+        prior_digest="",
+        space="",
+        labels=LABELS,
+        regions=[
+            region(3, "kitchen", 0.9, (2.0, 1.5, 1.0), object_ids=[1]),
+            region(7, "bedroom", 0.7, (6.0, 1.5, 1.0), object_ids=[2]),
+        ],
+        place_ids=np.arange(10, 10 + count),
+        positions_m=positions_m,
+        radii_m=np.full(count, 1.0, np.float32),
+        basis_points=np.full(count, 3, np.int16),
+        place_regions=np.array([3] * first + [7] * (count - first)),
+        posteriors=posteriors,
+        unknown=np.zeros(count, np.float16),
+        edges=np.array([(10, 11), (11, 12), (15, 16)]),
+        clearances_m=np.array([0.5, 0.5, 0.4], np.float32),
+        trajectory=np.array([(0.5, 1, 1.2), (3, 1, 1.2), (6, 1, 1.2)], np.float32),
+        objects=[thing(1, "stove", (1.0, 0.2)), thing(2, "bed", (6.5, 2.0)), thing(4, "", (3.0, 2.0))],
+        frontier_ids=np.array([13]),
+        frontier_directions=np.array([(0, 1, 0)], np.float32),
+        frontier_areas_m2=np.array([1.0], np.float32),
+    )
+    return msgspec.structs.replace(scene, **changes)
+
+
+def region(number: int, label: str, probability: float, position_m: tuple, **more: object) -> Region:
+    return Region(
+        id=number, label=label, place_count=4, probability=probability, position_m=position_m, area_m2=9.0, **more
+    )
+
+
+def thing(number: int, label: str, at_m: tuple[float, float]) -> SceneObject:
+    (x, y), half = at_m, 0.3
+    return SceneObject(
+        id=number,
+        label=label,
+        probability=0.8,
+        known=0.9,
+        position_m=(x, y, 0.3),
+        min_m=(x - half, y - half, 0.0),
+        max_m=(x + half, y + half, 0.6),
+        frames=3,
+    )
+
+
+def keyframe() -> Keyframe:
+    """A camera at (1, 1, 1.2) m that looks along x at a wall two metres away, red on the left, blue on the right."""
+    color = np.zeros((48, 64, 3), np.uint8)
+    color[:, :32], color[:, 32:] = (0, 0, 255), (255, 0, 0)  # as OpenCV orders it
+    pose = np.eye(4)
+    pose[:3, :3] = np.array([(0, 0, 1), (-1, 0, 0), (0, -1, 0)])
+    pose[:3, 3] = (1.0, 1.0, 1.2)
+    return Keyframe(
+        robot="robot1",
+        frame_id=0,
+        stamp_ns=10**9,
+        intrinsics=Intrinsics(64, 48, 50.0, 50.0, 31.5, 23.5),
+        world_from_camera=pose,
+        color=cv2.imencode(".png", color)[1].tobytes(),
+        depth=cv2.imencode(".png", np.full((48, 64), 2000, np.uint16))[1].tobytes(),
+        depth_scale_m=0.001,
+    )
