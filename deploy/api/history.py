@@ -1,12 +1,13 @@
 """The scenes of a run as they were, from what it left: a database of the store, or a recorded log."""
 
+import contextlib
 import threading
 from pathlib import Path
 from typing import Self
 
 from prior_sg.deploy.api.kept import kept
 from prior_sg.deploy.api.scene import Scene
-from prior_sg.schemas.codec import decode
+from prior_sg.schemas.codec import DecodeError, decode
 from prior_sg.schemas.priors import Prior
 from prior_sg.schemas.scene import StoredRevision
 from prior_sg.schemas.topics import OBJECT_DELTA, PLACE_DELTA, PRIOR, REGION_DELTA, TASK
@@ -71,8 +72,11 @@ def open_history(path_or_url: str | Path) -> History:
     if place.endswith(".mcap"):
         return _of_log(place)
     if not is_url(place) and not Path(place).is_file():
-        raise StoreError(f"{place} does not exist; `run` and `up` write it as scene.sqlite")
-    return History(Database(core.Config(path=place), read_only=True))
+        raise StoreError(f"{place} does not exist or is no file; name the scene.sqlite or log.mcap of a run")
+    try:
+        return History(Database(core.Config(path=place), read_only=True))
+    except ValueError as error:
+        raise StoreError(str(error)) from error
 
 
 def _of_log(path: str) -> History:
@@ -80,5 +84,6 @@ def _of_log(path: str) -> History:
     store = BY_NAME["scene_store"]
     runner = Runner(store, store.config(path=":memory:"), Identity("*", "history", 0))
     for logged in read_log(path, READ_OF_LOGS):
-        runner.feed(decode(logged.topic.type, logged.payload))
+        with contextlib.suppress(DecodeError):  # garbage on a topic is recorded as well, and was no store's
+            runner.feed(decode(logged.topic.type, logged.payload))
     return History(runner.state.database)

@@ -163,7 +163,9 @@ class Database:
         for record in self.storage.events(key, past.sequence, revision):
             if record.sequence != past.sequence + 1:
                 raise StoreError(f"{self.storage.location}: events of {past.robot} are missing; ask again")
-            applied = events.APPLY[record.kind]  # type: ignore[index]
+            applied = events.APPLY.get(record.kind)  # type: ignore[call-overload]
+            if applied is None:
+                raise StoreError(f"{self.storage.location} holds an event of unknown kind; choose another path.")
             applied.apply(past.graph, self._read(applied.message, record))
             past.sequence = record.sequence
             weight += keeping.EVENT_WEIGHT + len(record.payload)

@@ -1,10 +1,12 @@
 """A store in one SQLite file, in WAL mode: what is committed survives a killed process, a torn tail is cut off."""
 
+import os
 import sqlite3
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 from prior_sg.services.scene_store.core import graph as core
 from prior_sg.services.scene_store.storage import former
@@ -105,9 +107,10 @@ class Sqlite(Storage):
     def __init__(self, cfg: core.Config, *, read_only: bool = False) -> None:
         self.location = cfg.path
         try:
-            if cfg.path != ":memory:":
+            if cfg.path != ":memory:" and not read_only:
                 Path(cfg.path).parent.mkdir(parents=True, exist_ok=True)
-            self.connection = sqlite3.connect(cfg.path, isolation_level=None, check_same_thread=False)
+            where, is_uri = _frozen(cfg.path) if read_only else (cfg.path, False)
+            self.connection = sqlite3.connect(where, isolation_level=None, check_same_thread=False, uri=is_uri)
             try:
                 self._open(cfg, read_only)
             except BaseException:
@@ -126,6 +129,11 @@ class Sqlite(Storage):
                 f"layout {version}, this program needs {LAYOUT_VERSION}" if kind == APPLICATION_ID else "other content"
             )
             raise sqlite3.DatabaseError(f"it holds {found}")
+        if read_only and version == LAYOUT_VERSION:
+            run("PRAGMA query_only = ON")
+            return
+        if read_only and empty:
+            raise sqlite3.DatabaseError("it holds no scenes")
         run("PRAGMA journal_mode = WAL")
         run(f"PRAGMA synchronous = {cfg.synchronous}")
         run(f"PRAGMA wal_autocheckpoint = {cfg.checkpoint_pages}")
@@ -188,6 +196,12 @@ class Sqlite(Storage):
         try:
             yield
         except sqlite3.Error as error:
+            if (
+                getattr(error, "sqlite_errorname", "") == "SQLITE_CONSTRAINT_PRIMARYKEY"
+            ):  # the next event is there already
+                raise StoreError(
+                    f"{self.location} is written by another scene_store; stop it or name another."
+                ) from error
             raise StoreError(
                 f"{self.location} cannot be read or written ({error}); free the disk or the file, then restart."
             ) from error
@@ -252,6 +266,15 @@ class Sqlite(Storage):
 def _found(kind: Indexed, row: tuple[Any, ...]) -> Found:
     number, label, *position_m = row
     return Found(kind, number, label, tuple(position_m))
+
+
+def _frozen(path: str) -> tuple[str, bool]:
+    """How to name a file that is only read, and whether that is a URI: where nobody can write beside it, as on a medium
+    that is read only, nothing has to be coordinated."""
+    file = Path(path)
+    if os.access(file.parent, os.W_OK) or file.with_name(f"{file.name}-wal").exists():
+        return path, False
+    return f"file:{quote(str(file))}?immutable=1", True
 
 
 def _remedy(error: Exception) -> str:

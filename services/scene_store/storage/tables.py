@@ -115,8 +115,9 @@ class Storage(ABC):
         """Let go of it."""
 
     def robots(self) -> dict[str, int]:
-        """Key of every robot by name."""
-        return {name: key for name, key in self.run("SELECT name, id FROM robots ORDER BY name")}
+        """Key of every robot by name; SQLite may hold anything as a text."""
+        rows = self.run("SELECT name, id FROM robots ORDER BY name")
+        return {name: key for name, key in rows if isinstance(name, str)}
 
     def robot_key(self, name: str) -> int:
         """The key of a robot, which is new when it was not known; within a transaction."""

@@ -1,5 +1,8 @@
 """The past as programs ask for it: of a running store, of its file, of a log."""
 
+import os
+import sqlite3
+
 import numpy as np
 import pytest
 
@@ -49,11 +52,72 @@ def test_a_file_and_a_log_hold_what_the_store_answers(run, name):
 
 
 def test_what_is_not_there_is_said(tmp_path):
-    with pytest.raises(ServiceError, match="does not exist"):
+    with pytest.raises(ServiceError, match="does not exist or is no file"):
         prior_sg.open_history(tmp_path / "scene.sqlite")
     assert not (tmp_path / "scene.sqlite").exists()
     with pytest.raises(prior_sg.Error, match=r"log\.mcap cannot be read"):
         prior_sg.open_history(tmp_path / "log.mcap")
+
+
+def test_reading_changes_no_file(run, tmp_path):
+    _, folder = run
+    empty = tmp_path / "empty.sqlite"
+    empty.touch()
+    with pytest.raises(ServiceError, match="it holds no scenes"):
+        prior_sg.open_history(empty)
+    assert empty.stat().st_size == 0
+    source, copied = sqlite3.connect(folder / "scene.sqlite"), sqlite3.connect(tmp_path / "scene.sqlite")
+    source.backup(copied)
+    source.close(), copied.close()
+    before = (tmp_path / "scene.sqlite").read_bytes()
+    with prior_sg.open_history(tmp_path / "scene.sqlite") as history:
+        assert history.revisions(ROBOT)
+    assert (tmp_path / "scene.sqlite").read_bytes() == before
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["empty.sqlite", "scene.sqlite"]
+
+
+def test_where_nothing_can_be_written_the_past_is_read(run, tmp_path, monkeypatch):
+    store, folder = run
+    shelf = tmp_path / "a shelf?"
+    shelf.mkdir()
+    source, copied = sqlite3.connect(folder / "scene.sqlite"), sqlite3.connect(shelf / "scene.sqlite")
+    source.backup(copied)
+    source.close(), copied.close()
+    if os.geteuid():
+        shelf.chmod(0o555)
+    else:  # nothing is read-only for root
+        monkeypatch.setattr(os, "access", lambda path, mode: False)
+    with prior_sg.open_history(shelf / "scene.sqlite") as history:
+        assert encode(history.scene(ROBOT).message) == encode(store.scene())
+        assert [file.name for file in shelf.iterdir()] == ["scene.sqlite"]
+    shelf.chmod(0o755)
+
+
+def test_garbage_in_a_log_is_passed_over(tmp_path):
+    with LogWriter(tmp_path / "log.mcap") as log:
+        for i, message in enumerate(whole_run(3, steps=2)):
+            topic = topic_of(type(message))
+            log.add(topic, topic.key_of(message), b"garbage", "w", i, i, i)
+            log.add(topic, topic.key_of(message), encode(message), "w", i, i, i)
+    with prior_sg.open_history(tmp_path / "log.mcap") as history:
+        assert history.revisions(ROBOT)
+
+
+@pytest.mark.parametrize("size", [0, 7, 8, 1000, 20_000])
+def test_a_log_that_is_cut_off_is_read_as_far_as_it_goes(run, tmp_path, size):
+    _, folder = run
+    (tmp_path / "log.mcap").write_bytes((folder / "log.mcap").read_bytes()[:size])
+    if size < 8:
+        with pytest.raises(prior_sg.Error, match="not a log"):
+            prior_sg.open_history(tmp_path / "log.mcap")
+    else:
+        with prior_sg.open_history(tmp_path / "log.mcap") as history:
+            assert history.robots in ([], [ROBOT])
+
+
+def test_addresses_that_cannot_be_used_are_told():
+    with pytest.raises(ServiceError, match="PGPASSWORD"):
+        prior_sg.open_history("postgresql://me:secret@127.0.0.1/scenes")
 
 
 def test_a_client_asks_a_running_store(run):

@@ -296,6 +296,23 @@ def test_a_password_stays_out_of_settings_and_messages():
     assert "postgresql://127.0.0.1:1/db" in str(caught.value) and "\n" not in str(caught.value)
 
 
+def test_two_stores_on_one_file_destroy_nothing(tmp_path):
+    first = Store(tmp_path / "scene.sqlite")
+    second = Store(tmp_path / "scene.sqlite")
+    first.feed(place_delta(0, [(1, 0, 0, 0, 1)]))
+    with pytest.raises(StoreError, match="written by another scene_store"):
+        second.feed(place_delta(0, [(2, 0, 0, 0, 1)]))
+    assert first.reopened().scene().place_ids.tolist() == [1]
+
+
+def test_an_event_of_no_kind_is_told(tmp_path):
+    store = Store(tmp_path / "scene.sqlite")
+    store.feed(place_delta(0, [(1, 0, 0, 0, 1)]))
+    store.state.database.storage.run("UPDATE events SET kind = 'song'")
+    with pytest.raises(StoreError, match="of unknown kind"):
+        store.reopened()
+
+
 def test_only_one_store_writes_to_a_server(postgres):
     url = new_database(postgres)
     with pytest.raises(StoreError, match="holds no scenes"):

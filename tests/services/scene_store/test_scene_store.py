@@ -616,6 +616,7 @@ def test_a_stored_robot_whose_name_cannot_be_used_is_left_out(tmp_path, caplog):
     path = str(tmp_path / "scene.sqlite")
     database = Database(core.Config(path=path))
     database.storage.robot_key("x//y")
+    database.storage.robot_key(b"bytes")
     task = Task(robot="good", stamp_ns=1, environment="e", task="'; DROP TABLE robots;--")
     graph = core.Graph("good", task=task)
     database.put_task(graph, task)
