@@ -14,6 +14,7 @@ LONGEST_NAME = 80  # of a region or an object
 LONGEST_TEXT = 2000  # of a task or an environment
 RESERVED = ("alive", "encoder", "fleet", "jobs", "status")  # stand in keys where the name of a robot stands
 DIRECTIONS = "\u061c\u200e\u200f\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069"  # turn how others read
+HIDDEN = "\U000e0000", "\U000e007f"  # letters that nobody sees and language models read
 _IN_KEYS = re.compile(r"[/*$#?{}]")
 
 
@@ -87,7 +88,8 @@ def key_part(text: str) -> str:
 
 
 def _unprintable(c: str) -> bool:
-    return c in DIRECTIONS or (unicodedata.category(c) in ("Cc", "Cs", "Zl", "Zp") and c not in "\n\t") or c == "\ufeff"
+    unseen = c in DIRECTIONS or c == "\ufeff" or HIDDEN[0] <= c <= HIDDEN[1]
+    return unseen or (unicodedata.category(c) in ("Cc", "Cs", "Zl", "Zp") and c not in "\n\t")
 
 
 def _quoted(text: str) -> str:

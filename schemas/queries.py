@@ -157,6 +157,14 @@ Question = (
 )
 
 
+def checked(question: Question) -> Question:
+    """A question as the bus would bring it, numbers of numpy as plain ones. Raises ValueError where it holds what none
+    may hold."""
+    plain = msgspec.to_builtins(question, enc_hook=lambda number: number.item())
+    found: Question = msgspec.convert(plain, Question)
+    return found
+
+
 class Thing(Part, frozen=True, kw_only=True):
     """A place, a region or an object, in short."""
 

@@ -53,7 +53,9 @@ class Asking(ABC):
 
     @abstractmethod
     def ask(self, *questions: Question) -> list[Answer]:
-        """Answers to questions of `prior_sg.schemas.queries`, in their order, over one revision."""
+        """Answers to questions of `prior_sg.schemas.queries`, in their order, over one revision. Raises ValueError
+        where one holds what none may hold.
+        """
 
     @abstractmethod
     def prior_of(self, digest: str) -> Prior | None:

@@ -20,7 +20,7 @@ from prior_sg.schemas.codec import DecodeError, Message
 from prior_sg.schemas.features import TextEmbeddings, TextRequest
 from prior_sg.schemas.frames import PoseUpdate
 from prior_sg.schemas.priors import Prior, PriorList, PriorRequest, Task
-from prior_sg.schemas.queries import Answer, ChangedSince, Difference, Question, SceneAnswer, SceneQuery
+from prior_sg.schemas.queries import Answer, ChangedSince, Difference, Question, SceneAnswer, SceneQuery, checked
 from prior_sg.schemas.regions import PosteriorReply, PosteriorRequest, RegionDelta
 from prior_sg.schemas.scene import HistoryRequest, RevisionList, SceneRequest, StoredRevision
 from prior_sg.schemas.scene import Scene as SceneMessage
@@ -132,7 +132,9 @@ class Client(Asking):
 
     def answers(self, *questions: Question) -> SceneAnswer:
         """The same with the revision that they are about. Raises BusError."""
-        found: SceneAnswer = self._client.ask(SCENE_QUERY, SceneQuery(robot=self.robot, questions=list(questions)))
+        found: SceneAnswer = self._client.ask(
+            SCENE_QUERY, SceneQuery(robot=self.robot, questions=[checked(one) for one in questions])
+        )
         return found
 
     def changed_since(self, revision: int) -> Difference:

@@ -16,7 +16,7 @@ from prior_sg.deploy.api.errors import NotInSceneError, PackageMissingError, Sav
 from prior_sg.deploy.json_text import json_text
 from prior_sg.deploy.settings import DEFAULT_ROBOT
 from prior_sg.schemas.priors import Prior
-from prior_sg.schemas.queries import Answer, Difference, Question
+from prior_sg.schemas.queries import Answer, Difference, Question, checked
 from prior_sg.schemas.regions import NO_REGION, Region
 from prior_sg.schemas.scene import Scene as SceneMessage
 
@@ -221,7 +221,7 @@ class Scene(Asking):
         """Answers to questions of `prior_sg.schemas.queries`, in their order."""
         from prior_sg.services.scene_store.core.queries.answering import answer
 
-        return [answer(self._index, question) for question in questions]
+        return [answer(self._index, checked(question)) for question in questions]
 
     def difference(self, older: "Scene") -> Difference:
         """What is new, gone and renamed since another scene of the same robot."""

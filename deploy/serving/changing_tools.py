@@ -65,6 +65,8 @@ def correct_poses(system: System) -> Tool:
     """Other poses of keyframes."""
 
     def ask(ctx: Context, poses: list[CorrectedPose]) -> Elicit[Permission]:
+        if len({pose.frame for pose in poses}) < len(poses):
+            raise ToolError("a keyframe is given two poses: give one")
         return _question(ctx, f"Move {len(poses)} keyframes of {system.robot} to other poses? Its map moves with them.")
 
     @told

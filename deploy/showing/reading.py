@@ -72,7 +72,7 @@ def _read_graph(path: Path) -> Material:
     if path.suffix == ".json":
         try:
             told = json.loads(path.read_bytes())
-        except ValueError as error:
+        except (ValueError, RecursionError) as error:
             raise SourceUnreadable(f"{path} is not JSON ({error})") from error
     if isinstance(told, dict) and "embedding_space" in told:
         try:

@@ -1,7 +1,7 @@
 """The scene as a folder of CSV tables, for spreadsheets and whatever reads them.
 
-A text that a spreadsheet would take for a formula (`=`, `+`, `-`, `@`, tabulator, carriage return at its beginning) has
-an apostrophe before it, as OWASP advises; labels come from models and users.
+A text that a spreadsheet would take for a formula (`=`, `+`, `-`, `@`, also in full width, tabulator, carriage return
+at its beginning) has an apostrophe before it, as OWASP advises; labels come from models and users.
 """
 
 import csv
@@ -14,7 +14,7 @@ import numpy as np
 from prior_sg.deploy.api.scene import Scene, flat_rows
 from prior_sg.deploy.showing.material import Material
 
-FORMULA_STARTS = ("=", "+", "-", "@", "\t", "\r", "\n")
+FORMULA_STARTS = (*"=+-@＝＋－＠", "\t", "\r", "\n")
 
 
 def write_csv(material: Material, path: Path) -> None:

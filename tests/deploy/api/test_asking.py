@@ -74,6 +74,29 @@ def test_what_cannot_be_understood_names_what_is_nearest(scene):
         scene.candidates(3)
 
 
+NONE_MAY_HOLD = [
+    lambda asked: asked.near((0, 0, 0), k=-1),
+    lambda asked: asked.near((0, 0, 0), what="planet"),
+    lambda asked: asked.within((1e308, 0, 0), 1e308, what="place"),
+    lambda asked: asked.within((0, 0, 0), -1.0),
+    lambda asked: asked.route("kitchen", "hall", clearance_m=-1.0),
+    lambda asked: asked.labelled("a" * 3000),
+]
+
+
+@pytest.mark.parametrize("ask", NONE_MAY_HOLD)
+def test_what_no_question_may_hold_is_refused_by_saved_scenes_and_clients_alike(scene, ask):
+    with Client(robot=ROBOT, bus=LocalBus(Hub())) as client:
+        for asked in (scene, client):
+            with pytest.raises(ValueError, match=r"Expected|Invalid"):
+                ask(asked)
+
+
+def test_numbers_of_numpy_are_taken(scene):
+    assert scene.describe("place", scene.places.ids[0]).place.radius_m == pytest.approx(0.5)
+    assert scene.route(Spot(what="place", id=np.int64(1)), (2, 0, 1)).found
+
+
 def test_a_route_between_whatever_names_a_place(scene):
     ends = ["oven", scene.region("kitchen"), scene.message.objects[0], scene.labelled("oven")[0], (0, 0, 1)]
     for end in ends:

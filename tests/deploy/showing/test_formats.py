@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import trimesh
 
+import prior_sg
 from prior_sg.deploy.api.scene import Scene as PublicScene
 from prior_sg.deploy.cli.main import main
 from prior_sg.deploy.showing.formats import FORMATS, ExportError, named, save
@@ -115,6 +116,15 @@ def test_csv_tables_hold_no_formula(tmp_path):
     assert tables["places"][1]["x_m"] == "1.5" and tables["objects"][0]["label"] == HOSTILE
     assert tables["regions"][0]["label"] == f"'{FORMULA}"
     assert tables["beliefs"][1] == {"place": "10", "label": f"'{FORMULA}", "probability": "0.75"}
+    wide = msgspec.structs.replace(told(), labels=["＝1+1", *told().labels[1:]])
+    written("csv", tmp_path, scene=wide)
+    assert "'＝1+1" in (folder / "beliefs.csv").read_text()
+
+
+def test_files_nested_too_deeply_are_told(tmp_path):
+    (tmp_path / "scene.json").write_text("[" * 100_000)
+    with pytest.raises(prior_sg.Error, match="is not JSON"):
+        PublicScene.read(tmp_path / "scene.json")
 
 
 def test_rerun_reads_the_timelines(tmp_path):
