@@ -27,8 +27,8 @@ coverage: $(VENV)/installed-dev
 
 # Tests that compile most inner loops.
 loops: $(VENV)/installed-dev
-	$(BIN)/python -m pytest tests/test_pipeline.py tests/services/segmenter/test_region_cost.py \
-		-k 'could_not_use or neighbours'
+	$(BIN)/python -m pytest tests/services/segmenter/test_region_cost.py tests/test_pipeline.py \
+		-k 'could_not_use or neighbours' --timeout 900
 
 # A real language model of 270 M parameters behind a server on loopback. Building the server takes many minutes, once.
 test-llm: $(VENV)/installed-dev $(LLM)/installed
