@@ -75,7 +75,7 @@ def cmd_query(arguments: argparse.Namespace) -> int:
         with warnings.catch_warnings(record=True) as said, _opened(arguments) as scene:
             warnings.simplefilter("always", UserWarning)
             found = run(scene, arguments, rest if run is not _find else arguments.words)
-    except NotInSceneError as error:
+    except (NotInSceneError, ValueError) as error:  # the latter of what no question may hold
         raise UserError(str(error)) from error
     notes = [str(warning.message) for warning in said]
     if arguments.json:

@@ -226,6 +226,12 @@ def test_the_command_answers_in_tables_and_json(capsys, saved):
         assert status == 0 and len(json.loads(out)["answer"]) >= 2
 
 
+@pytest.mark.parametrize("words", [("near", "nan", "0", "0"), ("near", "1e12", "0", "0"), ("region", "9" * 30)])
+def test_what_no_question_may_hold_is_one_sentence(capsys, saved, words):
+    status, _, err = asked(capsys, saved, *words)
+    assert status and "Traceback" not in err and any(said in err for said in ("finite", "Expected", "64 bits"))
+
+
 def test_a_sentence_is_any_other_question_and_what_stands_in_is_said(capsys, saved):
     status, out, _ = asked(capsys, saved, "where", "is", "the", "kitchen?", "--json")
     found = json.loads(out)
