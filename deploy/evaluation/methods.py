@@ -30,6 +30,7 @@ from prior_sg.services.segmenter.core.inference import see_objects
 from prior_sg.services.segmenter.core.state import State
 
 NEVER_M, ANY_SCALE = 1e6, 1e9
+WORTHLESS = 2.0  # more than crops can tell, which is a share
 
 
 @dataclass(frozen=True)
@@ -118,18 +119,26 @@ def ablations(config: Config) -> list[Method]:
     def but(part: str, **changes: Any) -> Variant:
         """Ours with a part's settings changed."""
         changed = msgspec.structs.replace(getattr(config, part), **changes)
-        return Variant(msgspec.structs.replace(config, **{part: changed}))
+        return at(**{part: changed})
+
+    def at(**changes: Any) -> Variant:
+        return Variant(msgspec.structs.replace(config, **changes))
 
     unscaled = but("kernel", gamma=ANY_SCALE)
     parts = {
         "no sharing": (but("sharing", steps=0), "each place is compared with the regions for itself"),
         "no balance": (but("balance", limit=0.0), "labels that the encoder favours everywhere are not corrected"),
         "no adaptation": (but("adaptation", weight=0.0), "regions are recognised by their text alone"),
-        "no pairwise term": (Variant(msgspec.structs.replace(config, beta=0.0)), "beta = 0"),
-        "doors are open": (
-            Variant(msgspec.structs.replace(config, edge_clearance_m=0.0)),
-            "narrow ways bind places as firmly as wide ones",
+        "crops mix": (but("unmixing", rounds=0), "crops are not told apart into places"),
+        "always corrected": (
+            but("information", least=WORTHLESS, full=WORTHLESS + 1),
+            "the map corrects looks whatever they are worth, and crops are not told apart",
         ),
+        "regions are free": (at(region_cost=0.0), "no region has to pay for itself"),
+        "borders as in the paper": (but("adjacency", border=0.0), "-log P of the prior, not against chance"),
+        "equally sure": (at(informed=0.0), "beliefs are as sure whatever crops tell"),
+        "no pairwise term": (at(beta=0.0), "beta = 0"),
+        "doors are open": (at(edge_clearance_m=0.0), "narrow ways bind places as firmly as wide ones"),
         "sought objects speak": (
             but("tracking", unprompted_weight=0.0),
             "not those of a detector that does not know the prior's",
