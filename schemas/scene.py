@@ -102,3 +102,8 @@ class Scene(Message, frozen=True, kw_only=True):
     hulls_m: Annotated[np.ndarray, Shape("float32", "hull", 2)] = _NO_CORNERS
     origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of the world, as in Keyframe; add it to any position
     revision: int = -1  # of the store, as in SceneRevision; -1 = nothing stored
+
+    def unnumbered(self) -> "Scene":
+        """The same without its revision, which counts what a store has applied: of one and the same scene it is another
+        where a writer's snapshot stood for several deltas, or for none yet."""
+        return msgspec.structs.replace(self, revision=-1)

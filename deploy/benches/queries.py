@@ -70,7 +70,7 @@ def _building(scene: Scene) -> dict[str, float]:
 
 def _asking(scene: Scene, rng: np.random.Generator, repeats: int) -> dict[str, float]:
     """p50 and p99 of each kind of question, and of a whole message's bytes for one of them."""
-    index, older = Index(scene, 1), Index(changed(scene, rng), 0)
+    index, older = Index(scene), Index(changed(scene, rng))
     found: dict[str, float] = {}
     for name, questions in kinds_of_questions(scene, rng, repeats).items():
         first = next(questions)

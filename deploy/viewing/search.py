@@ -27,7 +27,7 @@ class Found:
 def ranked(scene: Scene, text: str, likeness: Likeness) -> Ranking:
     """What answers a text by what its labels mean; where nothing is known of that, by their words."""
     asked = AnswersTo(text=text, regions=likeness.regions, objects=likeness.objects, limit=3 * MOST_ANSWERS)
-    found = answer(Index(scene, 0), asked)
+    found = answer(Index(scene), asked)
     if not isinstance(found, Ranking):
         raise TypeError(f"AnswersTo is answered by {type(found).__name__}")
     return found

@@ -80,9 +80,10 @@ def step(state: State, message: Message, cfg: core.Config) -> Iterator[Output]:
         case ObjectDelta():
             yield from _take_objects(state, _known(state, message.robot), message)
         case Task():
-            graph = _known(state, message.robot).graph
-            if core.set_task(graph, message):
-                state.database.put_task(graph, message)
+            robot = _known(state, message.robot)
+            if core.set_task(robot.graph, message):
+                robot.index = None  # a task is no revision, and before the first regions the scene tells it
+                state.database.put_task(robot.graph, message)
         case Prior():
             state.database.put_prior(message)
         case Tick():
@@ -169,9 +170,9 @@ def answer_query(state: State, request: SceneQuery, cfg: core.Config) -> SceneAn
 
 
 def _index(robot: Robot) -> Index:
-    """The graph as it is, prepared for questions; made once for each revision that somebody asks about."""
-    if robot.index is None or robot.index.revision != robot.graph.revision:
-        robot.index = Index(core.scene(robot.graph), robot.graph.revision)
+    """The graph as it is, prepared for questions; made once for each revision and task that somebody asks about."""
+    if robot.index is None or robot.index.scene.revision != robot.graph.revision:
+        robot.index = Index(core.scene(robot.graph))
     return robot.index
 
 

@@ -2,6 +2,7 @@
 
 import threading
 
+import msgspec
 import numpy as np
 
 from prior_sg.schemas.codec import decode, encode
@@ -36,7 +37,7 @@ class StandIn:
 
     def __init__(self, scene, relabel=lambda scene, task, digest: scene):
         self.hub, self.robot, self.relabel = Hub(), scene.robot, relabel
-        self.scenes, self.tasks, self.poses = [scene], [], []
+        self.scenes, self.tasks, self.poses = [msgspec.structs.replace(scene, revision=0)], [], []
         self.forgotten = set()
         self.bus = BusClient(LocalBus(self.hub))
         serve = self.bus.bus.serve
@@ -56,9 +57,8 @@ class StandIn:
 
     def answer(self, request):
         query = decode(SceneQuery, request.payload)
-        known = query.robot == self.robot
-        scene, revision = (self.scenes[-1], len(self.scenes) - 1) if known else (empty(query.robot), -1)
-        request.reply(encode(reply(Index(scene, revision), query, self.older)))
+        scene = self.scenes[-1] if query.robot == self.robot else empty(query.robot)
+        request.reply(encode(reply(Index(scene), query, self.older)))
 
     def older(self, revision):
         kept = 0 <= revision < len(self.scenes) and revision not in self.forgotten
@@ -66,8 +66,8 @@ class StandIn:
 
     def store(self, scene):
         """One revision more."""
-        self.scenes.append(scene)
-        number = len(self.scenes) - 1
+        number = len(self.scenes)
+        self.scenes.append(msgspec.structs.replace(scene, revision=number))
         counts = {"places": len(scene.place_ids), "edges": len(scene.edges), "regions": len(scene.regions)}
         told = SceneRevision(robot=self.robot, epoch=1, revision=number, stamp_ns=scene.stamp_ns, **counts)
         self.bus.publish(SCENE_REVISION, told)

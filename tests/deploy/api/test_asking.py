@@ -159,7 +159,7 @@ def test_without_its_prior_names_stand_alone_and_that_is_said():
 def test_a_running_system_gives_the_same_answers(scene):
     hub = Hub()
     bus = LocalBus(hub)
-    index = Index(scene.message, 5)
+    index = Index(msgspec.structs.replace(scene.message, revision=5))
     bus.serve(
         SCENE_QUERY.key.format(robot=ROBOT),
         lambda request: request.reply(encode(reply(index, decode(SceneQuery, request.payload)))),

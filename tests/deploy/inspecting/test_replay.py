@@ -1,15 +1,20 @@
-"""Journals of another version: what has changed in the settings is told, what cannot be read is refused."""
+"""Journals of another version: what has changed in the settings is told, what cannot be read is refused. And how the
+scene at the end of a log is judged."""
 
 import msgspec
 import pytest
 
-from prior_sg.deploy.inspecting.replay import open_log, recorded_config, replay_life
+from prior_sg.deploy.cli.report import final_scene_difference
+from prior_sg.deploy.inspecting.replay import Log, open_log, recorded_config, replay_life
 from prior_sg.schemas.codec import encode
 from prior_sg.schemas.priors import Task
 from prior_sg.schemas.status import Consumed, Started
-from prior_sg.schemas.topics import JOURNAL, TASK
+from prior_sg.schemas.topics import JOURNAL, TASK, topic_of
 from prior_sg.services.runtime.record import LogError, LogWriter
+from prior_sg.services.scene_store.service import SERVICE as SCENE_STORE
 from prior_sg.services.segmenter.service import SERVICE
+from tests.services.scene_store.test_history import object_delta
+from tests.services.scene_store.test_scene_store import Store, random_run, snapshots_of
 
 
 def journal(path, config, versions, inline):
@@ -54,3 +59,28 @@ def test_what_a_journal_holds_inline_is_of_the_version_that_its_start_tells(tmp_
     log = journal(tmp_path / "a.mcap", config(), {}, b"\xc1")
     with pytest.raises(LogError, match="the journal of s1 cannot be replayed: Task/1"):
         list(replay_life(log, log.lives[0]))
+
+
+def difference_at_the_end(path, deltas, scene):
+    """Of a scene from one where a store has read these deltas and nothing else."""
+    with LogWriter(path) as log:
+        for i, delta in enumerate(deltas):
+            topic = topic_of(type(delta))
+            log.add(topic, topic.key_of(delta), encode(delta), "w", i, i, i)
+        log.attach("scene.msgpack", "application/msgpack", encode(scene))
+    return final_scene_difference(Log(path, SCENE_STORE), path)
+
+
+def test_a_store_that_took_snapshots_ends_with_the_scene_of_one_that_did_not(tmp_path):
+    """Whether they stood for several deltas or were the answer of a writer that had told nothing yet."""
+    deltas = [*random_run(1, steps=10)[0], object_delta(0, 2)]
+    whole, jumping, early = Store(), Store(), Store()
+    whole.feed(*deltas[:20])
+    jumping.feed(*deltas[:8], *snapshots_of(whole, 9, 9), deltas[-1])
+    early.feed(object_delta(-1, 0, snapshot=True), *deltas)
+    scenes = [jumping.scene(), early.scene()]
+    assert [scene.revision for scene in scenes] == [8 + 2 + 1 - 1, len(deltas) + 1 - 1]
+    for i, scene in enumerate(scenes):
+        assert difference_at_the_end(tmp_path / f"{i}.mcap", deltas, scene) == ""
+    other = msgspec.structs.replace(scenes[0], task="other")
+    assert difference_at_the_end(tmp_path / "o.mcap", deltas, other) == "final scene: task: 'other' became 'clean'"

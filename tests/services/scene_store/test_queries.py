@@ -10,6 +10,7 @@ import pytest
 from prior_sg.deploy.benches.queries import KINDS, LABELS, changed, synthetic_scene
 from prior_sg.schemas import queries as q
 from prior_sg.schemas.places import PlaceDelta
+from prior_sg.schemas.priors import Task
 from prior_sg.schemas.regions import NO_REGION
 from prior_sg.schemas.topics import SCENE_QUERY
 from prior_sg.services.runtime.runner import Runner
@@ -19,8 +20,8 @@ from prior_sg.services.scene_store.core.queries.answering import answer, reply
 from prior_sg.services.scene_store.core.queries.index import Index
 from tests.help.examples import QUESTIONS
 
-SCENE = synthetic_scene(1500, 300)
-INDEX = Index(SCENE, 7)
+SCENE = msgspec.structs.replace(synthetic_scene(1500, 300), revision=7)
+INDEX = Index(SCENE)
 CENTRES = SCENE.positions_m.astype(np.float64)
 MIDDLE = tuple(CENTRES.mean(axis=0).tolist())
 
@@ -286,8 +287,8 @@ def test_beliefs_of_a_region_are_the_mean_of_its_places():
 
 
 def test_what_changed():
-    before = changed(SCENE, np.random.default_rng(1))
-    old = Index(before, 3)
+    before = msgspec.structs.replace(changed(SCENE, np.random.default_rng(1)), revision=3)
+    old = Index(before)
     found = answer(INDEX, q.ChangedSince(revision=3), {3: before}.get)
     labels = {region.id: region.label for region in SCENE.regions}
     renamed = {r.id: r.label for r in before.regions if r.label != labels[r.id]}
@@ -323,6 +324,18 @@ def test_the_store_answers_over_its_revision_and_keeps_what_it_made_of_it():
     runner.feed(place_delta(1, [(3, 0, 0, 0, 0.5)]))
     second = runner.answer(SCENE_QUERY, asked)
     assert (second.revision, second.answers[1].things[0].id) == (1, 3)
+
+
+def test_a_task_is_in_the_answers_at_once_though_it_is_no_revision():
+    runner = Runner(service.SERVICE, service.core.Config(path=":memory:"), wire=True)
+    runner.feed(place_delta(0, [(1, 0, 0, 1, 0.5)]))
+    asked = q.SceneQuery(robot="spot", questions=[q.WordsInUse()])
+    tasks = []
+    for stamp_ns, text in ((1, "tidy up"), (2, "serve drinks")):
+        runner.feed(Task(robot="spot", stamp_ns=stamp_ns, environment="home", task=text))
+        found = runner.answer(SCENE_QUERY, asked)
+        tasks.append((found.revision, found.answers[0].task))
+    assert tasks == [(0, "tidy up"), (0, "serve drinks")]
 
 
 def test_every_kind_of_question_about_an_empty_scene_has_an_answer():

@@ -111,8 +111,8 @@ class Store:
 
 
 def content(scene):
-    """The bytes of a scene, whatever its revision: one that a snapshot has made up for counts fewer deltas."""
-    return encode(msgspec.structs.replace(scene, revision=-1))
+    """The bytes of a scene, whatever its revision."""
+    return encode(scene.unnumbered())
 
 
 def asked(outputs):

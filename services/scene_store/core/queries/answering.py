@@ -37,7 +37,7 @@ def reply(index: Index, query: SceneQuery, older: Older = no_history) -> SceneAn
     """All answers over one revision."""
     return SceneAnswer(
         robot=query.robot,
-        revision=index.revision,
+        revision=index.scene.revision,
         stamp_ns=index.scene.stamp_ns,
         answers=[answer(index, question, older) for question in query.questions],
     )
@@ -75,6 +75,6 @@ def answer(index: Index, question: Question, older: Older = no_history) -> Answe
 def _changed(index: Index, question: ChangedSince, older: Older) -> Difference:
     before = older(question.revision)
     if before is None:
-        reason = f"revision {question.revision} is not kept; the scene is at revision {index.revision}"
+        reason = f"revision {question.revision} is not kept; the scene is at revision {index.scene.revision}"
         return Difference(since_revision=question.revision, reason=reason)
-    return changes.difference(Index(before, question.revision), index)
+    return changes.difference(Index(before), index)

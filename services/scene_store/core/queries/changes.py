@@ -17,7 +17,7 @@ def difference(before: Index, now: Index) -> Difference:
         renamed += _renamed(before, now, what)
     old, new = before.scene, now.scene
     return Difference(
-        since_revision=before.revision,
+        since_revision=before.scene.revision,
         appeared=appeared,
         gone=gone,
         renamed=renamed,

@@ -30,8 +30,8 @@ class Ways:
 class Index:
     """Everything questions need of one scene, which must not change; what is expensive is made once, when asked for."""
 
-    def __init__(self, scene: Scene, revision: int = -1) -> None:
-        self.scene, self.revision = scene, revision
+    def __init__(self, scene: Scene) -> None:
+        self.scene = scene
         self._ways: dict[float, Ways] = {}
 
     def ids(self, what: What) -> np.ndarray:
