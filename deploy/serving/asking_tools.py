@@ -8,8 +8,8 @@ import msgspec
 from mcp.server.mcpserver.exceptions import ToolError
 from pydantic import Field
 
+from prior_sg.deploy.api.spots import ENDS, spot_in
 from prior_sg.deploy.serving.planner_text import lean_json
-from prior_sg.deploy.serving.spots import ENDS, spot_in
 from prior_sg.deploy.serving.system import LONGEST_SEARCH, System
 from prior_sg.deploy.showing.text import LEAST_TOKENS, USUAL_TOKENS, scene_text
 from prior_sg.schemas.queries import (

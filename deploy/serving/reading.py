@@ -9,9 +9,9 @@ from litestar.datastructures import State
 from litestar.params import FromPath, FromQuery, JSONBody, QueryParameter
 
 from prior_sg.deploy.api.errors import NotInSceneError
+from prior_sg.deploy.api.spots import ENDS, spot_in
 from prior_sg.deploy.serving.errors import FaultyRequestError
 from prior_sg.deploy.serving.parameters import FAULTS, Coordinate, Count, Distance, Label, Robot, system_of
-from prior_sg.deploy.serving.spots import ENDS, spot_in
 from prior_sg.deploy.serving.system import EVERYWHERE, LONGEST_SEARCH, MOST_QUESTIONS
 from prior_sg.schemas.queries import (
     MOST_LISTED,
@@ -172,9 +172,8 @@ async def route(
     clearance_m: Distance = 0.0,
 ) -> Answered:
     """The shortest way over the place graph on which nothing is closer than `clearance_m`."""
-    return await _one(
-        state, robot, _asked(RouteBetween, start=spot_in(start), goal=spot_in(goal), clearance_m=clearance_m)
-    )
+    ends = {"start": _asked(spot_in, text=start), "goal": _asked(spot_in, text=goal)}
+    return await _one(state, robot, _asked(RouteBetween, **ends, clearance_m=clearance_m))
 
 
 @get("/v1/{robot:str}/search", responses=FAULTS)

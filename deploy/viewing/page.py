@@ -224,7 +224,7 @@ class Page:
             panel.write("prior", words.card(graph_svg(prior)))
 
     def _tell_way(self, way: Way | None) -> None:
-        chosen = self._wanted.start is not FROM_THE_ROBOT
+        chosen = not self._wanted.start.here
         story = words.way_story(way) if way is not None else words.note(START_CHOSEN) if chosen else ""
         self.panel.write("way", story, (CLOSE_WAY, FROM_ROBOT) if chosen else (CLOSE_WAY,))
 

@@ -13,7 +13,7 @@ from prior_sg.schemas.regions import NO_REGION
 from prior_sg.services.scene_store.core.queries.answering import answer
 from prior_sg.services.scene_store.core.queries.index import Index
 
-FROM_THE_ROBOT = Spot()  # where the camera was last
+FROM_THE_ROBOT = Spot(here=True)
 ARROW_EVERY_M, ARROW_M, SHAFT_M = 1.2, 0.05, 0.035
 WAY_PX, GAP_PX, GAP_DASH_M = 6.0, 3.0, 0.1
 END_M, NAME_ABOVE_M = 0.24, 0.35
@@ -47,24 +47,15 @@ class Way:
     from_robot: bool = True
 
 
-def robot_m(index: Index) -> Point | None:
-    """Where the camera was last."""
-    path_m = index.scene.trajectory
-    return None if not len(path_m) else (float(path_m[-1][0]), float(path_m[-1][1]), float(path_m[-1][2]))
-
-
 def way(index: Index, trip: Trip) -> Way:
     """The shortest known way of a trip, or one that says why there is none."""
-    from_robot = trip.start is FROM_THE_ROBOT
-    here_m = robot_m(index) if from_robot else trip.start.point_m
-    if from_robot and here_m is None:
-        return Way(Route(reason="it is not known where the robot is: click where to start, then Start here"))
-    start = Spot(point_m=here_m) if from_robot else trip.start
-    found = answer(index, RouteBetween(start=start, goal=trip.goal))
+    found = answer(index, RouteBetween(start=trip.start, goal=trip.goal))
     if not isinstance(found, Route):
         raise TypeError(f"RouteBetween is answered by {type(found).__name__}")
+    path_m = index.scene.trajectory
+    start_m = tuple(path_m[-1].tolist()) if trip.start.here and len(path_m) else trip.start.point_m
     goal_m = found.goal.position_m if found.goal is not None and found.goal.what == "object" else None
-    return Way(found, here_m, goal_m, _stops(index, found), from_robot)
+    return Way(found, start_m, goal_m, _stops(index, found), trip.start.here)
 
 
 def _stops(index: Index, route: Route) -> list[Stop]:

@@ -20,7 +20,7 @@ def test_a_way_begins_at_the_robot_unless_a_start_was_chosen() -> None:
     assert ways.way(index, Trip(BED)).route.place_ids == [12, 14, 16, 18]
     assert ways.way(index, Trip(BED, FAR_CORNER)).route.place_ids == [10, 12, 14, 16, 18]
     lost = ways.way(joined(trajectory=np.zeros((0, 3), np.float32)), Trip(BED))
-    assert not lost.route.found and "Start here" in words.way_story(lost)
+    assert not lost.route.found and "camera was last" in words.way_story(lost)
 
 
 def test_the_line_goes_over_the_places_and_dashes_over_what_nobody_has_checked() -> None:
@@ -50,7 +50,7 @@ def test_the_panel_tells_length_room_and_what_is_passed() -> None:
     ("goal", "told"),
     [
         (Spot(what="place", id=11), "No way to kitchen"),
-        (Spot(what="region", id=99), "there is none"),
+        (Spot(what="region", id=99), "there is no region 99; the scene has regions 3, 7"),
     ],
 )
 def test_no_way_is_told_and_draws_nothing(goal: Spot, told: str) -> None:
