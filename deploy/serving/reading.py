@@ -72,6 +72,16 @@ class Alive(msgspec.Struct, frozen=True):
     silent: dict[str, str]  # why they do not answer, by instance
 
 
+class Progress(msgspec.Struct, frozen=True):
+    """How far a source is read."""
+
+    robot: str
+    frames_read: int
+    frames_total: int  # 0 = unknown, as of a live source
+    encoded: int  # keyframes
+    finished: bool
+
+
 @get("/health", responses=FAULTS)
 async def health(state: State) -> Alive:
     """Every process that is alive, and of those that do not answer, why."""
@@ -195,6 +205,13 @@ async def changes(state: State, robot: Robot, since: Annotated[int, QueryParamet
     return await _one(state, robot, _asked(ChangedSince, revision=since))
 
 
+@get("/v1/{robot:str}/source", responses=FAULTS)
+async def source(state: State, robot: Robot) -> Progress:
+    """How far the source is read; once `finished`, the map grows no more."""
+    read = system_of(state).source(robot)
+    return Progress(robot, read.frames_read, read.frames_total, read.encoded, read.finished)
+
+
 @get("/v1/{robot:str}/task", responses=FAULTS)
 async def task(state: State, robot: Robot) -> Answered:
     """The task and environment that the regions follow, with the labels that regions can have and that are in use."""
@@ -215,6 +232,7 @@ READING = [
     route,
     search,
     changes,
+    source,
     task,
 ]
 
