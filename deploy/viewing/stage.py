@@ -37,7 +37,7 @@ LAYERS = (
     Layer("objects", "Objects", True),
     Layer("unnamed", "Unnamed objects", False),
     Layer("way", "Way there", True),
-    Layer("trajectory", "Where the robot has been", True),
+    Layer("trajectory", "Robot's way", True),
     Layer("camera", "Camera", True),
     Layer("frontiers", "Openings", False),
     Layer("answers", "Answers", True),
