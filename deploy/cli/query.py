@@ -1,6 +1,7 @@
 """`prior-sg query`: ask the map, in a sentence or by position, label and route."""
 
 import argparse
+import contextlib
 import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -88,19 +89,6 @@ def cmd_query(arguments: argparse.Namespace) -> int:
     return 0
 
 
-class _Saved:
-    """A saved scene where a client, which is closed in the end, would be."""
-
-    def __init__(self, scene: "Asking") -> None:
-        self._scene = scene
-
-    def __enter__(self) -> "Asking":
-        return self._scene
-
-    def __exit__(self, *_: object) -> None:
-        pass
-
-
 def _opened(arguments: argparse.Namespace) -> Any:
     """The running system, or a saved scene. Raises PriorSgError."""
     if arguments.scene is None:
@@ -109,7 +97,7 @@ def _opened(arguments: argparse.Namespace) -> Any:
         return Client(arguments.connect, arguments.robot)
     from prior_sg.deploy.api.scene import Scene
 
-    return _Saved(Scene.read(arguments.scene, arguments.robot))
+    return contextlib.nullcontext(Scene.read(arguments.scene, arguments.robot))
 
 
 def _find(scene: "Asking", arguments: argparse.Namespace, words: Sequence[str]) -> "list[Thing]":
