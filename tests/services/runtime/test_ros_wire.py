@@ -147,10 +147,13 @@ def test_strangers_messages_are_told_and_passed_over(endpoint):
     heard, faults, done = [], [], threading.Event()
     types = Types()
     payload = types.encode(types.make("std_msgs/msg/String", "hi"))
-    with RosSession(endpoint, domain=8) as node, zenoh.open(_config(endpoint)) as stranger:
-        node.subscribe(
-            CHATTER, lambda message: (heard.append(message), done.set()), lambda *fault: faults.append(fault)
-        )
+
+    def hear(message):
+        heard.append(message)
+        done.set()
+
+    with RosSession(endpoint, domain=8) as node, zenoh.open(client_config(endpoint)) as stranger:
+        node.subscribe(CHATTER, hear, lambda *fault: faults.append(fault))
         key = "8/chatter/std_msgs::msg::dds_::String_/"
         good = Attachment(1, 2, bytes(16)).written()
         stranger.put(key + STRING, payload)
