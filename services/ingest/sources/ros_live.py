@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from prior_sg.services.ingest.core import selection
@@ -339,7 +340,8 @@ class Stream:
             pose = robot.convention.of_matrix(posed.source_from_camera)
             stamp_ns = posed.color.stamp_ns
             if not self._wanted(View(number, stamp_ns, robot.normaliser.pose(pose))):
-                return robot.normaliser.bare(number, 0, number, stamp_ns, pose, NO_IMAGES)
+                bare = robot.normaliser.bare(number, 0, number, stamp_ns, pose, NO_IMAGES)
+                return msgspec.structs.replace(bare, pose_only=True)
             images = self._reader.images(posed, robot.choice, robot.pictures)
             return robot.normaliser.frame(number, 0, number, stamp_ns, pose, images)
         except UNUSABLE as error:
