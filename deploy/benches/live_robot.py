@@ -116,6 +116,7 @@ class Watch:
     def __init__(self) -> None:
         self.to_pyramid_s: list[float] = []
         self.to_region_s: list[float] = []
+        self.begun_ns, self.sent_before = time.time_ns(), 0
         self.pids: dict[str, int] = {}
         self.worked_s: dict[str, float] = {}
         self._client: BusClient | None = None
@@ -145,7 +146,9 @@ class Watch:
             self._client.bus.close()
 
     def _aged(self, into: list[float], kind: Any, sample: Sample) -> None:
-        into.append((time.time_ns() - decode(kind, sample.payload).stamp_ns) / 1e9)
+        stamp_ns = decode(kind, sample.payload).stamp_ns
+        if stamp_ns >= self.begun_ns:  # the first regions are of no image
+            into.append((time.time_ns() - stamp_ns) / 1e9)
 
 
 def measure(seconds: float, source: str, frames: int, settings: list[str]) -> dict[str, Any]:
@@ -173,7 +176,7 @@ def measure(seconds: float, source: str, frames: int, settings: list[str]) -> di
     ingest = result.counts.ingest
     return {
         "seconds": result.seconds,
-        "sent": player.sent,
+        "sent_since_the_start": player.sent - watch.sent_before,
         "most_late_s": player.late_s,
         "read": 0 if ingest is None else ingest.frames_read,
         "keyframes": len(result.counts.keyframes),
@@ -190,6 +193,7 @@ def _time_out(player: Player, watch: Watch, seconds: float) -> None:
     """Let the robot go after some seconds of being read."""
     while not watch.pids and not player.stopped.wait(0.2):
         continue
+    watch.sent_before = player.sent
     end_s = time.monotonic() + seconds
     while time.monotonic() < end_s and not player.stopped.wait(1.0):
         watch.look()

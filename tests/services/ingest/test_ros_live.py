@@ -22,6 +22,10 @@ from prior_sg.services.ingest.core.config import Config
 from prior_sg.services.ingest.core.frames import BadFrame, Closure, RawFrame, Unused
 from prior_sg.services.ingest.core.options import ReadOptions
 from prior_sg.services.ingest.core.poses import PoseError
+from prior_sg.services.ingest.core.ros.assembly import Assembly, Shot
+from prior_sg.services.ingest.core.ros.posing import Way
+from prior_sg.services.ingest.core.ros.topics import Topic
+from prior_sg.services.ingest.core.ros.transforms import Stamped
 from prior_sg.services.ingest.core.selection import State
 from prior_sg.services.ingest.service import step
 from prior_sg.services.ingest.sources import Source, SourceError, open_source
@@ -111,6 +115,29 @@ def test_the_frames_of_the_bag_come_out_whatever_the_order_on_the_way(walked, tm
         for one, other in zip(frames, recorded, strict=True):
             assert (one.frame_id, one.color, one.depth) == (other.frame_id, other.color, other.depth)
             assert np.array_equal(one.world_from_camera, other.world_from_camera)
+
+
+def test_a_colour_image_waits_for_the_closest_depth_image():
+    assembly = Assembly(Way("camera", topic="/pose", body="camera"), 20 * MS)
+    assembly.motion(Topic("/pose", "geometry_msgs/msg/PoseStamped", 1, 0), [pose_at(0), pose_at(1000)])
+    colors = [Shot(at_ms * MS, 0, b"color") for at_ms in (100, 150, 200)]
+    depths = [Shot(at_ms * MS, 0, b"depth") for at_ms in (85, 102, 149, 185, 240)]
+    for shot in (depths[0], colors[0]):
+        (assembly.depth if shot in depths else assembly.color)(shot)
+        assert list(assembly.ready(0)) == []
+    for depth, color in zip(depths[1:], [*colors[1:], None, None], strict=True):
+        assembly.depth(depth)
+        if color:
+            assembly.color(color)
+    frames = list(assembly.ready(0))
+    assert [(f.color.stamp_ns // MS, f.depth.stamp_ns // MS) for f in frames] == [(100, 102), (150, 149)]
+    (last,) = assembly.ready(0, ended=True)
+    assert last.depth is depths[3]
+    assert sorted({fault.what for fault in assembly.faults()}) == ["depth images"]
+
+
+def pose_at(at_ms):
+    return Stamped(at_ms * MS, "world", "", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
 
 
 def test_images_are_decoded_only_of_frames_that_may_become_keyframes(walked):
