@@ -47,6 +47,7 @@ class ReadOptions(msgspec.Struct, frozen=True, kw_only=True):
     depth_topic: str = ""
     info_topic: str = ""  # the colour camera's info
     pose_topic: str = ""  # odometry, poses or transforms; empty = tf where it moves the camera, else one of them
+    graph_topic: str = ""  # of a live robot: its optimised poses (nav_msgs/Path) of pose_frame; empty = jumps of tf
     fixed_frame: str = ""  # of tf: the world; empty = map, world, odom or the root
     pose_frame: str = ""  # the frame whose poses pose_topic has; empty = as its messages say, else the camera's
     sync_tolerance_s: float = 0.02  # most between stamps of colour, depth and pose that belong together

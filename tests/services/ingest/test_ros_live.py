@@ -19,7 +19,7 @@ from prior_sg.schemas.topics import POSE_UPDATE
 from prior_sg.services.geometry import inverse
 from prior_sg.services.ingest import service
 from prior_sg.services.ingest.core.config import Config
-from prior_sg.services.ingest.core.frames import BadFrame, Closure, RawFrame, Unused
+from prior_sg.services.ingest.core.frames import BadFrame, Closure, Correction, RawFrame, Unused
 from prior_sg.services.ingest.core.options import ReadOptions
 from prior_sg.services.ingest.core.poses import PoseError
 from prior_sg.services.ingest.core.ros.assembly import Assembly, Shot
@@ -241,6 +241,27 @@ def test_a_jump_of_the_map_moves_the_keyframes_before_it(walked):
 def sentences(events):
     """What is said of faults."""
     return {getattr(event, "example", "") or event.reason for event in events if isinstance(event, Unused | BadFrame)}
+
+
+@pytest.mark.parametrize("body", ["base", ""])
+def test_optimised_poses_of_a_graph_correct_every_frame(walked, body):
+    """Nodes at every third frame, the world turned and moved: all frames stand where that puts them."""
+    after, maker = motion(0.4, 0.2, 0.0, 25, 0, 0), Maker("mcap")
+    poses = WORLD_FROM_BASE if body else WALK
+    nodes = [maker.pose(STAMPS_NS[i], "map", after @ poses[i]) for i in range(0, len(WALK), 3)]
+    late = maker.types["nav_msgs/msg/Path"](maker.header(STAMPS_NS[-1], "map"), nodes)
+    maker.messages = [*walked.messages, ("/graph", STAMPS_NS[-1] + 500 * MS, late)]
+    robot = robot_heard(maker, graph_topic="/graph", pose_frame=body)
+    empty = maker.types["nav_msgs/msg/Path"](maker.header(0, "map"), [])
+    messages = received(maker)
+    said = replace(messages[-1], payload=bytes(maker.store.serialize_cdr(empty, "nav_msgs/msg/Path")))
+    events = streamed(robot, [*messages, messages[-1], said])
+    (update,) = [event for event in events if isinstance(event, Correction)]
+    assert not any(isinstance(event, Closure) for event in events)
+    assert words(events) == {"no pose of the graph has the stamp of a frame"}
+    assert update.frame_ids.tolist() == list(range(len(WALK)))
+    for pose, walk_pose in zip(update.world_from_camera, WALK, strict=True):
+        assert np.abs(pose - after @ walk_pose).max() < 1e-6
 
 
 def test_mutated_messages_cost_themselves_and_one_sentence(walked, rng):
