@@ -20,17 +20,17 @@ class Types:
         from rosbags.typesys import Stores, get_typestore
 
         self.store = get_typestore(Stores.ROS2_JAZZY)
+        del self.store.fielddefs[SERVICE_EVENT]  # there with a char, which ROS 2 hashes as the uint8 it stands for
+        self.add_message(SERVICE_EVENT, SERVICE_EVENT_TEXT)
 
     def add_message(self, name: str, text: str) -> None:
         """Define a message as a .msg file does."""
         from rosbags.typesys import get_types_from_msg
 
-        self.store.register(get_types_from_msg(text, name))
+        self.store.register(_as_named(get_types_from_msg(text, name)))
 
     def add_service(self, name: str, request: str, reply: str) -> None:
         """Define a service as a .srv file does, by the halves before and after ---."""
-        if SERVICE_EVENT not in self.store.fielddefs:
-            self.add_message(SERVICE_EVENT, SERVICE_EVENT_TEXT)
         self.add_message(f"{name}_Request", request)
         self.add_message(f"{name}_Response", reply)
         halves = f"{name}_Request[<=1] request\n{name}_Response[<=1] response\n"
@@ -59,6 +59,15 @@ class Types:
         except Exception as error:  # rosbags says nothing of what it raises for damaged data
             said = " ".join(str(error).split())[:120].rstrip(".") or type(error).__name__
             raise WireError(f"its {len(data)} bytes are no {name}: {said}") from error
+
+
+def _as_named(parsed: Any) -> Any:
+    """Definitions by ROS's own names: rosbags takes a part of a service for a message of the package pkg/srv."""
+    if isinstance(parsed, dict):
+        return {_as_named(name): _as_named(fields) for name, fields in parsed.items()}
+    if isinstance(parsed, (list, tuple)):
+        return type(parsed)(map(_as_named, parsed))
+    return parsed.replace("/srv/msg/", "/srv/") if isinstance(parsed, str) else parsed
 
 
 @cache
