@@ -37,6 +37,7 @@ def add_commands(commands: Commands) -> None:
     up.add_argument(
         "--api", nargs="?", type=port_in, const=API_PORT, default=None, metavar="PORT", help="also serve HTTP there"
     )
+    up.add_argument("--ros", action="store_true", help="also tell ROS 2 of the scene, through the same router")
     add_run_options(up)
     add_source_options(up)
 
@@ -81,6 +82,8 @@ def cmd_up(arguments: argparse.Namespace) -> int:
             raise UserError(f"there is no service {name!r}; known: {', '.join(BY_NAME)}")
     if arguments.api is not None:
         extras.require("api", "prior-sg up --api")
+    if arguments.ros:
+        extras.require("ros", "prior-sg up --ros")
     with claimed_folder(arguments.out):
         return _stay_up(arguments, names)
 
@@ -115,6 +118,8 @@ def _stay_up(arguments: argparse.Namespace, names: list[str]) -> int:
             supervisor.start(name, arguments.workers if BY_NAME[name].job is not None else 1)
         if arguments.api is not None:
             _open_api(supervisor, arguments.api)
+        if arguments.ros:
+            supervisor.start_door("ros", "prior_sg.deploy.ros.process", [])
         listening = " and ".join((arguments.connect, *arguments.listen))
         console.print(f"router {listening}; logs in {supervisor.log_folder}; Ctrl-C stops")
         while True:

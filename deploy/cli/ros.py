@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from rich.table import Table
 
+from prior_sg.deploy.cli.ros_results import add_results
 from prior_sg.deploy.cli.shared import Commands, console
 from prior_sg.deploy.errors import UserError
 from prior_sg.deploy.json_text import json_text
@@ -23,6 +24,7 @@ def add_commands(commands: Commands) -> None:
     )
     topics.add_argument("source", type=Path, help="a rosbag2 folder, or a file ending in .mcap, .db3 or .bag")
     topics.add_argument("--json", action="store_true", help="print JSON")
+    add_results(actions)
 
 
 def cmd_topics(arguments: argparse.Namespace) -> int:

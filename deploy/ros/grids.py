@@ -1,8 +1,8 @@
 """Regions and free space as nav_msgs/OccupancyGrid, from above (pure).
 
 A cell belongs to the region whose places' spheres reach farthest beyond its middle, as on the live page's map: spheres
-are taken 0.14 m larger, for they touch walls in single points. It is free where a sphere itself covers it: free, that is,
-at the height of that place. What no sphere covers is unknown; a map of places knows no obstacles.
+are taken 0.14 m larger, for they touch walls in single points. It is free where a sphere itself covers it, at that
+place's height. What no sphere covers is unknown; a map of places knows no obstacles.
 
 A grid's corner moves, and its sides grow, in steps of 2 m; cells double until there are no more than MOST_CELLS.
 """
@@ -20,7 +20,6 @@ from prior_sg.schemas.regions import NO_REGION
 from prior_sg.schemas.scene import Scene
 
 GRID = "nav_msgs/msg/OccupancyGrid"
-FINEST_CELL_M, COARSEST_CELL_M, USUAL_CELL_M = 0.02, 1.0, 0.05
 MOST_CELLS = 4_000_000
 UNKNOWN, FREE = -1, 0
 MOST_VALUES = 100  # that a cell can have beside free and unknown
@@ -83,9 +82,7 @@ def widened(ground: Ground, margin_m: float) -> Ground:
     return Ground(Layout((x_m, y_m), ground.layout.cell_m, shape), owners, np.pad(ground.free, border))
 
 
-def _field(
-    layout: Layout, positions_m: np.ndarray, radii_m: np.ndarray
-) -> tuple[tuple[slice, slice], np.ndarray]:
+def _field(layout: Layout, positions_m: np.ndarray, radii_m: np.ndarray) -> tuple[tuple[slice, slice], np.ndarray]:
     """Over the window that some discs reach: by how much the farthest reaches beyond each cell's middle, metres."""
     at = (positions_m - layout.corner_m) / layout.cell_m - 0.5
     radii = (radii_m + PAD_M) / layout.cell_m
@@ -127,10 +124,11 @@ def free_cells(ground: Ground) -> np.ndarray:
     return np.where(ground.free, FREE, UNKNOWN).astype(np.int8)
 
 
-def occupancy_grid(classes: Classes, layout: Layout, cells: np.ndarray, frame: str, stamp_ns: int) -> Any:
-    """A grid of cells (i, j); the message has the rows along x, from the lowest y up."""
+def occupancy_grid(classes: Classes, layout: Layout, cells: np.ndarray, frame: str) -> Any:
+    """A grid of cells (i, j); the message has the rows along x, from the lowest y up. It has no stamp: it holds until
+    the next, and one that says the same has the same bytes.
+    """
     corner = messages.pose(classes, (*layout.corner_m, 0.0))
-    width, height = layout.shape
-    load_time = messages.stamp(classes, stamp_ns)
-    about = classes["nav_msgs/msg/MapMetaData"](load_time, layout.cell_m, width, height, corner)
-    return classes[GRID](messages.header(classes, frame, stamp_ns), about, np.ascontiguousarray(cells.T).reshape(-1))
+    load_time = messages.stamp(classes, messages.LATEST)
+    about = classes["nav_msgs/msg/MapMetaData"](load_time, layout.cell_m, *layout.shape, corner)
+    return classes[GRID](messages.header(classes, frame), about, np.ascontiguousarray(cells.T).reshape(-1))

@@ -1,8 +1,8 @@
 """The live page's picture of a scene as visualization_msgs/MarkerArray (pure).
 
 A picture's names are paths: what is no number in them is the marker's namespace, which RViz switches on and off, and
-the number its id: `/regions/7/floor` is marker 7 of `regions/floor`. Every array holds the whole picture and begins with
-DELETEALL: whoever gets one, be it the first or after a gap, shows that scene and nothing of an older one.
+the number its id: `/regions/7/floor` is marker 7 of `regions/floor`. Every array holds the whole picture and begins
+with DELETEALL: whoever gets one, be it the first or after a gap, shows that scene and nothing of an older one.
 """
 
 from collections.abc import Iterator
@@ -30,8 +30,9 @@ def marker_array(classes: Classes, picture: Picture, frame: str) -> Any:
 
 def _markers(classes: Classes, picture: Picture, frame: str) -> Iterator[Any]:
     for path, shape in sorted(picture.items()):
-        namespace, number = place_of(path)
-        yield _marker(classes, frame, namespace, number, **_content(classes, shape))
+        content = _content(classes, shape)
+        if "text" in content or len(content["at"]):  # RViz calls an empty list an error
+            yield _marker(classes, frame, *place_of(path), **content)
 
 
 def place_of(path: str) -> tuple[str, int]:

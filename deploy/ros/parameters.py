@@ -100,9 +100,7 @@ class Parameters:
     def _description(self, name: str) -> Any:
         kind = STRING if name in MEANINGS else NOT_SET
         read_only = name != TASK
-        return self._message(
-            "ParameterDescriptor", name, kind, MEANINGS.get(name, ""), "", read_only, False, [], []
-        )
+        return self._message("ParameterDescriptor", name, kind, MEANINGS.get(name, ""), "", read_only, False, [], [])
 
     def _message(self, name: str, *values: Any) -> Any:
         return self._classes[f"{PACKAGE}/msg/{name}"](*values)

@@ -9,33 +9,29 @@ from prior_sg.deploy.ros import frames, grids, masks, messages
 from prior_sg.deploy.ros.grids import CellValues, Ground
 from prior_sg.deploy.ros.markers import ARRAY, marker_array
 from prior_sg.deploy.ros.messages import Classes
+from prior_sg.deploy.ros.rules import Look
 from prior_sg.deploy.showing.export import scene_json
 from prior_sg.deploy.viewing.drawing import Painter
 from prior_sg.schemas.scene import Scene
 
 STRING = "std_msgs/msg/String"
-MARKERS, REGION_GRID, FREE_GRID, TABLE, SCENE, TASK_STATE = "markers", "region_grid", "free_grid", "regions", "scene", "task"
-LATCHED = {MARKERS: ARRAY, REGION_GRID: grids.GRID, FREE_GRID: grids.GRID, TABLE: STRING, SCENE: STRING, TASK_STATE: STRING}
+MARKERS, REGION_GRID, FREE_GRID, TABLE, SCENE, TASK_STATE = (
+    "markers",
+    "region_grid",
+    "free_grid",
+    "regions",
+    "scene",
+    "task",
+)
+LATCHED = {
+    MARKERS: ARRAY,
+    REGION_GRID: grids.GRID,
+    FREE_GRID: grids.GRID,
+    TABLE: STRING,
+    SCENE: STRING,
+    TASK_STATE: STRING,
+}
 TF_TOPIC, SET_TASK = "/tf", "set_task"
-
-
-@dataclass(frozen=True)
-class Look:
-    """How a scene is shown."""
-
-    node: str = "prior_sg"
-    frame: str = "map"
-    cell_m: float = grids.USUAL_CELL_M
-    heights_m: tuple[float, float] = (float("-inf"), float("inf"))  # of places on the grids and masks
-    rules: tuple[masks.Rule, ...] = ()
-
-    def topic(self, name: str) -> str:
-        """The full name of one of the node's topics."""
-        return f"/{self.node}/{name}"
-
-    def filters(self) -> tuple[masks.Filter, ...]:
-        """Filters that any rule is of."""
-        return tuple(of for of in masks.TYPES if any(rule.filter == of for rule in self.rules))
 
 
 def latched_types(look: Look) -> dict[str, str]:
@@ -60,15 +56,15 @@ class Teller:
         ground = grids.ground_of(scene, self.look.cell_m, self.look.heights_m)
         values = self._values(scene)
         yield MARKERS, marker_array(self.classes, self.painter.draw(scene), self.look.frame)
-        yield REGION_GRID, self._grid(scene, ground, grids.region_cells(ground, values))
-        yield FREE_GRID, self._grid(scene, ground, grids.free_cells(ground))
+        yield REGION_GRID, self._grid(ground, grids.region_cells(ground, values))
+        yield FREE_GRID, self._grid(ground, grids.free_cells(ground))
         yield TABLE, self._text(self._table(scene, values))
         yield SCENE, self._text(scene_json(scene))
         if self.look.rules:
             around = grids.widened(ground, masks.MARGIN_M)
             for of in self.look.filters():
                 cells = masks.mask_cells(around, scene.regions, self.look.rules, of)
-                yield f"{of}_mask", self._grid(scene, around, cells)
+                yield f"{of}_mask", self._grid(around, cells)
 
     def filter_infos(self) -> Iterator[tuple[str, Any]]:
         """What Nav2 has to be told of the masks, once: with every telling it subscribes again."""
@@ -92,8 +88,8 @@ class Teller:
         colors = self.painter.label_colors(scene)
         return frames.table(scene, self.look.node, self.look.frame, values, colors)
 
-    def _grid(self, scene: Scene, ground: Ground, cells: Any) -> Any:
-        return grids.occupancy_grid(self.classes, ground.layout, cells, self.look.frame, scene.stamp_ns)
+    def _grid(self, ground: Ground, cells: Any) -> Any:
+        return grids.occupancy_grid(self.classes, ground.layout, cells, self.look.frame)
 
     def _text(self, told: dict[str, Any]) -> Any:
         return messages.text(self.classes, json_text(told, indent=None))
