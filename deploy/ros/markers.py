@@ -16,7 +16,8 @@ from prior_sg.deploy.viewing.shapes import Arrows, Lines, Mesh, Name, Picture, P
 
 ARRAY, MARKER = "visualization_msgs/msg/MarkerArray", "visualization_msgs/msg/Marker"
 MOST_IDS = 2**31  # an id is an int32
-METRES_OF_PX = 0.012  # lines of the page are as wide on every screen, those of RViz in the world
+METRES_OF_PX = 0.02  # lines of the page are as wide on every screen, those of RViz in the world
+GROUND_OPACITY = 0.6  # of the page's, where points of images lie between ground and edges
 TEXT_M = 0.32  # height of a name of scale 1
 BARB = 0.3  # of an arrow's length
 BARB_ANGLE_RAD = 2.6
@@ -52,7 +53,7 @@ def _content(classes: Classes, shape: Shape) -> dict[str, Any]:
         case Lines():
             return {"kind": kinds.LINE_LIST, "at": shape.points_m} | _line(classes, shape)
         case Mesh():
-            tint = messages.color(classes, shape.color, shape.opacity)
+            tint = messages.color(classes, shape.color, GROUND_OPACITY * shape.opacity)
             return {"kind": kinds.TRIANGLE_LIST, "at": shape.vertices_m[shape.faces], "color": tint}
         case Arrows():
             tint = messages.color(classes, shape.color)
