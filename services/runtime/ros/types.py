@@ -38,9 +38,13 @@ class Types:
         whole = f"{name}_Request request_message\n{name}_Response response_message\n{name}_Event event_message\n"
         self.add_message(name, whole)
 
+    def knows(self, name: str) -> bool:
+        """Whether a type is defined here."""
+        return name in self.store.fielddefs
+
     def hash(self, name: str) -> str:
         """RIHS01_… of a message or service. Raises WireError."""
-        if name not in self.store.fielddefs:
+        if not self.knows(name):
             raise WireError(f"the type {name[:60]!r} is not known here")
         return str(self.store.hash_rihs01(name))
 
