@@ -47,7 +47,7 @@ def serve_ros(connect: str, robot: str, options: Options, say: Say, *, parent: i
     with RosSession(router, look.node, options.domain) as ros, joined(connect, robot) as system:
         bridge = Bridge(system, ros, types, options, say)
         say(f"node /{look.node} on {router}, domain {options.domain}: topics under {look.topic('')}")
-        asyncio.run(bridge.run(parent))
+        asyncio.run(_until_end(bridge, parent))
 
 
 def bridge_types() -> Types:
@@ -82,25 +82,16 @@ class Bridge:
     def _channel(self, name: str, kind: str, quality: Quality = Quality()) -> Channel:
         return Channel(name, kind, self._types.hash(kind), quality)
 
-    async def run(self, parent: int = 0) -> None:
-        """Until a signal, or until the parent process is gone."""
-        self._loop, self._news, stop = asyncio.get_running_loop(), asyncio.Event(), asyncio.Event()
-        for number in (signal.SIGINT, signal.SIGTERM):
-            with contextlib.suppress(ValueError):  # not on the main thread, as in tests
-                self._loop.add_signal_handler(number, stop.set)
+    async def run(self) -> None:
+        """Until it is cancelled."""
+        self._loop, self._news = asyncio.get_running_loop(), asyncio.Event()
         self._system.on_revision.append(self._saw)
         for name, message in self._teller.filter_infos():
             self._put(name, message)
         self._listen()
-        ends: tuple[Coroutine[Any, Any, Any], ...] = (stop.wait(), _parent_gone(parent))
-        jobs = [asyncio.create_task(job) for job in (self._follow(), self._repeat_tf(), *ends)]
-        try:
-            done, _ = await asyncio.wait(jobs, return_when=asyncio.FIRST_COMPLETED)
-            for job in done:
-                job.result()
-        finally:
-            for job in (*jobs, *self._jobs):
-                job.cancel()
+        async with asyncio.TaskGroup() as jobs:
+            jobs.create_task(self._follow())
+            jobs.create_task(self._repeat_tf())
 
     def _saw(self, revision: SceneRevision) -> None:
         if revision.robot == self._system.robot:
@@ -220,6 +211,21 @@ def _tag(scene: Scene | None) -> tuple[int, int] | None:
 
 def _state(task: str, state: str, note: str = "") -> dict[str, str]:
     return {"task": task, "state": state, "note": note}
+
+
+async def _until_end(bridge: Bridge, parent: int) -> None:
+    """Run until a signal, or until the parent process is gone."""
+    stop = asyncio.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        asyncio.get_running_loop().add_signal_handler(number, stop.set)
+    ends: tuple[Coroutine[Any, Any, Any], ...] = (bridge.run(), stop.wait(), _parent_gone(parent))
+    jobs = [asyncio.create_task(job) for job in ends]
+    done, others = await asyncio.wait(jobs, return_when=asyncio.FIRST_COMPLETED)
+    for job in others:
+        job.cancel()
+    await asyncio.wait(jobs)
+    for job in done:
+        job.result()
 
 
 async def _parent_gone(parent: int) -> None:
