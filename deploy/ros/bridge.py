@@ -43,10 +43,10 @@ def serve_ros(connect: str, robot: str, options: Options, say: Say, *, parent: i
     if options.takes_tasks and bundle is not None and bundle.own.role == "viewer":
         raise UserError(f"these keys are of {bundle.own.name}, a viewer, who gives no tasks; leave out --take-tasks")
     types = bridge_types()
-    router, look = options.router or connect, options.look
-    with RosSession(router, look.node, options.domain) as ros, joined(connect, robot) as system:
+    look = options.look
+    with RosSession(options.router, look.node, options.domain) as ros, joined(connect, robot) as system:
         bridge = Bridge(system, ros, types, options, say)
-        say(f"node /{look.node} on {router}, domain {options.domain}: topics under {look.topic('')}")
+        say(f"node /{look.node} on {options.router}, domain {options.domain}: topics under {look.topic('')}")
         asyncio.run(_until_end(bridge, parent))
 
 

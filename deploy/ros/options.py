@@ -18,6 +18,7 @@ from prior_sg.deploy.ros.rules import (
 )
 from prior_sg.services.runtime.ros.wire import LARGEST_DOMAIN
 
+ENDPOINT = "tcp/127.0.0.1:7447"  # where rmw_zenohd listens
 SHORTEST_INTERVAL_S, LONGEST_INTERVAL_S = 0.1, 3600.0
 FRAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_./-]{0,99}")
 DOMAIN_VARIABLE = "ROS_DOMAIN_ID"
@@ -28,7 +29,7 @@ class Options:
     """What is told where, how often, and whether anything is taken from there."""
 
     look: Look = USUAL_LOOK
-    router: str = ""  # of ROS; empty = the system's own
+    router: str = ENDPOINT  # of ROS
     domain: int = 0
     interval_s: float = 1.0
     takes_tasks: bool = False
@@ -37,7 +38,7 @@ class Options:
 def add_options(parser: argparse.ArgumentParser) -> None:
     """All options of the bridge."""
     parser.add_argument(
-        "--ros-router", default="", metavar="tcp/HOST:PORT", help="Zenoh router of ROS; default: the one at --connect"
+        "--ros-router", default=ENDPOINT, metavar="tcp/HOST:PORT", help="Zenoh router of ROS (default: %(default)s)"
     )
     parser.add_argument("--domain", default="", help=f"domain of ROS; default: {DOMAIN_VARIABLE}, else 0")
     parser.add_argument("--node", default=Look.node, help="name of the node and of its topics (default: %(default)s)")

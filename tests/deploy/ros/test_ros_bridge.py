@@ -186,7 +186,7 @@ def test_a_node_of_ros_itself_sees_markers_and_grids(endpoint):
 
 def test_the_bridge_is_supervised(endpoint, tmp_path):
     supervisor = Supervisor(endpoint, "ada", tmp_path)
-    supervisor.start_door("ros", "prior_sg.deploy.ros.process", [])
+    supervisor.start_door("ros", "prior_sg.deploy.ros.process", ["--ros-router", endpoint])
     try:
         (child,) = supervisor.children
         wait_for(lambda: "node /prior_sg" in child.log_path.read_text(), 30)
@@ -215,6 +215,11 @@ def test_options_that_cannot_be_are_told(options, said, endpoint, capsys):
     assert main(["ros", "bridge", "--connect", endpoint, *options]) == 1
     told = capsys.readouterr().err
     assert said in told and len(told.splitlines()) == 1
+
+
+def test_up_keeps_its_router_apart_from_ros(tmp_path, capsys):
+    assert main(["up", "--ros", "--connect", "tcp/127.0.0.1:7447", "--out", str(tmp_path / "up")]) == 1
+    assert "do not find each other" in capsys.readouterr().err
 
 
 def test_a_configuration_of_rviz_names_what_the_bridge_tells(tmp_path, capsys):
