@@ -29,6 +29,7 @@ from prior_sg.services.runtime.ros.wire import Channel, Quality
 log = logging.getLogger(__name__)
 TF_PERIOD_S = 1.0
 IDLE_S = 10.0  # after which the scene is asked for though nobody told of a change: such notices may be lost
+REST = 2.0  # times as long as telling of a large scene takes, nothing is told: others need the processor as well
 TASK_WAIT_S = 300.0  # a language model may take minutes
 PARENT_CHECK_S = 1.0
 TF_DEPTH = 100
@@ -101,6 +102,7 @@ class Bridge:
         """Tell of the scene whenever it has changed, and no oftener than asked for."""
         while True:
             self._news.clear()
+            since_s = time.monotonic()
             try:
                 scene = (await self._system.scene(self._system.robot)).message
                 self._silent = ""
@@ -109,7 +111,7 @@ class Bridge:
             else:
                 if scene.revision >= 0 and _tag(scene) != _tag(self._scene):
                     await asyncio.to_thread(self._tell, scene)
-            await asyncio.sleep(self._options.interval_s)
+            await asyncio.sleep(max(self._options.interval_s, REST * (time.monotonic() - since_s)))
             with contextlib.suppress(TimeoutError):
                 await asyncio.wait_for(self._news.wait(), IDLE_S)
 

@@ -7,7 +7,7 @@ place's height. What no sphere covers is unknown; a map of places knows no obsta
 A grid's corner moves, and its sides grow, in steps of 2 m; cells double until there are no more than MOST_CELLS.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -111,12 +111,20 @@ class CellValues:
         return {region: self._values[region] for region in regions if region in self._values}
 
 
-def region_cells(ground: Ground, values: dict[int, int]) -> np.ndarray:
+def region_cells(ground: Ground, values: Mapping[int, int]) -> np.ndarray:
     """Each cell's region by its value; FREE where free space, or a region without a value, is, else UNKNOWN (int8)."""
-    cells = np.where(ground.free | (ground.owners != NO_REGION), FREE, UNKNOWN).astype(np.int8)
-    for region, value in values.items():
-        cells[ground.owners == region] = value
-    return cells
+    unsaid = np.where(ground.free | (ground.owners != NO_REGION), FREE, UNKNOWN).astype(np.int8)
+    return with_values(ground, values, unsaid)
+
+
+def with_values(ground: Ground, values: Mapping[int, int], cells: np.ndarray) -> np.ndarray:
+    """The cells (int8), those of some regions with their values."""
+    if not values:
+        return cells
+    regions = np.array(sorted(values), np.int64)
+    of_regions = np.array([values[region] for region in regions.tolist()], np.int8)
+    at = np.minimum(np.searchsorted(regions, ground.owners), len(regions) - 1)
+    return np.where(regions[at] == ground.owners, of_regions[at], cells)
 
 
 def free_cells(ground: Ground) -> np.ndarray:

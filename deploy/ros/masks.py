@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from prior_sg.deploy.ros import messages
-from prior_sg.deploy.ros.grids import UNKNOWN, Ground
+from prior_sg.deploy.ros.grids import UNKNOWN, Ground, with_values
 from prior_sg.deploy.ros.messages import Classes
 from prior_sg.deploy.ros.rules import NO_LIMIT, Filter, Rule
 from prior_sg.schemas.names import same
@@ -25,12 +25,10 @@ MARGIN_M = 5.0
 
 def mask_cells(ground: Ground, regions: Sequence[Region], rules: Iterable[Rule], of: Filter) -> np.ndarray:
     """The mask of one filter (int8): regions with a rule's label, also predicted ones, and all else unsaid."""
-    cells = np.full(ground.owners.shape, UNKNOWN if of == "keepout" else NO_LIMIT, np.int8)
-    values = {same(rule.label): rule.value for rule in rules if rule.filter == of}
-    for region in regions:
-        if (value := values.get(same(region.label))) is not None:
-            cells[ground.owners == region.id] = value
-    return cells
+    by_label = {same(rule.label): rule.value for rule in rules if rule.filter == of}
+    values = {region.id: by_label[same(region.label)] for region in regions if same(region.label) in by_label}
+    unsaid = np.full(ground.owners.shape, UNKNOWN if of == "keepout" else NO_LIMIT, np.int8)
+    return with_values(ground, values, unsaid)
 
 
 def filter_info(classes: Classes, of: Filter, mask_topic: str, frame: str) -> Any:
