@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from prior_sg.deploy.ros import grids, masks, parameters
+from prior_sg.deploy.ros import grids, masks, messages, parameters
 from prior_sg.deploy.ros.bridge import bridge_types
 from prior_sg.deploy.ros.grids import FREE, UNKNOWN, CellValues, ground_of
 from prior_sg.deploy.ros.markers import ARRAY, marker_array, place_of, with_barbs
@@ -115,9 +115,9 @@ def cell(grid, x_m, y_m):
 
 
 def test_grids_say_whose_a_spot_is_and_where_it_is_free():
-    messages = told(home())
-    regions, free = messages["region_grid"], messages["free_grid"]
-    table = json.loads(messages["regions"].data)
+    by_topic = told(home())
+    regions, free = by_topic["region_grid"], by_topic["free_grid"]
+    table = json.loads(by_topic["regions"].data)
     values = {one["label"]: one["grid_value"] for one in table["regions"]}
     assert sorted(values.values()) == [1, 2]
     assert cell(regions, 2.0, 1.5) == values["kitchen"] and cell(regions, 6.0, 1.5) == values["bedroom"]
@@ -126,6 +126,19 @@ def test_grids_say_whose_a_spot_is_and_where_it_is_free():
     assert cell(free, 2.0, 3.08) == UNKNOWN and cell(regions, 2.0, 3.08) == values["kitchen"]  # just outside it
     assert set(np.unique(free.data)) == {FREE, UNKNOWN}
     assert (regions.info.width, regions.info.height) == (200, 120)  # -2..8 and -2..4 m at 5 cm
+
+
+def test_a_cell_is_free_where_its_middle_lies_in_a_sphere():
+    scene, grid = home(), told(home())["free_grid"]
+    about = grid.info
+    turn = about.origin.orientation
+    assert (turn.x, turn.y, turn.z, turn.w) == (0, 0, 0, 1)
+    rows, columns = np.mgrid[: about.height, : about.width] + 0.5
+    x_m, y_m = about.origin.position.x + columns * 0.05, about.origin.position.y + rows * 0.05
+    away_m = np.hypot(x_m[..., None] - scene.positions_m[:, 0], y_m[..., None] - scene.positions_m[:, 1])
+    reach_m = (scene.radii_m - away_m).max(axis=-1)
+    clear = np.abs(reach_m) > 1e-4
+    assert ((grid.data.reshape(rows.shape) == FREE) == (reach_m > 0))[clear].all()
 
 
 def test_places_of_no_region_are_free_and_nobodys():
@@ -205,8 +218,8 @@ def test_rules_that_contradict_each_other_are_told():
 
 def test_masks_say_what_nav2_understands():
     by = teller()
-    messages = told(home(), by)
-    speed, keepout = messages["speed_mask"], messages["keepout_mask"]
+    by_topic = told(home(), by)
+    speed, keepout = by_topic["speed_mask"], by_topic["keepout_mask"]
     assert cell(speed, 2.0, 1.5) == 50 and cell(speed, 6.0, 1.5) == 0
     assert set(np.unique(speed.data)) == {0, 50}  # -1 is an error to Nav2's speed filter
     assert cell(keepout, 6.0, 1.5) == 100 and cell(keepout, 2.0, 1.5) == UNKNOWN
@@ -307,6 +320,7 @@ def messages_by_ros():
     found = dict(teller().about(home()))
     for name, message in found.items():
         yield name, message, classes[message.__msgtype__.rpartition("/")[2]]
+    yield "other letters", messages.text(CLASSES, "Küche ☕"), String
     yield "tf", teller().tf(home(), 1_500_000_000).transforms[0], TransformStamped
     replies = {
         "get_parameters": (["task", "gone"],),
@@ -333,7 +347,7 @@ def test_bytes_are_those_of_ros_itself():
         assert not np.frombuffer(ours, np.uint8)[differ].any(), name
         assert TYPES.encode(TYPES.decode(theirs, message.__msgtype__)) == ours, name
         names.append(name)
-    assert len(names) == 14
+    assert len(names) == 15
 
 
 def test_hashes_are_those_of_ros_itself():
