@@ -58,7 +58,7 @@ def cmd_bridge(arguments: argparse.Namespace) -> int:
 
     options = options_of(arguments)
     with contextlib.suppress(KeyboardInterrupt):
-        serve_ros(arguments.connect, arguments.robot, options, say_until)
+        serve_ros(arguments.connect, arguments.robot, options, say_until, console.print)
     console.print("stopping")
     return 0
 

@@ -38,8 +38,10 @@ BUSY = "a task is being given: try again when the topic task tells of its end"
 Say = Callable[[str], None]
 
 
-def serve_ros(connect: str, robot: str, options: Options, say: Say, *, parent: int = 0) -> None:
-    """Tell of a robot's scene until a signal. Raises BusError, UserError, ExtraMissing."""
+def serve_ros(connect: str, robot: str, options: Options, opened: Say, say: Say, *, parent: int = 0) -> None:
+    """Tell of a robot's scene until a signal; `opened` is told where, `say` what happens. Raises BusError, UserError,
+    ExtraMissing.
+    """
     bundle = bundle_in_force()
     if options.takes_tasks and bundle is not None and bundle.own.role == "viewer":
         raise UserError(f"these keys are of {bundle.own.name}, a viewer, who gives no tasks; leave out --take-tasks")
@@ -47,7 +49,7 @@ def serve_ros(connect: str, robot: str, options: Options, say: Say, *, parent: i
     look = options.look
     with RosSession(options.router, look.node, options.domain) as ros, joined(connect, robot) as system:
         bridge = Bridge(system, ros, types, options, say)
-        say(f"node /{look.node} on {options.router}, domain {options.domain}: topics under {look.topic('')}")
+        opened(f"node /{look.node} on {options.router}, domain {options.domain}: topics under {look.topic('')}")
         asyncio.run(_until_end(bridge, parent))
 
 

@@ -33,7 +33,7 @@ def main() -> int:
     try:
         options = options_of(arguments)
         with contextlib.suppress(KeyboardInterrupt):
-            serve_ros(arguments.connect, arguments.robot, options, log.info, parent=arguments.parent)
+            serve_ros(arguments.connect, arguments.robot, options, log.info, log.info, parent=arguments.parent)
     except (UserError, BusError, ServiceError) as error:
         log.error(str(error))
         return EXIT_HOPELESS
