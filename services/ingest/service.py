@@ -21,6 +21,7 @@ from prior_sg.services.runtime.service import Identity, Output, Service
 
 log = logging.getLogger(__name__)
 PROGRESS_S = 1.0
+SEARCH_S = 1.0  # between two searches for a robot
 
 
 class Port(Protocol):
@@ -92,7 +93,9 @@ async def drive(port: Port, cfg: Config) -> None:
     if not cfg.source:
         log.info("no source is configured: set ingest.source to a dataset folder or an MCAP log")
         return
-    source = await asyncio.to_thread(_open, cfg)
+    source = await _opened(port, cfg)
+    if source is None:
+        return
     log.info("reading", extra={"source": cfg.source, "layout": source.layout, "frames": source.total})
     for note in source.notes:
         log.info("source", extra={"note": note})
@@ -103,6 +106,19 @@ async def drive(port: Port, cfg: Config) -> None:
             await port.consume(EndOfSource())
     finally:
         stopping.cancel()
+
+
+async def _opened(port: Port, cfg: Config) -> Source | None:
+    """The source; a robot that is not there is waited for, until the host wishes to stop. Raises SourceError."""
+    while not port.stopping.is_set():
+        try:
+            return await asyncio.to_thread(_open, cfg)
+        except SourceError as error:
+            if not is_live(cfg.source):
+                raise
+            log.warning("no robot yet", extra={"reason": str(error)})
+            await _stopped_while(port, asyncio.sleep(SEARCH_S))
+    return None
 
 
 async def _fed(port: Port, source: Source, cfg: Config) -> bool:

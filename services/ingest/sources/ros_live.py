@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from prior_sg.services.ingest.core import selection
@@ -49,7 +50,7 @@ from prior_sg.services.runtime.ros.wire import WireError
 
 NAME = "ros2"
 NODE = "prior_sg_ingest"
-LOOK_S, MOMENT_S = 12.0, 0.1
+LOOK_S, MOMENT_S = 8.0, 0.1
 SAMPLES = 3
 NO_IMAGES = Images(b"", b"")
 
@@ -112,6 +113,19 @@ def load(path: Path, options: ReadOptions) -> Source:
     )
 
 
+def heard(source: str, domain: int, seconds: float) -> list[Topic]:
+    """Topics of a running robot that could serve, by name. Raises SourceError."""
+    try:
+        with RosSession(endpoint_of(source), NODE, domain) as session:
+            look = Look(session, shared_types())
+            end_s = time.monotonic() + seconds
+            while (left_s := end_s - time.monotonic()) > 0:
+                look.listen(min(left_s, MOMENT_S))
+            return look.topics()
+    except (BusError, WireError) as error:
+        raise SourceError(f"{source}: {error}") from error
+
+
 class Due:
     """Whether a frame may become a keyframe, so that its images are worth decoding."""
 
@@ -131,14 +145,14 @@ def _found(path: Path, options: ReadOptions) -> Robot:
     endpoint, types = endpoint_of(str(path)), shared_types()
     try:
         with RosSession(endpoint, NODE, options.ros_domain) as session:
-            look = Look(session, types, options)
+            look = Look(session, types)
             end_s = time.monotonic() + LOOK_S
             while True:
                 look.listen(MOMENT_S)
                 late = time.monotonic() > end_s
                 if look.settled or late:
                     try:
-                        return _robot(look, types, path, options)
+                        return robot_of(look, types, path, options)
                     except (SourceError, PoseError, ValueError) as error:
                         if late:
                             raise SourceError(_what_is_there(path, look, options, str(error))) from error
@@ -155,8 +169,8 @@ def _what_is_there(path: Path, look: Look, options: ReadOptions, said: str) -> s
     return f"{path}: {said} ({there}{faults})"
 
 
-def _robot(look: Look, types: Types, path: Path, options: ReadOptions) -> Robot:
-    """Raises SourceError, ValueError and PoseError, each with one sentence."""
+def robot_of(look: Look, types: Types, path: Path, options: ReadOptions) -> Robot:
+    """What is to be read, of what was heard. Raises SourceError, ValueError and PoseError, each with one sentence."""
     topics = look.topics()
     choice, posing = chosen(topics, options), pose_topics(topics, options)
     by_name = {topic.name: topic for topic in topics}
@@ -271,8 +285,14 @@ class Reader:
 class Stream:
     """What a robot sends from now on."""
 
-    def __init__(self, robot: Robot, wanted: Callable[[View], bool], stop: threading.Event) -> None:
-        self._robot, self._wanted, self._stop = robot, wanted, stop
+    def __init__(
+        self,
+        robot: Robot,
+        wanted: Callable[[View], bool],
+        stop: threading.Event,
+        clock_ns: Callable[[], int] = time.time_ns,
+    ) -> None:
+        self._robot, self._wanted, self._stop, self._clock_ns = robot, wanted, stop, clock_ns
         self._types, self._tally, self._frames = shared_types(), Tally(), 0
         by_name = {topic.name: topic for topic in robot.topics}
         self._reader = Reader(self._types, robot.options, by_name)
@@ -287,11 +307,12 @@ class Stream:
             heard_s = time.monotonic()
             while not self._stop.is_set() and not 0 < quiet_s < time.monotonic() - heard_s:
                 frames = self._frames
-                yield from self._heard(*feed.take(MOMENT_S))
+                yield from self.take(*feed.take(MOMENT_S))
                 heard_s = time.monotonic() if self._frames > frames else heard_s
-            yield from self._complete(ended=True)
+            yield from self.rest()
 
-    def _heard(self, messages: list[Received], faults: list[Fault]) -> Iterator[Event]:
+    def take(self, messages: list[Received], faults: list[Fault]) -> Iterator[Event]:
+        """What comes of messages, and words on what could not be used."""
         for message in messages:
             fault = self._reader.hand_over(message, self._robot.choice, self._assembly)
             faults += [fault] if fault is not None else []
@@ -299,9 +320,13 @@ class Stream:
             self._tally.add(fault)
         yield from self._complete(ended=False)
 
+    def rest(self) -> Iterator[Event]:
+        """What can still be made of what waits."""
+        yield from self._complete(ended=True)
+
     def _complete(self, ended: bool) -> Iterator[Event]:
         """Frames and jumps that are complete, then words on what was of no use."""
-        for one in self._assembly.ready(time.time_ns(), ended):
+        for one in self._assembly.ready(self._clock_ns(), ended):
             yield self._closure(one) if isinstance(one, Jump) else self._frame(one)
         for fault in self._assembly.faults():
             self._tally.add(fault)
@@ -315,7 +340,8 @@ class Stream:
             pose = robot.convention.of_matrix(posed.source_from_camera)
             stamp_ns = posed.color.stamp_ns
             if not self._wanted(View(number, stamp_ns, robot.normaliser.pose(pose))):
-                return robot.normaliser.bare(number, 0, number, stamp_ns, pose, NO_IMAGES)
+                bare = robot.normaliser.bare(number, 0, number, stamp_ns, pose, NO_IMAGES)
+                return msgspec.structs.replace(bare, pose_only=True)
             images = self._reader.images(posed, robot.choice, robot.pictures)
             return robot.normaliser.frame(number, 0, number, stamp_ns, pose, images)
         except UNUSABLE as error:

@@ -5,7 +5,6 @@ from collections import deque
 from dataclasses import dataclass, field
 from typing import Any
 
-from prior_sg.services.ingest.core.options import ReadOptions
 from prior_sg.services.ingest.core.ros.assembly import Fault
 from prior_sg.services.ingest.core.ros.images import encoding_of, shown_by
 from prior_sg.services.ingest.core.ros.topics import CAMERA_INFO, COMPRESSED, IMAGE, READ_TYPES, Topic
@@ -47,10 +46,10 @@ class Heard:
 class Look:
     """Listens to all topics that could serve, and remembers their newest messages."""
 
-    def __init__(self, session: RosSession, types: Types, options: ReadOptions) -> None:
+    def __init__(self, session: RosSession, types: Types) -> None:
         self.heard: dict[str, Heard] = {}
         self.tally = Tally()
-        self._session, self._types, self._options = session, types, options
+        self._session, self._types = session, types
         self._feed = Feed()
         self._searched_s = self._found_s = 0.0
 

@@ -21,6 +21,7 @@ from prior_sg.services.ingest.core.ros.transforms import Stamped
 
 PATIENCE_NS = 1_200_000_000  # of a pair for its pose, by the time of arrival; longer than is interpolated over
 WAITING = 64  # images of a stream that wait for a partner, pairs that wait for a pose
+NEVER_NS = -(1 << 62)
 BACK_NS = 1_000_000_000  # a stream whose stamp is farther back has begun anew
 JUMP_M, JUMP_DEG = 0.05, 1.0  # more than this at once is no drift that is followed
 CLOCK_BACK = "the clock of its topic went back"
@@ -70,7 +71,7 @@ class Assembly:
         self.transforms, self.poses = RecentTransforms(), Recent()
         self._colors: list[Shot] = []
         self._depths: list[Shot] = []
-        self._newest_ns = [0, 0]  # stamps of colour and depth
+        self._newest_ns = [NEVER_NS, NEVER_NS]  # stamps of colour and depth
         self._pairs: deque[tuple[Shot, Shot]] = deque()
         self._faults: list[Fault] = []
         self._drift: Stamped | None = None  # the newest transform that a SLAM corrects
@@ -163,7 +164,7 @@ class Assembly:
         """Forget images of another time; frames whose pose is awaited stay."""
         self._colors.clear()
         self._depths.clear()
-        self._newest_ns[:] = 0, 0
+        self._newest_ns[:] = NEVER_NS, NEVER_NS
 
     def _pair(self, ended: bool) -> None:
         """Move colour images that have got the closest depth image, oldest first, and let go of those without."""
