@@ -7,7 +7,7 @@ from pathlib import Path
 from prior_sg.deploy.cli.shared import Commands, add_bus, console
 from prior_sg.deploy.cli.source_options import source_option
 from prior_sg.deploy.errors import UserError
-from prior_sg.deploy.ros.options import ENDPOINT, add_options, options_of
+from prior_sg.deploy.ros.options import add_options, options_of
 from prior_sg.services.runtime import extras
 
 
@@ -31,24 +31,29 @@ def add_results(actions: Commands) -> None:
 def add_ros(up: argparse.ArgumentParser) -> None:
     """The option of `up` that starts the bridge as well."""
     up.add_argument(
-        "--ros", nargs="?", const=ENDPOINT, default=None, metavar="tcp/HOST:PORT", help="also tell ROS 2, on its router"
+        "--ros",
+        nargs="?",
+        const="",
+        default=None,
+        metavar="tcp/HOST:PORT",
+        help="also tell ROS 2, on the router of `up` or on another",
     )
 
 
 def check_ros(arguments: argparse.Namespace) -> None:
     """That the bridge of `up` can be. Raises UserError, ExtraMissing."""
     extras.require("ros", "prior-sg up --ros")
-    if arguments.ros == arguments.connect and not arguments.no_router:
+    if arguments.ros in ("", arguments.connect) and (arguments.listen or arguments.join):
         raise UserError(
-            "ROS's nodes do not find each other on a router of `up`: start ROS's (`ros2 run rmw_zenoh_cpp rmw_zenohd`) "
-            "and add --no-router to use it for all, or --connect tcp/127.0.0.1:7448 to keep apart"
+            "a router with --listen or --join passes on nothing of ROS: start another for ROS (`ros2 run rmw_zenoh_cpp "
+            "rmw_zenohd`) and name it, as in --ros tcp/127.0.0.1:7448"
         )
 
 
 def bridge_arguments(arguments: argparse.Namespace) -> list[str]:
     """Of the bridge that `up` starts; its domain is that of a live source where one is told."""
     domain = source_option(arguments, "--domain")
-    return ["--ros-router", arguments.ros, *(["--domain", domain] if domain else [])]
+    return ["--ros-router", arguments.ros or arguments.connect, *(["--domain", domain] if domain else [])]
 
 
 def cmd_bridge(arguments: argparse.Namespace) -> int:

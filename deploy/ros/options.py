@@ -16,9 +16,9 @@ from prior_sg.deploy.ros.rules import (
     check_rules,
     rule_of,
 )
+from prior_sg.services.runtime.ros.session import ENDPOINT
 from prior_sg.services.runtime.ros.wire import LARGEST_DOMAIN
 
-ENDPOINT = "tcp/127.0.0.1:7447"  # where rmw_zenohd listens
 SHORTEST_INTERVAL_S, LONGEST_INTERVAL_S = 0.1, 3600.0
 FRAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_./-]{0,99}")
 DOMAIN_VARIABLE = "ROS_DOMAIN_ID"

@@ -14,6 +14,7 @@ import msgspec
 import numpy as np
 import pytest
 import yaml
+import zenoh
 
 from prior_sg.deploy.cli.main import main
 from prior_sg.deploy.ros import frames, grids, masks, parameters
@@ -217,9 +218,36 @@ def test_options_that_cannot_be_are_told(options, said, endpoint, capsys):
     assert said in told and len(told.splitlines()) == 1
 
 
-def test_up_keeps_its_router_apart_from_ros(tmp_path, capsys):
-    assert main(["up", "--ros", "--connect", "tcp/127.0.0.1:7447", "--out", str(tmp_path / "up")]) == 1
-    assert "do not find each other" in capsys.readouterr().err
+def node_of_ros(endpoint):
+    """A session with what matters of rmw_zenoh's own configuration."""
+    settings = {
+        "mode": "peer",
+        "connect": {"endpoints": [endpoint]},
+        "listen": {"endpoints": ["tcp/localhost:0"]},
+        "scouting": {
+            "multicast": {"enabled": False},
+            "gossip": {"enabled": True, "autoconnect": {"router": [], "peer": ["router", "peer"]}},
+        },
+    }
+    return zenoh.open(zenoh.Config.from_json5(json.dumps(settings)))
+
+
+def test_nodes_of_ros_find_each_other_on_our_router(endpoint):
+    heard = set()
+    with node_of_ros(endpoint) as talker, node_of_ros(endpoint) as listener:
+        subscriber = listener.declare_subscriber("25/chatter/**", lambda sample: heard.add(sample.payload.to_string()))
+
+        def said():
+            talker.put("25/chatter/x", "hello")
+            return heard == {"hello"}
+
+        wait_for(said)
+        subscriber.undeclare()
+
+
+def test_a_router_with_keys_passes_on_nothing_of_ros(tmp_path, capsys):
+    assert main(["up", "--ros", "--listen", "tls/127.0.0.1:7450", "--out", str(tmp_path / "up")]) == 1
+    assert "passes on nothing of ROS" in capsys.readouterr().err
 
 
 def test_a_configuration_of_rviz_names_what_the_bridge_tells(tmp_path, capsys):
