@@ -16,9 +16,11 @@ import pytest
 import yaml
 import zenoh
 
-from prior_sg.deploy.cli.main import main
+from prior_sg.deploy.cli.main import build_parser, main
+from prior_sg.deploy.cli.ros_results import bridge_arguments
+from prior_sg.deploy.errors import UserError
 from prior_sg.deploy.ros import frames, grids, masks, parameters
-from prior_sg.deploy.ros.bridge import BUSY, CLOSED, Bridge, bridge_types
+from prior_sg.deploy.ros.bridge import BUSY, CLOSED, Bridge, bridge_types, serve_ros
 from prior_sg.deploy.ros.markers import ARRAY
 from prior_sg.deploy.ros.options import Options
 from prior_sg.deploy.ros.rules import Look, rule_of
@@ -26,6 +28,7 @@ from prior_sg.deploy.ros.topics import STRING
 from prior_sg.deploy.running.supervisor import Supervisor
 from prior_sg.deploy.serving.system import System
 from prior_sg.schemas.regions import NO_REGION
+from prior_sg.services.runtime.keys import About, Bundle, Participant
 from prior_sg.services.runtime.ros.session import RosError, RosSession
 from prior_sg.services.runtime.ros.wire import Channel, Quality
 from tests.help.homes import home
@@ -216,6 +219,26 @@ def test_options_that_cannot_be_are_told(options, said, endpoint, capsys):
     assert main(["ros", "bridge", "--connect", endpoint, *options]) == 1
     told = capsys.readouterr().err
     assert said in told and len(told.splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("words", "passed"),
+    [
+        ("--ros", ["--ros-router", "tcp/127.0.0.1:7460"]),
+        ("--ros tcp/127.0.0.1:7461 --domain 3", ["--ros-router", "tcp/127.0.0.1:7461", "--domain", "3"]),
+    ],
+)
+def test_up_tells_its_bridge_where_ros_is(words, passed):
+    told = build_parser().parse_args(["up", "--connect", "tcp/127.0.0.1:7460", *words.split()])
+    assert bridge_arguments(told) == passed
+
+
+def test_a_viewer_gives_no_tasks(monkeypatch):
+    viewer = Participant(name="screen", role="viewer", issue=1, until="2099-01-01")
+    bundle = Bundle(folder=Path(), about=About(name="screen", participants=[viewer]))
+    monkeypatch.setattr("prior_sg.deploy.ros.bridge.bundle_in_force", lambda: bundle)
+    with pytest.raises(UserError, match="screen, a viewer"):
+        serve_ros("tcp/127.0.0.1:1", "ada", Options(takes_tasks=True), print, print)
 
 
 def node_of_ros(endpoint):
