@@ -108,7 +108,7 @@ def _rows_of_regions(scene: Scene) -> dict[int, np.ndarray]:
     """Rows of each region's places."""
     order = np.argsort(scene.place_regions, kind="stable")
     regions, starts = np.unique(scene.place_regions[order], return_index=True)
-    parts = np.split(order, starts[1:])
+    parts = np.split(order, starts[1:])[: len(regions)]  # of no places, one empty part
     return {int(region): rows for region, rows in zip(regions, parts, strict=True) if region != NO_REGION}
 
 
