@@ -4,7 +4,7 @@ import re
 from collections.abc import Iterator
 from datetime import timedelta
 from importlib.metadata import version
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import spark_dsg
@@ -24,11 +24,25 @@ from prior_sg.schemas.objects import SceneObject
 from prior_sg.services.geometry import pose_from_quaternion
 
 INDEX_BITS = 56  # of a symbol's value; the rest is its letter
-MOST_BASIS_POINTS = 2**15 - 1
+MOST_BASIS_POINTS, MOST_NS = 2**15 - 1, 2**63 - 1
 PLACE_IN_CODE = re.compile(r"^\[[^]]*\] ")
 AGENT, SEMANTIC = spark_dsg.AgentNodeAttributes, spark_dsg.SemanticNodeAttributes
 MICROSECOND = timedelta(microseconds=1)
 SOUND_AGENT = 1e-3  # by which a quaternion's length may differ from 1
+
+
+class Place(NamedTuple):
+    """What is taken of one place."""
+
+    id: int
+    symbol: int
+    parent: int  # the value of the symbol above it, NO_ROOM = none
+    stamp_ns: int
+    position_m: list[float]
+    radius_m: float
+    basis_points: int
+    opening: tuple[np.ndarray, float] | None  # direction, area
+    surface: tuple[tuple[float, float, float], np.ndarray] | None  # ellipse, hull
 
 
 class NotAGraph(ValueError):
@@ -47,22 +61,22 @@ def read_graph(payload: bytes, robot: str) -> HydraGraph:
 
 def graph_columns(graph: spark_dsg.DynamicSceneGraph, robot: str) -> HydraGraph:
     """Places of the layer PLACES, else of MESH_PLACES, with the rooms above them; objects; agents of every robot."""
-    places = _items(graph, LAYERS.PLACES, PLACE) or _items(graph, MESH_PLACES, PLACE_2D)
-    sound = [place for place in places if _is_sound(place)]
+    items = _items(graph, LAYERS.PLACES, PLACE) or _items(graph, MESH_PLACES, PLACE_2D)
+    places = [found for item in items if (found := _place(item)) is not None]
     rooms = {signed(node.id.value) for node in _nodes(graph, LAYERS.ROOMS)}
-    items = [item for item in _items(graph, LAYERS.OBJECTS, OBJECT) if isinstance(item.node.attributes, SEMANTIC)]
-    objects = [found for item in items if (found := _object(graph, item)) is not None]
+    things = [item for item in _items(graph, LAYERS.OBJECTS, OBJECT) if isinstance(item.node.attributes, SEMANTIC)]
+    objects = [found for item in things if (found := _object(graph, item)) is not None]
     agents = list(_agents(graph))
     return HydraGraph(
         robot=robot,
-        stamp_ns=max((int(place.node.attributes.last_update_time_ns) for place in sound), default=0) & (2**63 - 1),
+        stamp_ns=max((place.stamp_ns for place in places), default=0),
         room_ids=np.array(sorted(rooms), np.int64),
         objects=objects,
         agent_stamps_ns=np.array([stamp_ns for stamp_ns, _ in agents], np.int64),
         world_from_agent=np.array([pose for _, pose in agents], float).reshape(-1, 4, 4),
-        left_out=len(places) - len(sound) + len(items) - len(objects),
-        **_place_columns(sound, rooms),
-        **_edge_columns(graph, sound),
+        left_out=len(items) - len(places) + len(things) - len(objects),
+        **_place_columns(places, rooms),
+        **_edge_columns(graph, items, places),
     )
 
 
@@ -86,13 +100,29 @@ def _items(graph: spark_dsg.DynamicSceneGraph, layer: str, letter: str) -> list[
     return sorted(items, key=lambda item: item.id)
 
 
-def _is_sound(place: Item) -> bool:
-    numbers = [*place.node.attributes.position, radius_m_of(place)]
-    if (opening := opening_of(place)) is not None:
-        numbers += [*opening[0], opening[1]]
-    if (shape := ground_of(place)) is not None:
-        numbers += [*shape[0], *shape[1].ravel()]
-    return bool((np.abs(numbers) < MOST_M).all()) and radius_m_of(place) >= 0  # not a number is no less
+def _place(item: Item) -> Place | None:
+    """One place; None where its numbers are not finite, or absurd."""
+    attributes = item.node.attributes
+    position_m, radius_m = attributes.position.tolist(), radius_m_of(item)
+    opening, surface = opening_of(item), ground_of(item)
+    numbers = [*position_m, radius_m]
+    if opening is not None:
+        numbers += [*opening[0].tolist(), opening[1]]
+    if surface is not None:
+        numbers += [*surface[0], *surface[1].ravel().tolist()]
+    if radius_m < 0 or not all(abs(number) < MOST_M for number in numbers):  # not a number is no less
+        return None
+    return Place(
+        id=item.id,
+        symbol=item.node.id.value,
+        parent=signed(item.node.get_parent()) if item.node.has_parent() else NO_ROOM,
+        stamp_ns=int(attributes.last_update_time_ns) & MOST_NS,
+        position_m=position_m,
+        radius_m=radius_m,
+        basis_points=min(basis_points_of(item), MOST_BASIS_POINTS),
+        opening=opening,
+        surface=surface,
+    )
 
 
 def _object(graph: spark_dsg.DynamicSceneGraph, item: Item) -> SceneObject | None:
@@ -104,16 +134,15 @@ def _object(graph: spark_dsg.DynamicSceneGraph, item: Item) -> SceneObject | Non
     return found if bool((np.abs(corners_m) < MOST_M).all()) else None
 
 
-def _place_columns(places: list[Item], rooms: set[int]) -> dict[str, Any]:
-    parents = [signed(item.node.get_parent()) if item.node.has_parent() else NO_ROOM for item in places]
-    openings = [(place.id, *found) for place in places if (found := opening_of(place)) is not None]
-    surfaces = [(place.id, *flat) for place in places if (flat := ground_of(place)) is not None]
+def _place_columns(places: list[Place], rooms: set[int]) -> dict[str, Any]:
+    openings = [(place.id, *place.opening) for place in places if place.opening is not None]
+    surfaces = [(place.id, *place.surface) for place in places if place.surface is not None]
     return {
         "place_ids": np.array([place.id for place in places], np.int64),
-        "positions_m": np.array([place.node.attributes.position for place in places], float).reshape(-1, 3),
-        "radii_m": np.array([radius_m_of(place) for place in places], float),
-        "basis_points": np.array([min(basis_points_of(place), MOST_BASIS_POINTS) for place in places], np.int16),
-        "place_rooms": np.array([parent if parent in rooms else NO_ROOM for parent in parents], np.int64),
+        "positions_m": np.array([place.position_m for place in places], float).reshape(-1, 3),
+        "radii_m": np.array([place.radius_m for place in places], float),
+        "basis_points": np.array([place.basis_points for place in places], np.int16),
+        "place_rooms": np.array([place.parent if place.parent in rooms else NO_ROOM for place in places], np.int64),
         "frontier_ids": np.array([place for place, _, _ in openings], np.int64),
         "frontier_directions": np.array([way for _, way, _ in openings], float).reshape(-1, 3),
         "frontier_areas_m2": np.array([area_m2 for _, _, area_m2 in openings], float),
@@ -124,17 +153,18 @@ def _place_columns(places: list[Item], rooms: set[int]) -> dict[str, Any]:
     }
 
 
-def _edge_columns(graph: spark_dsg.DynamicSceneGraph, places: list[Item]) -> dict[str, Any]:
+def _edge_columns(graph: spark_dsg.DynamicSceneGraph, items: list[Item], places: list[Place]) -> dict[str, Any]:
     """Edges between places that are there. One without a usable weight is as wide as the smaller of its ends."""
-    ids = {place.node.id.value: place.id for place in places}
-    radii_m = {place.id: radius_m_of(place) for place in places}
+    ends = {place.symbol: place for place in places}
     found: dict[tuple[int, int], float] = {}
-    layer = places[0].node.layer if places else None
+    layer = items[0].node.layer if items else None
     for way in [] if layer is None else graph.get_layer(layer.layer, layer.partition).edges:
-        if way.source in ids and way.target in ids and way.source != way.target:
-            a, b = sorted((ids[way.source], ids[way.target]))
-            weight = way.info.weight if way.info.weighted else -1.0
-            found[a, b] = weight if 0 <= weight < MOST_M else min(radii_m[a], radii_m[b])
+        one, two = ends.get(way.source), ends.get(way.target)
+        if one is not None and two is not None and one is not two:
+            info = way.info
+            weight = info.weight if info.weighted else -1.0
+            pair = (one.id, two.id) if one.id < two.id else (two.id, one.id)
+            found[pair] = weight if 0 <= weight < MOST_M else min(one.radius_m, two.radius_m)
     ordered = sorted(found.items())
     return {
         "edges": np.array([pair for pair, _ in ordered], np.int64).reshape(-1, 2),
