@@ -3,6 +3,7 @@
 import asyncio
 import json
 import threading
+from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -169,11 +170,11 @@ def columns_of_nothing():
     } | {"stamp_ns": 0}
 
 
-def test_a_folder_that_is_not_there_is_one_sentence():
-    from pathlib import Path
-
+def test_a_file_that_cannot_be_written_is_one_sentence(capsys):
     with pytest.raises(ExportError, match="cannot write"):
         save(Material(home()), Path("/proc/nowhere/x.mcap"), "foxglove")
+    assert main(["foxglove", "--layout", "/proc/nowhere/layout.json"]) == 1
+    assert "cannot write /proc/nowhere/layout.json" in capsys.readouterr().err
 
 
 class Filmed(Held):
