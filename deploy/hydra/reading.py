@@ -65,7 +65,7 @@ def graph_columns(graph: spark_dsg.DynamicSceneGraph, robot: str) -> HydraGraph:
     places = [found for item in items if (found := _place(item)) is not None]
     rooms = {signed(node.id.value) for node in _nodes(graph, LAYERS.ROOMS)}
     things = [item for item in _items(graph, LAYERS.OBJECTS, OBJECT) if isinstance(item.node.attributes, SEMANTIC)]
-    objects = [found for item in things if (found := _object(graph, item)) is not None]
+    objects = [thing for item in things if (thing := _object(graph, item)) is not None]
     agents = list(_agents(graph))
     return HydraGraph(
         robot=robot,

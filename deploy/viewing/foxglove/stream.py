@@ -81,6 +81,7 @@ class Stream:
         self._notes = LogChannel(NOTES, context=context)
         self._shown: dict[str, Picture] = {}  # by topic, as sent
         self._made: dict[str, _Made] = {}  # by entity
+        self._facts: dict[str, dict[str, Any]] = {}  # by region's entity
         self._told: tuple[str, str] | None = None  # task and environment
 
     def show(self, scene: Scene, stamp_ns: int) -> None:
@@ -91,10 +92,11 @@ class Stream:
         points = by_layer.pop("places")
         if self._is_news(PLACES, points):
             self._points[PLACES].log(cloud(_dots(points), stamp_ns), log_time=stamp_ns)
-        regions = {f"regions/{region.id}": region for region in scene.regions}
+        facts = {f"regions/{region.id}": facts_of(region) for region in scene.regions}
         for layer, picture in by_layer.items():
-            if self._is_news(layer, picture):
-                self._layers[layer].log(self._update(layer, picture, regions, stamp_ns), log_time=stamp_ns)
+            if self._is_news(layer, picture) or (layer == "regions" and facts != self._facts):
+                self._layers[layer].log(self._update(layer, picture, facts, stamp_ns), log_time=stamp_ns)
+        self._facts = facts
         self._scene.log(json.dumps(figures(scene)).encode(), log_time=stamp_ns)
         if (told := (scene.task, scene.environment)) != self._told:
             self._told = told
@@ -143,19 +145,18 @@ class Stream:
         self._shown[topic] = picture
         return True
 
-    def _update(self, layer: str, picture: Picture, regions: dict[str, Region], stamp_ns: int) -> SceneUpdate:
+    def _update(self, layer: str, picture: Picture, facts: dict[str, dict[str, Any]], stamp_ns: int) -> SceneUpdate:
         """The whole layer instead of what was there; entities that look the same are made once."""
         groups: dict[str, Picture] = {}
         for name, shape in picture.items():
             groups.setdefault(_entity_of(name), {})[name] = shape
         entities = []
         for name, shapes in groups.items():
-            facts = facts_of(regions[name]) if name in regions else {}
-            kept = self._made.get(name)
-            if kept is None or kept.facts != facts or not _alike(kept.shapes, shapes):
-                about = [KeyValuePair(key=key, value=str(value)) for key, value in facts.items()]
+            told, kept = facts.get(name, {}), self._made.get(name)
+            if kept is None or kept.facts != told or not _alike(kept.shapes, shapes):
+                about = [KeyValuePair(key=key, value=str(value)) for key, value in told.items()]
                 made = entity(name, shapes.values(), self._painter.theme.ink, stamp_ns, metadata=about)
-                kept = self._made[name] = _Made(shapes, facts, made)
+                kept = self._made[name] = _Made(shapes, told, made)
             entities.append(kept.entity)
         gone = [name for name in self._made if _layer_of(name) == layer and name not in groups]
         for name in gone:

@@ -17,6 +17,7 @@ from prior_sg.deploy.errors import UserError
 from prior_sg.deploy.showing.colors import label_colors
 from prior_sg.deploy.showing.formats import ExportError, save
 from prior_sg.deploy.showing.material import Material, Moment
+from prior_sg.deploy.viewing.drawing import Painter
 from prior_sg.deploy.viewing.foxglove.layout import layout
 from prior_sg.deploy.viewing.foxglove.server import Broadcast, jpeg_of, lens_of
 from prior_sg.deploy.viewing.foxglove.stream import LAYERS
@@ -137,7 +138,8 @@ def test_the_log_that_is_read_is_not_written(log, capsys):
 
 
 def test_a_story_from_nothing_keeps_what_a_label_was_coloured(tmp_path):
-    empty = msgspec.structs.replace(home(), regions=[], place_ids=np.zeros(0, np.int64), **columns_of_nothing())
+    empty = nothing()
+    assert not any(name.startswith("/places") for name in Painter().draw(empty))
     renamed = [region(3, "bath", 0.9, (2.0, 1.5, 1.0)), *home().regions[1:]]
     later = msgspec.structs.replace(home(), regions=renamed, stamp_ns=3 * 10**9)
     path = tmp_path / "story.mcap"
@@ -151,23 +153,24 @@ def test_a_story_from_nothing_keeps_what_a_label_was_coloured(tmp_path):
     assert first["regions/3"].triangles[0].color != second["regions/3"].triangles[0].color
 
 
-def columns_of_nothing():
-    return {
-        name: getattr(home(), name)[:0]
-        for name in (
-            "positions_m",
-            "radii_m",
-            "basis_points",
-            "place_regions",
-            "posteriors",
-            "unknown",
-            "edges",
-            "clearances_m",
-            "frontier_ids",
-            "frontier_directions",
-            "frontier_areas_m2",
-        )
-    } | {"stamp_ns": 0}
+def nothing():
+    """The home before anything was seen."""
+    whole = home()
+    columns = {
+        name: getattr(whole, name)[:0]
+        for name in whole.__struct_fields__
+        if isinstance(getattr(whole, name), np.ndarray) and name != "trajectory"
+    }
+    return msgspec.structs.replace(whole, regions=[], stamp_ns=0, **columns)
+
+
+def test_what_a_region_is_said_to_be_is_told_though_it_looks_the_same(tmp_path):
+    doubted = [msgspec.structs.replace(one, unknown=0.5) for one in home().regions]
+    later = msgspec.structs.replace(home(), regions=doubted, stamp_ns=2 * 10**9)
+    save(Material(later, moments=[Moment(0, home()), Moment(1, later)]), tmp_path / "a.mcap", "foxglove")
+    updates = [update for _, update in told(tmp_path / "a.mcap")[1]["/map/regions"]]
+    facts = [{pair.key: pair.value for pair in update.entities[0].metadata} for update in updates]
+    assert [fact["unknown"] for fact in facts] == ["0.0", "0.5"]
 
 
 def test_a_file_that_cannot_be_written_is_one_sentence(capsys):
