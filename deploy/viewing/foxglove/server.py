@@ -14,6 +14,7 @@ from prior_sg.deploy.errors import UserError
 from prior_sg.deploy.viewing.foxglove.stream import Stream
 from prior_sg.deploy.viewing.sources import Camera, Source
 from prior_sg.schemas.frames import Intrinsics
+from prior_sg.services.errors import PriorSgError
 
 LOOPBACK = "127.0.0.1"  # Foxglove's protocol knows no login
 SURFACE_S = 2.0  # at least, between sendings of the coloured points
@@ -51,6 +52,7 @@ class Broadcast:
         except RuntimeError as error:
             raise UserError(f"nothing can be served on port {port} ({error}); choose another with --port") from error
         self._points, self._surface_s, self._frame = -1, 0.0, -1
+        self._stamp_ns, self._fault = 0, ""
 
     @property
     def address(self) -> str:
@@ -58,17 +60,24 @@ class Broadcast:
         return f"ws://{LOOPBACK}:{self._server.port}"
 
     def follow(self, wait_s: float) -> None:
-        """Wait so long for something new, and send what there is of it."""
+        """Wait so long for something new, and send what there is of it; what fails is noted, and tried again."""
         news = self._source.wait(wait_s)
         if self._newcomers.came.is_set():
             self._newcomers.came.clear()
             self._stream.forget()
             self._points, self._surface_s, self._frame, news = -1, 0.0, -1, True
-        if news:
-            scene = self._source.scene()
-            self._stream.show(scene, scene.stamp_ns)
-        self._send_camera()
-        self._send_surface()
+        try:
+            if news or self._fault:
+                scene = self._source.scene()
+                self._stamp_ns = scene.stamp_ns
+                self._stream.show(scene, scene.stamp_ns)
+            self._send_camera()
+            self._send_surface()
+            self._fault = ""
+        except PriorSgError as error:
+            if str(error) != self._fault:
+                self._stream.note(str(error), self._stamp_ns)
+            self._fault = str(error)
 
     def _send_camera(self) -> None:
         camera = self._source.camera()
@@ -78,10 +87,9 @@ class Broadcast:
 
     def _send_surface(self) -> None:
         points, now_s = len(self._source.cloud), time.monotonic()
-        if points != self._points and now_s - self._surface_s >= SURFACE_S:
+        if points != self._points and self._stamp_ns and now_s - self._surface_s >= SURFACE_S:
             self._points, self._surface_s = points, now_s
-            stamps = self._source.stamps()
-            self._stream.surface(self._source.cloud.picture(), stamps[-1] if stamps else 0)
+            self._stream.surface(self._source.cloud.picture(), self._stamp_ns)
 
     def close(self) -> None:
         """End all connections."""

@@ -23,6 +23,7 @@ from prior_sg.deploy.viewing.foxglove.server import Broadcast, jpeg_of, lens_of
 from prior_sg.deploy.viewing.foxglove.stream import LAYERS
 from prior_sg.deploy.viewing.held import Held
 from prior_sg.deploy.viewing.recorded import camera_of
+from prior_sg.services.runtime.bus import BusError
 from tests.deploy.viewing.test_recorded import log as recorded_log
 from tests.help.homes import home, keyframe, region
 
@@ -232,6 +233,33 @@ def test_a_client_that_comes_late_gets_everything():
         stop.set()
         serving.join()
         broadcast.close()
+
+
+class Gone(Held):
+    """Whose store does not answer, until it does."""
+
+    silent = True
+
+    def scene(self, moment=None):
+        if self.silent:
+            raise BusError("nobody answers")
+        return super().scene(moment)
+
+
+def test_a_store_that_does_not_answer_is_noted_once_and_asked_again(monkeypatch):
+    source, notes, shown = Gone(home()), [], []
+    broadcast = Broadcast(source, 0)
+    monkeypatch.setattr(broadcast._stream, "note", lambda text, stamp_ns: notes.append(text))
+    monkeypatch.setattr(broadcast._stream, "show", lambda scene, stamp_ns: shown.append(stamp_ns))
+    source.put(home())
+    broadcast.follow(0.0)
+    broadcast.follow(0.0)
+    assert (notes, shown) == (["nobody answers"], [])
+    source.silent = False
+    broadcast.follow(0.0)
+    broadcast.follow(0.0)
+    broadcast.close()
+    assert (notes, shown) == (["nobody answers"], [10**9])
 
 
 def test_a_smaller_image_has_a_smaller_lens():
