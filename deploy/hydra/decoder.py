@@ -42,7 +42,7 @@ class Decoder:
         return decode(HydraGraph, columns)
 
     def _start_again(self) -> None:
-        for process in list(self._pool._processes.values()):
+        for process in list((self._pool._processes or {}).values()):
             process.kill()
         self._pool.shutdown(wait=False, cancel_futures=True)
         self._pool = _pool()
