@@ -80,6 +80,13 @@ def view() -> tuple[dict, dict]:
     return view_bench()
 
 
+def hydra() -> tuple[dict, dict]:
+    """The bridge to Hydra; see `prior_sg.deploy.benches.hydra`."""
+    from prior_sg.deploy.benches.hydra import hydra_bench  # needs the extra `hydra`
+
+    return hydra_bench()
+
+
 def e2e() -> tuple[dict, dict]:
     """Keyframe in hand → region delta that follows from it, encoder time excluded, without transport."""
     keyframes = _sample_keyframes()
@@ -122,6 +129,7 @@ LONG: dict[str, Callable[[float], tuple[dict, dict]]] = {  # no part of `all`; t
     "pool": attacked_pool,
     "store_crashes": lambda seconds: crashes(),
     "view": lambda seconds: view(),  # needs an extra and a browser
+    "hydra": lambda seconds: hydra(),  # needs an extra
 }
 
 

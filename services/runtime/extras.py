@@ -27,14 +27,18 @@ MODULES = {  # by extra; what the build file lists there, by the names that code
     "mcp": ("mcp",),
     "view": ("viser",),
     "rerun": ("rerun",),
+    "foxglove": ("foxglove",),
     "ros": ("rosbags",),
+    "hydra": ("zmq", "spark_dsg"),
 }
 CONTAINS = {
     "view": ("map",),
     "encode": ("map",),
     "clip": ("encode", "map"),
     "export": ("clip", "encode", "map"),
+    "foxglove": ("map",),
     "ros": ("map",),
+    "hydra": ("map",),
 }
 
 
