@@ -72,8 +72,11 @@ def transforms_of(message: Any) -> Iterator[Stamped]:
 class Track:
     """One transform over time, interpolated between its stamps."""
 
-    def __init__(self, samples: Sequence[Stamped], fixed: bool = False) -> None:
-        """`fixed`: it holds at all times; so does one that never changes. Of equal stamps the last counts."""
+    def __init__(self, samples: Sequence[Stamped], fixed: bool = False, moves: bool = False) -> None:
+        """`fixed`: it holds at all times; so does one that never changes, unless it is said that it `moves`.
+
+        Of equal stamps the last counts.
+        """
         by_stamp = {sample.stamp_ns: sample for sample in samples if sample.is_motion()}
         ordered = [by_stamp[stamp] for stamp in sorted(by_stamp)]
         self.stamps_ns = np.array([sample.stamp_ns for sample in ordered], np.int64)
@@ -81,7 +84,7 @@ class Track:
         turns = np.array([sample.quaternion_xyzw for sample in ordered], np.float64).reshape(-1, 4)
         self.quaternions_xyzw = turns / np.linalg.norm(turns, axis=1, keepdims=True)
         still = len(ordered) > 1 and bool((np.ptp(np.hstack((self.positions_m, turns)), axis=0) == 0).all())
-        self.fixed = bool(ordered) and (fixed or still)
+        self.fixed = bool(ordered) and (fixed or (still and not moves))
 
     def at(self, stamp_ns: int, within_ns: int) -> np.ndarray:
         """parent_from_child (4, 4); before the first and after the last stamp at most `within_ns` away.
@@ -132,10 +135,17 @@ class TransformTree:
                 parents = edges[sample.child]
                 if always or not any(fixed_one for _, fixed_one in parents.values()):
                     parents.setdefault(sample.parent, ([], always))[0].append(sample)
-        self._edges = {
+        self._edges: dict[str, dict[str, Track]] = {
             child: {parent: Track(samples, always) for parent, (samples, always) in parents.items()}
             for child, parents in edges.items()
         }
+
+    @classmethod
+    def of_tracks(cls, tracks: dict[str, dict[str, Track]]) -> "TransformTree":
+        """The tree whose transforms are these, by child and parent."""
+        tree = cls()
+        tree._edges = tracks
+        return tree
 
     def ancestors(self, frame: str) -> list[str]:
         """The frame, its parent, and so on to the root. Raises PoseError for a loop and for two parents."""
