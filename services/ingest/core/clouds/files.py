@@ -6,6 +6,7 @@ import re
 import numpy as np
 
 from prior_sg.services.ingest.core.clouds.sweep import CloudError
+from prior_sg.services.ingest.core.pixels import NPY_FAULTS
 
 ENDINGS = (".npy", ".pcd", ".ply", ".bin")
 PCD_TYPES = {"F": "f", "I": "i", "U": "u"}
@@ -27,7 +28,7 @@ def columns_of(data: bytes, ending: str) -> dict[str, np.ndarray]:
         return read(data)
     except CloudError:
         raise
-    except (ValueError, TypeError, KeyError, IndexError, EOFError, OverflowError) as error:
+    except (*NPY_FAULTS, KeyError, IndexError, StopIteration) as error:
         raise CloudError(f"it is damaged: {str(error)[:100]}") from error
 
 

@@ -11,7 +11,7 @@ TIMES = ("t", "time", "timestamp", "timestamps", "offset_time", "time_offset", "
 NEAREST_M = 0.1  # drivers write zeros where nothing came back, and see their own mount
 SLICE_NS = 1_000_000  # within which the sensor is taken to stand still
 LONGEST_NS = 1_000_000_000  # a sweep; longer offsets are no offsets
-DATES = ((1e8, 1e9), (1e11, 1e6), (1e14, 1e3), (1e17, 1.0))  # times from here on are dates, and ns per unit then
+DATES = ((1e17, 1), (1e14, 10**3), (1e11, 10**6), (1e8, 10**9))  # times from here on are dates of so many ns per unit
 
 
 class CloudError(ValueError):
@@ -48,13 +48,14 @@ def _offsets_ns(times: np.ndarray, stamp_ns: int) -> np.ndarray | None:
         return None
     if not np.isfinite(times.astype(np.float64)).all():
         raise CloudError("its points have times that are no numbers")
+    whole = times.dtype.kind in "iu"
     largest = float(np.abs(times.astype(np.float64)).max())
-    dated = next((factor for least, factor in reversed(DATES) if largest >= least), None)
-    if dated is not None and not (times.dtype.kind in "iu" and largest < LONGEST_NS):
-        whole = times.astype(np.int64) if times.dtype.kind in "iu" else np.rint(times.astype(np.longdouble) * dated)
-        offsets = (whole * int(dated) if times.dtype.kind in "iu" else whole.astype(np.int64)) - stamp_ns
+    dated = 0 if whole and largest < LONGEST_NS else next((ns for least, ns in DATES if largest >= least), 0)
+    if whole:
+        offsets = times.astype(np.int64) * (dated or 1)
     else:
-        offsets = np.rint(times.astype(np.float64) * (1.0 if times.dtype.kind in "iu" else 1e9)).astype(np.int64)
+        offsets = np.rint(times.astype(np.longdouble) * (dated or 10**9)).astype(np.int64)
+    offsets -= stamp_ns if dated else 0
     if np.abs(offsets).max() > LONGEST_NS:
         raise CloudError(f"its points were measured up to {np.abs(offsets).max() / 1e9:.3g} s from its stamp")
     return offsets

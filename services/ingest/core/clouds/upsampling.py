@@ -1,44 +1,53 @@
-"""Depth images from sparse points, guided by the picture (pure).
+"""Depth images from sparse points, along the surfaces they lie on and the edges of the picture (pure).
 
-Each pixel gets the inverse depth of the plane through the points around it, weighted by how far one walks to them
-through the picture: a step across an edge is long. The walk is the domain transform of Gastal and Oliveira 2011 ("Domain
-transform for edge-aware image and video processing", equations 11 and 21, recursive form), the weights normalised by
-those of the measured pixels, as joint bilateral upsampling does (Kopf et al. 2007, equation 4). A plane, because inverse
-depth is linear in the image on every flat surface: with a plain average floors become stairs between two rings.
+First the points are joined to triangles (Delaunay's, in the image), which are drawn as the flat pieces they are; none are
+drawn across a jump in depth. What is left lies at jumps and margins, and goes to the side it looks like: each pixel there
+gets the inverse depth of the plane through what is known around it, weighted by how far one walks to it through the
+picture, where a step across an edge is long. The walk is the domain transform of Gastal and Oliveira 2011 ("Domain
+transform for edge-aware image and video processing", equations 11 and 21, recursive form), the weights normalised by those
+of the measured pixels, as in joint bilateral upsampling (Kopf et al. 2007, equation 4). Planes, as inverse depth is linear
+in the image on every flat surface: a plain average makes stairs of a floor between two rings.
 """
 
 import cv2
 import numpy as np
+from scipy.spatial import Delaunay, QhullError
 
 from prior_sg.schemas.frames import Intrinsics
 from prior_sg.services.compiled import compiled
 from prior_sg.services.geometry import project
+from prior_sg.services.ingest.core.lidar import draw_triangles
 
 NEAR_M = 0.2  # nothing nearer to the camera is drawn
-HIDDEN = 0.1  # a point this share behind its neighbours is seen past an edge by the lidar, not by the camera
+HIDDEN = 0.1  # a point this share behind its neighbours on two sides is seen through them
+MAX_STEP = 0.2  # neighbours whose depths differ by more than this share lie on two surfaces; rings are far apart
 EDGE = 20.0  # difference of grey levels that is as long as one spread in pixels
 PASSES = 3
 GAP_QUANTILE = 0.95
 REACH = 1.25  # no depth farther from a point than this many half gaps
-FLAT = 0.1  # most of inverse depth that the points around a pixel may lie off their plane
+FLAT = 0.1  # most of its inverse depth that what is known around a pixel may lie off the plane
 STIFF = 0.05  # pulls planes level that too few directions hold; in spreads squared
+FAR_M = 1e9
 
 
-def upsampled(points_camera: np.ndarray, camera: Intrinsics, guide: np.ndarray) -> np.ndarray:
+def upsampled(points_camera: np.ndarray, camera: Intrinsics, picture: np.ndarray | None) -> np.ndarray:
     """Depth (h, w), metres, 0 = no measurement, of points (n, 3) in the camera's frame.
 
-    `guide` (h, w) or (h, w, 3) uint8 is what the camera saw. Pixels that lie farther from all points than the points lie
-    from each other, or between surfaces, stay empty.
+    `picture` (h, w) or (h, w, 3) uint8 is what the camera saw; without one only surfaces are drawn. Pixels that lie farther
+    from all points than the points lie from each other, or that could be of two surfaces, stay empty.
     """
-    sparse = splatted(points_camera, camera)
-    measured = sparse > 0
-    if not measured.any():
-        return sparse
-    away_px = cv2.distanceTransform((~measured).astype(np.uint8), cv2.DIST_L2, 5)
-    half_gap_px = max(1.0, float(np.quantile(away_px[_hull(measured)], GAP_QUANTILE)))
-    plane, off = _planes(np.divide(1.0, sparse, out=np.zeros_like(sparse), where=measured), measured, guide, half_gap_px)
-    kept = (away_px <= REACH * half_gap_px) & (plane > 0) & (off <= FLAT * plane)
-    return np.divide(1.0, plane, out=np.zeros_like(plane), where=kept)
+    points = splatted(points_camera, camera)
+    if not points.any():
+        return points
+    depth_m = _surfaces(points)
+    if picture is None:
+        return depth_m
+    away_px = cv2.distanceTransform((points == 0).astype(np.uint8), cv2.DIST_L2, 5)
+    half_gap_px = max(1.0, float(np.quantile(away_px[_hull(points > 0)], GAP_QUANTILE)))
+    plane, off = _planes(depth_m, picture, half_gap_px)
+    filled = (depth_m == 0) & (away_px <= REACH * half_gap_px) & (plane > 0) & (off <= FLAT * plane)
+    depth_m[filled] = 1.0 / plane[filled]
+    return depth_m
 
 
 def splatted(points_camera: np.ndarray, camera: Intrinsics) -> np.ndarray:
@@ -48,30 +57,35 @@ def splatted(points_camera: np.ndarray, camera: Intrinsics) -> np.ndarray:
     pixels, depths_m = project(points, camera)
     u, v = np.rint(pixels).astype(np.int64).T
     seen = (u >= 0) & (u < camera.width_px) & (v >= 0) & (v < camera.height_px)
-    image = np.full((camera.height_px, camera.width_px), np.inf)
+    image = np.full((camera.height_px, camera.width_px), FAR_M)
     np.minimum.at(image, (v[seen], u[seen]), depths_m[seen])
-    return _without_hidden(image)
+    return np.where(image < FAR_M, np.where(_hidden(image), 0.0, image), 0.0)
 
 
-def _without_hidden(image: np.ndarray) -> np.ndarray:
-    """Points behind a neighbour on both of two opposite sides are seen through gaps between nearer ones."""
-    count = int(np.isfinite(image).sum())
-    side = 2 * round(np.sqrt(image.size / max(count, 1))) + 1
-    nearest = cv2.erode(np.where(np.isfinite(image), image, 1e9), np.ones((side, side)))
-    farther = np.isfinite(image) & (image > (1 + HIDDEN) * nearest)
-    halves = [cv2.erode(np.where(np.isfinite(image), image, 1e9), _half(side, way)) for way in range(4)]
-    behind = [np.where(np.isfinite(image), image, 0) > (1 + HIDDEN) * half for half in halves]
-    hidden = farther & ((behind[0] & behind[1]) | (behind[2] & behind[3]))
-    return np.where(np.isfinite(image) & ~hidden, image, 0.0)
+def _hidden(image: np.ndarray) -> np.ndarray:
+    """Points with nearer ones on two opposite sides: the lidar, which is elsewhere, saw them past these."""
+    side = round(np.sqrt(image.size / max(int((image < FAR_M).sum()), 1)))
+    before, after, whole = slice(None, side), slice(side + 1, None), slice(None)
+    behind = []
+    for part in ((before, whole), (after, whole), (whole, before), (whole, after)):
+        window = np.zeros((2 * side + 1, 2 * side + 1), np.uint8)
+        window[part] = 1
+        behind.append(
+            image > (1 + HIDDEN) * cv2.erode(image, window, borderType=cv2.BORDER_CONSTANT, borderValue=FAR_M)
+        )
+    return (behind[0] & behind[1]) | (behind[2] & behind[3])
 
 
-def _half(side: int, way: int) -> np.ndarray:
-    """The left, right, upper or lower half of a square window."""
-    window = np.zeros((side, side), np.uint8)
-    middle = side // 2
-    window[(slice(None), slice(None, middle)) if way == 0 else (slice(None), slice(middle + 1, None)) if way == 1 else
-           (slice(None, middle),) if way == 2 else (slice(middle + 1, None),)] = 1
-    return window
+def _surfaces(points: np.ndarray) -> np.ndarray:
+    """Depth (h, w) of the triangles between the pixels that have one, and of these."""
+    v, u = np.nonzero(points)
+    try:
+        corners = Delaunay(np.stack((u, v), axis=1)).simplices.astype(np.int64)
+    except QhullError:  # too few points, or all on one line
+        return points.copy()
+    inverse = np.zeros_like(points)
+    draw_triangles(corners, u.astype(np.float64), v.astype(np.float64), points[v, u], inverse, NEAR_M, MAX_STEP)
+    return np.divide(1.0, inverse, out=points.copy(), where=inverse > 0)
 
 
 def _hull(measured: np.ndarray) -> np.ndarray:
@@ -82,24 +96,29 @@ def _hull(measured: np.ndarray) -> np.ndarray:
     return hull.astype(bool)
 
 
-def _planes(inverse: np.ndarray, measured: np.ndarray, guide: np.ndarray, spread_px: float):
-    """Inverse depth (h, w) of the plane around each pixel, and how far the points lie off it."""
-    v, u = np.indices(inverse.shape) / spread_px
-    moments = (np.ones_like(u), u, v, u * u, u * v, v * v, inverse, inverse * u, inverse * v, inverse * inverse)
-    sums = np.stack(moments, axis=-1) * measured[..., None]
-    across, down = _steps(guide, spread_px)
+def _planes(depth_m: np.ndarray, picture: np.ndarray, spread_px: float) -> tuple[np.ndarray, np.ndarray]:
+    """Inverse depth (h, w) of the plane around each pixel, and how far what is known lies off it."""
+    height, width = depth_m.shape
+    v, u = np.indices(depth_m.shape, dtype=np.float32)
+    u, v = (u - width / 2) / np.float32(spread_px), (v - height / 2) / np.float32(spread_px)
+    known = (depth_m > 0).astype(np.float32)
+    w = np.divide(1.0, depth_m, out=np.zeros(depth_m.shape, np.float32), where=depth_m > 0)
+    sums = np.stack(
+        (known, u * known, v * known, u * u * known, u * v * known, v * v * known, w, w * u, w * v, w * w), -1
+    )
+    across, down = _steps(picture, spread_px)
     for number in range(PASSES):
         share = np.sqrt(3.0) * 2 ** (PASSES - number - 1) / np.sqrt(4.0**PASSES - 1)
-        decay = np.exp(-np.sqrt(2.0) / (spread_px * share))
+        decay = np.float32(np.exp(-np.sqrt(2.0) / (spread_px * share)))
         _walk(sums, decay**across)
         _walk(sums.transpose(1, 0, 2), (decay**down).T)
     return _fit(sums, u, v)
 
 
-def _steps(guide: np.ndarray, spread_px: float) -> tuple[np.ndarray, np.ndarray]:
+def _steps(picture: np.ndarray, spread_px: float) -> tuple[np.ndarray, np.ndarray]:
     """How long the step to each pixel is from the one on its left (h, w), and from the one above it."""
-    levels = guide.reshape(*guide.shape[:2], -1).astype(np.float64)
-    across, down = np.ones(guide.shape[:2]), np.ones(guide.shape[:2])
+    levels = picture.reshape(*picture.shape[:2], -1).astype(np.float32)
+    across, down = np.ones(picture.shape[:2], np.float32), np.ones(picture.shape[:2], np.float32)
     across[:, 1:] += spread_px / EDGE * np.abs(np.diff(levels, axis=1)).mean(axis=-1)
     down[1:] += spread_px / EDGE * np.abs(np.diff(levels, axis=0)).mean(axis=-1)
     return across, down
@@ -120,9 +139,8 @@ def _walk(sums, feedback):  # noqa: ANN001, ANN202
 
 def _fit(sums: np.ndarray, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The weighted plane's value at each pixel, and the standard deviation from it."""
-    weight = sums[..., 0]
     with np.errstate(divide="ignore", invalid="ignore"):
-        mu, mv, muu, muv, mvv, mw, muw, mvw, mww = np.moveaxis(sums[..., 1:] / weight[..., None], -1, 0)
+        mu, mv, muu, muv, mvv, mw, muw, mvw, mww = np.moveaxis(sums[..., 1:] / sums[..., :1], -1, 0)
         cuu, cuv, cvv = muu - mu * mu + STIFF, muv - mu * mv, mvv - mv * mv + STIFF
         cuw, cvw = muw - mu * mw, mvw - mv * mw
         determinant = cuu * cvv - cuv * cuv
