@@ -30,7 +30,7 @@ def add_commands(commands: Commands) -> None:
         needs="map",
     )
     up.add_argument("services", nargs="*", help="services to start; default: all")
-    up.add_argument("--source", default="", help="what ingest reads; default: nothing")
+    up.add_argument("--source", default="", help="what ingest reads, ros2:/ for a robot; default: nothing")
     up.add_argument("--out", type=Path, default=Path("out/up"), help="folder for the database and logs")
     up.add_argument("--no-router", action="store_true", help="use the router at --connect instead of starting one")
     add_router(up)
@@ -91,6 +91,7 @@ def _stay_up(arguments: argparse.Namespace, names: list[str]) -> int:
     from prior_sg.deploy.running.job import require_files
     from prior_sg.deploy.running.supervisor import Supervisor
     from prior_sg.deploy.settings import check_settings
+    from prior_sg.services.ingest.core.options import is_live
     from prior_sg.services.registry import BY_NAME
     from prior_sg.services.runtime.zenoh_bus import open_router
 
@@ -102,7 +103,8 @@ def _stay_up(arguments: argparse.Namespace, names: list[str]) -> int:
         raise UserError("--listen and --join are of the router that `up` starts; leave out --no-router")
     settings = [f"scene_store.path={arguments.out / 'scene.sqlite'}", f"ingest.speed={arguments.speed}"]
     if arguments.source:
-        before_start(arguments.source, read_options(arguments), console)
+        if not is_live(arguments.source):  # a robot may come later, through the router that is started here
+            before_start(arguments.source, read_options(arguments), console)
         settings.append(f"ingest.source={arguments.source}")
     settings += settings_of(arguments)
     check_settings(arguments.config, settings)

@@ -82,6 +82,8 @@ OPTIONS = (
     Option(
         "--sync-tolerance", "sync_tolerance_s", "SECONDS", "most between stamps of one frame's colour, depth and pose"
     ),
+    Option("--domain", "ros_domain", "ID", "ROS_DOMAIN_ID of a live robot (default: 0)"),
+    Option("--end-after", "end_after_s", "SECONDS", "without a frame, a live source has ended (default: 30; 0: never)"),
     Option("--clock", "clock", "CLOCK", "stamps of a ROS recording: of its", choices=("header", "received")),
 )
 

@@ -1,6 +1,5 @@
 """Recordings of ROS, opened with rosbags: what they hold, and single messages of them."""
 
-import struct
 import weakref
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -11,7 +10,7 @@ from typing import Any
 from prior_sg.services.ingest.core.ros import topics as ros_topics
 from prior_sg.services.ingest.core.ros.images import encoding_of, shown_by
 from prior_sg.services.ingest.core.ros.topics import Topic
-from prior_sg.services.ingest.core.ros.transforms import frame_name
+from prior_sg.services.ingest.core.ros.transforms import frame_name, written_stamp_ns
 from prior_sg.services.ingest.sources.base import FrameError
 from prior_sg.services.ingest.sources.tables import SourceError
 from prior_sg.services.runtime import extras
@@ -121,13 +120,9 @@ class Bag:
     def stamp_ns(self, data: bytes) -> int:
         """The stamp of a message that begins with a header. Raises FrameError."""
         try:
-            if self.is_ros1:
-                seconds, rest = struct.unpack_from("<II", data, 4)
-            else:
-                seconds, rest = struct.unpack_from("<iI" if data[1] & 1 else ">iI", data, 4)
-        except (struct.error, IndexError) as error:
-            raise FrameError("a message has no header") from error
-        return seconds * 1_000_000_000 + rest
+            return written_stamp_ns(data, self.is_ros1)
+        except ValueError as error:
+            raise FrameError(str(error)) from error
 
     def _topic(self, name: str) -> Topic:
         connections = self._connections[name]

@@ -27,20 +27,31 @@ class Types:
         """Define a message as a .msg file does."""
         from rosbags.typesys import get_types_from_msg
 
-        self.store.register(_as_named(get_types_from_msg(text, name)))
+        self.store.register(get_types_from_msg(text, name))
 
     def add_service(self, name: str, request: str, reply: str) -> None:
         """Define a service as a .srv file does, by the halves before and after ---."""
-        self.add_message(f"{name}_Request", request)
-        self.add_message(f"{name}_Response", reply)
-        halves = f"{name}_Request[<=1] request\n{name}_Response[<=1] response\n"
-        self.add_message(f"{name}_Event", f"{SERVICE_EVENT} info\n{halves}")
-        whole = f"{name}_Request request_message\n{name}_Response response_message\n{name}_Event event_message\n"
-        self.add_message(name, whole)
+        from rosbags.typesys import get_types_from_msg
+
+        as_message = name.replace("/srv/", "/msg/")  # rosbags knows no others, and looks beside it for short names
+        parts = {f"{as_message}{end}": f"{name}{end}" for end in ("_Request", "_Response", "_Event", "")}
+        asked, answered, told, _ = parts
+        texts = (
+            request,
+            reply,
+            f"{SERVICE_EVENT} info\n{asked}[<=1] request\n{answered}[<=1] response\n",
+            f"{asked} request_message\n{answered} response_message\n{told} event_message\n",
+        )
+        for part, text in zip(parts, texts, strict=True):
+            self.store.register(_renamed(get_types_from_msg(text, part), parts))
+
+    def knows(self, name: str) -> bool:
+        """Whether a type is defined here."""
+        return name in self.store.fielddefs
 
     def hash(self, name: str) -> str:
         """RIHS01_… of a message or service. Raises WireError."""
-        if name not in self.store.fielddefs:
+        if not self.knows(name):
             raise WireError(f"the type {name[:60]!r} is not known here")
         return str(self.store.hash_rihs01(name))
 
@@ -61,13 +72,13 @@ class Types:
             raise WireError(f"its {len(data)} bytes are no {name}: {said}") from error
 
 
-def _as_named(parsed: Any) -> Any:
-    """Definitions by ROS's own names: rosbags takes a part of a service for a message of the package pkg/srv."""
+def _renamed(parsed: Any, names: dict[str, str]) -> Any:
+    """Definitions as rosbags parses them, with other names of types."""
     if isinstance(parsed, dict):
-        return {_as_named(name): _as_named(fields) for name, fields in parsed.items()}
-    if isinstance(parsed, (list, tuple)):
-        return type(parsed)(map(_as_named, parsed))
-    return parsed.replace("/srv/msg/", "/srv/") if isinstance(parsed, str) else parsed
+        return {_renamed(name, names): _renamed(fields, names) for name, fields in parsed.items()}
+    if isinstance(parsed, list | tuple):
+        return type(parsed)(_renamed(part, names) for part in parsed)
+    return names.get(parsed, parsed) if isinstance(parsed, str) else parsed
 
 
 @cache

@@ -124,9 +124,8 @@ def test_two_nodes_talk_find_each_other_and_remember_latched_messages(endpoint):
         for channel in (latched, CHATTER):
             listener.subscribe(channel, heard.append, lambda *fault: faults.append(fault))
         wait_for(lambda: {types.decode(m.payload, CHATTER.type).data for m in heard} == {"first", "house"})
-        chatting.publish(said("hello"))
-        wait_for(lambda: "/chatter" in {m.topic for m in heard})
-        assert heard[-1].attachment.sequence == 1 and abs(heard[-1].attachment.sent_ns - heard[-1].received_ns) < 10e9
+        wait_for(lambda: chatting.publish(said("hello")) or "/chatter" in {message.topic for message in heard})
+        assert heard[-1].attachment.sequence >= 1 and abs(heard[-1].attachment.sent_ns - heard[-1].received_ns) < 10e9
         client = listener.client(adding)
         request = types.encode(types.make("example_interfaces/srv/AddTwoInts_Request", 40, 2))
         reply = types.decode(client.call(request), "example_interfaces/srv/AddTwoInts_Response")

@@ -20,6 +20,7 @@ class Way:
     topic: str = ""  # of poses
     body: str = ""  # the frame whose poses the topic has
     said: str = ""  # one phrase
+    drifting: str = ""  # the frame below the world that a SLAM corrects; empty = none
 
     def at(self, tree: TransformTree, track: Track, stamp_ns: int, within_ns: int) -> np.ndarray:
         """world_from_camera (4, 4) at a stamp; `track` is of the topic's poses. Raises PoseError."""
@@ -43,7 +44,8 @@ def way_of(
         if options.fixed_frame and not tree.connects(options.fixed_frame, camera):
             raise PoseError(f"tf does not connect {camera} with {fixed}, which is asked for")
         if fixed:
-            return Way(camera, fixed=fixed, said=f"poses of {camera} in {fixed}")
+            said = f"poses of {camera} in {fixed}"
+            return Way(camera, fixed=fixed, said=said, drifting=_drifting(tree, camera, fixed))
     if not posing:
         where = tree.ancestors(camera)[-1]
         raise PoseError(
@@ -68,3 +70,12 @@ def _of_topic(camera: str, tree: TransformTree, options: ReadOptions, topic: Top
         )
     said = f"poses of {topic.name} ({topic.type.rpartition('/')[2]} of {body or 'the camera'})"
     return Way(camera, topic=topic.name, body=body, said=said)
+
+
+def _drifting(tree: TransformTree, camera: str, fixed: str) -> str:
+    """The frame right below the world, where the camera moves in it too: odom below map (REP 105)."""
+    chain = tree.ancestors(camera)
+    if fixed not in chain[1:]:
+        return ""
+    below = chain[chain.index(fixed) - 1]
+    return below if tree.moves(below, camera) else ""

@@ -4,6 +4,7 @@ A transform `parent_from_child` places a frame in its parent; stamps are nanosec
 """
 
 import math
+import struct
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -33,6 +34,18 @@ def stamp_ns_of(header: Any) -> int:
     return int(seconds) * 1_000_000_000 + int(rest)
 
 
+def written_stamp_ns(data: bytes, ros1: bool = False) -> int:
+    """The stamp of a message, as bytes, that begins with a header. Raises ValueError with one sentence."""
+    try:
+        if ros1:
+            seconds, rest = struct.unpack_from("<II", data, 4)
+        else:
+            seconds, rest = struct.unpack_from("<iI" if data[1] & 1 else ">iI", data, 4)
+    except (struct.error, IndexError) as error:
+        raise ValueError("a message has no header") from error
+    return int(seconds) * 1_000_000_000 + int(rest)
+
+
 @dataclass(frozen=True)
 class Stamped:
     """A transform as a message says it."""
@@ -47,6 +60,11 @@ class Stamped:
         """Whether the numbers are finite and the quaternion is one of a rotation, if not normalised."""
         length = math.hypot(*self.quaternion_xyzw)
         return bool(np.isfinite(self.position_m).all()) and 1 / LONGEST_QUATERNION < length < LONGEST_QUATERNION
+
+    def matrix(self) -> np.ndarray:
+        """parent_from_child (4, 4) of a motion."""
+        turn = np.array(self.quaternion_xyzw)
+        return pose_from_quaternion(np.array(self.position_m), turn / np.linalg.norm(turn))
 
 
 def transforms_of(message: Any) -> Iterator[Stamped]:
