@@ -6,7 +6,6 @@ import numpy as np
 
 from prior_sg.services.ingest.core.clouds.sweep import CloudError
 
-POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
 KINDS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}  # of PointField
 MOST_POINTS = 1 << 25
 

@@ -9,7 +9,7 @@ lidar.json                       {"camera": {"width": …, "height": …, "fx": 
 poses.txt                        (any name and format of a list with stamps) world_from_body, the lidar's own where
                                  body_from_lidar is left out; at any rate, as it is interpolated
 
-Each picture gets the sweep nearest in time. Points go to where the lidar was when each was measured, then into the camera
+Each picture gets the sweep nearest in time, each sweep one picture. Points go to where the lidar was when each was measured, then into the camera
 at the picture's stamp, and are upsampled along the picture's edges (core/clouds/upsampling.py). World z up.
 """
 
@@ -102,11 +102,10 @@ def _drawn(
     def world_from_camera(stamp_ns: int) -> np.ndarray:
         return lidar.world_from_lidar(stamp_ns) @ inverse(camera_from_lidar)
 
-    drawing, within_ns = Drawing.of(lidar, camera, world_from_camera), lidar.within_ns()
+    drawing = Drawing.of(lidar, camera, world_from_camera)
     entries = [
-        Entry(number, stamp, partial(world_from_camera, stamp), partial(_images, drawing, file, stamp))
-        for number, (file, stamp) in enumerate(zip(files, stamps, strict=True))
-        if abs(lidar.stamps_ns[lidar.nearest(stamp)] - stamp) <= within_ns
+        Entry(i, stamps[i], partial(world_from_camera, stamps[i]), partial(_images, drawing, files[i], stamps[i], j))
+        for i, j in lidar.partners(stamps)
     ]
     if not entries:
         away_s = (lidar.stamps_ns[0] - stamps[0]) / 1e9
@@ -114,8 +113,8 @@ def _drawn(
     return entries
 
 
-def _images(drawing: Drawing, file: Path, stamp_ns: int) -> Images:
-    return drawing(read_bytes(file), stamp_ns)
+def _images(drawing: Drawing, file: Path, stamp_ns: int, position: int) -> Images:
+    return drawing(read_bytes(file), stamp_ns, position)
 
 
 def _sweep(files: list[Path], stamps: list[int], position: int) -> Sweep:

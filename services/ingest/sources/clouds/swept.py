@@ -11,6 +11,7 @@ from prior_sg.services.geometry import inverse, transform
 from prior_sg.services.ingest.core.clouds.sweep import CloudError, Sweep, in_world
 from prior_sg.services.ingest.core.clouds.upsampling import upsampled
 from prior_sg.services.ingest.core.clouds.views import VIEW, lidar_from_views, looked_at, seen
+from prior_sg.services.ingest.core.pairing import associate
 from prior_sg.services.ingest.core.pixels import encoded
 from prior_sg.services.ingest.core.poses import PoseError
 from prior_sg.services.ingest.sources.base import Camera, Entry, FrameError, Images, SourceError, color_pixels
@@ -41,16 +42,11 @@ class Lidar:
             self._last = position, points
         return self._last[1]
 
-    def nearest(self, stamp_ns: int) -> int:
-        """Position of the sweep that is nearest in time."""
-        right = int(np.searchsorted(self.stamps_ns, stamp_ns))
-        near = range(len(self.stamps_ns))[max(0, right - 1) : right + 1]
-        return min(near, key=lambda i: abs(self.stamps_ns[i] - stamp_ns))
-
-    def within_ns(self) -> int:
-        """How far from its own stamp a sweep still serves: it was under way then, or the one before."""
+    def partners(self, stamps_ns: Sequence[int]) -> list[tuple[int, int]]:
+        """Positions of pictures, by their stamps, and of the sweep that was under way then or next; each used once."""
         steps = np.diff(self.stamps_ns)
-        return round(float(np.median(steps))) if len(steps) else USUAL_PERIOD_NS
+        within_ns = round(float(np.median(steps))) if len(steps) else USUAL_PERIOD_NS
+        return sorted(associate(stamps_ns, self.stamps_ns, within_ns).items())
 
 
 @dataclass(frozen=True)
@@ -67,8 +63,8 @@ class Drawing:
         """With what straightens the camera's lens."""
         return Drawing(lidar, camera, world_from_camera, straight_maps(camera))
 
-    def __call__(self, file: bytes, stamp_ns: int) -> Images:
-        """Colour and depth of an image file. Raises FrameError and PoseError."""
+    def __call__(self, file: bytes, stamp_ns: int, position: int) -> Images:
+        """Colour of an image file, and depth of a sweep. Raises FrameError and PoseError."""
         picture, of = color_pixels(file), self.camera.intrinsics
         if picture.shape[:2] != (of.height_px, of.width_px):
             raise FrameError(
@@ -78,7 +74,7 @@ class Drawing:
         if self.maps is not None:
             picture = cv2.remap(picture, *self.maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
             file = encoded(picture, ".png")
-        points_world = self.lidar.points_world(self.lidar.nearest(stamp_ns))
+        points_world = self.lidar.points_world(position)
         points_camera = transform(inverse(self.world_from_camera(stamp_ns)), points_world)
         return Images(file, upsampled(points_camera, of, picture))
 
