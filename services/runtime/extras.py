@@ -28,6 +28,7 @@ MODULES = {  # by extra; what the build file lists there, by the names that code
     "view": ("viser",),
     "rerun": ("rerun",),
     "ros": ("rosbags",),
+    "record3d": ("lzfse",),
 }
 CONTAINS = {
     "view": ("map",),
@@ -35,6 +36,7 @@ CONTAINS = {
     "clip": ("encode", "map"),
     "export": ("clip", "encode", "map"),
     "ros": ("map",),
+    "record3d": ("map",),
 }
 
 

@@ -24,6 +24,7 @@ from prior_sg.services.ingest.sources import (
 )
 from prior_sg.services.ingest.sources.base import Source, SourceError
 from prior_sg.services.ingest.sources.clouds import folder as clouds_folder
+from prior_sg.services.ingest.sources.exports import record3d, rtabmap, stray_scanner
 from prior_sg.services.ingest.sources.hints import hint
 from prior_sg.services.ingest.sources.normalise import finish
 
@@ -40,6 +41,9 @@ LAYOUTS = (
     tartanground,
     coda,
     clouds_folder,
+    stray_scanner,
+    record3d,
+    rtabmap,
     generic,
     ros,
 )
