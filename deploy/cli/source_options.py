@@ -79,6 +79,7 @@ OPTIONS = (
     Option("--pose-topic", "pose_topic", "TOPIC", "its odometry, poses or transforms; default: tf, else one of these"),
     Option("--fixed-frame", "fixed_frame", "FRAME", "the world, of tf; default: map, world, odom or the root"),
     Option("--pose-frame", "pose_frame", "FRAME", "the frame whose poses --pose-topic has"),
+    Option("--depth-model", "depth_model", "FILE", "ONNX file that sees depth in the pictures of a stereo camera"),
     Option(
         "--sync-tolerance", "sync_tolerance_s", "SECONDS", "most between stamps of one frame's colour, depth and pose"
     ),

@@ -24,7 +24,7 @@ from prior_sg.services.ingest.sources import (
 )
 from prior_sg.services.ingest.sources.base import Source, SourceError
 from prior_sg.services.ingest.sources.clouds import folder as clouds_folder
-from prior_sg.services.ingest.sources.exports import record3d, rtabmap, stray_scanner
+from prior_sg.services.ingest.sources.exports import euroc, record3d, rtabmap, stray_scanner
 from prior_sg.services.ingest.sources.hints import hint
 from prior_sg.services.ingest.sources.normalise import finish
 
@@ -44,6 +44,7 @@ LAYOUTS = (
     stray_scanner,
     record3d,
     rtabmap,
+    euroc,
     generic,
     ros,
 )

@@ -284,4 +284,4 @@ def test_exports_damaged_by_hand_give_a_result_or_a_sentence(tmp_path, unpacks, 
 def test_check_understands_an_export(written, name):
     report = check(open_source(written(name)), Config(), brief=True)
     assert report.layout == name
-    assert not [finding for finding in report.problems if finding.name in ("poses", "depth unit")], report.findings
+    assert not [finding for finding in report.problems if finding.topic in ("poses", "depth unit")], report.findings

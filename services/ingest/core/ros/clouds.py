@@ -29,7 +29,13 @@ def columns_of_message(message: Any) -> dict[str, np.ndarray]:
     }
     if any(offset < 0 or offset + kind.itemsize > point_bytes for kind, offset in named.values()):
         raise CloudError("a field of its points lies beyond them")
-    formats = {"formats": [kind for kind, _ in named.values()], "offsets": [offset for _, offset in named.values()]}
-    row = np.dtype({"names": list(named), "itemsize": point_bytes, **formats})
+    row = np.dtype(
+        {
+            "names": list(named),
+            "formats": [kind for kind, _ in named.values()],
+            "offsets": [offset for _, offset in named.values()],
+            "itemsize": point_bytes,
+        }
+    )
     points = np.ndarray((height, width), row, data, strides=(row_bytes, point_bytes))
     return {name: np.ravel(points[name]).astype(points[name].dtype.newbyteorder("=")) for name in named}
