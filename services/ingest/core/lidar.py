@@ -27,8 +27,8 @@ def depth_image(points_camera: np.ndarray, camera: Intrinsics) -> np.ndarray:
 
 
 @compiled()
-def draw_triangles(corners, u, v, z, image, near_m, max_step):  # noqa: ANN001, PLR0917
-    """Raise the image's inverse depth to that of triangles, (n, 3) indices of corners at pixels u, v in the depths z."""
+def draw_triangles(corners, u, v, z, image, near_m, max_step):  # noqa: ANN001, ANN201, PLR0917
+    """Raise the image's inverse depth to that of triangles: (n, 3) indices of corners, at pixels u, v in depths z."""
     for a, b, c in corners:
         _triangle(u, v, z, a, b, c, image, near_m, max_step)
 

@@ -13,7 +13,7 @@ STEPS_PX = 16  # disparities that SGBM takes are a multiple of this
 MOST_SHARE = 0.25  # of the picture's width that disparity may be
 NEAREST_PX = 0.5  # disparities below tell nothing of how far away something is
 Matcher = Callable[[np.ndarray, np.ndarray], np.ndarray]
-"""Disparity (h, w), pixels of the left picture, not positive = none, of two rectified pictures (h, w) or (h, w, 3) uint8."""
+"""Disparity (h, w), pixels of the left picture, not positive = none, of two rectified pictures (h, w[, 3]) uint8."""
 
 
 @dataclass(frozen=True)

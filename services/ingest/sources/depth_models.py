@@ -1,9 +1,9 @@
 """Networks of the user's that see depth in pictures, as ONNX files.
 
-A file with two inputs matches two rectified pictures, left and right, and gives the disparity of the left one in pixels of
-its own size. Inputs are (1, 3 or 1, h, w) of 32 bit floats, red green blue from 0 to 255; h and w are the file's, or where
-they are open the picture's, made larger to a multiple of 32. What a network wants beside this (means, other scales) belongs
-into the file.
+A file with two inputs matches two rectified pictures, left and right, and gives the disparity of the left one in pixels
+of its own size. Inputs are (1, 3 or 1, h, w) of 32 bit floats, red green blue from 0 to 255; h and w are the file's, or
+where they are open the picture's, made larger to a multiple of 32. What a network wants beside this (means, other
+scales) belongs into the file.
 """
 
 from pathlib import Path

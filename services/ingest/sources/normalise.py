@@ -117,7 +117,7 @@ class Normaliser:
         return pose if self.world_from_source is None else self.world_from_source @ pose
 
     def color_image(self, data: bytes | None) -> bytes:
-        """The file as it is where it fits, else a JPEG of a JPEG and a PNG of all else; empty for none. Raises UNUSABLE."""
+        """The file where it fits, else a JPEG of a JPEG and a PNG of all else; empty for none. Raises UNUSABLE."""
         if data is None:
             return b""
         try:

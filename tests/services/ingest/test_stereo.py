@@ -160,7 +160,7 @@ def test_a_network_replaces_the_matching_of_a_source(tmp_path, kept):
 def test_a_file_that_is_no_network_that_matches_is_told(tmp_path, kept, made):
     pytest.importorskip("onnxruntime")
     made(tmp_path / "n.onnx")
-    with pytest.raises(SourceError, match="cannot be loaded as a network|a network that matches has two"):
+    with pytest.raises(SourceError, match=r"cannot be loaded as a network|a network that matches has two"):
         open_source(kept, options=ReadOptions(depth_model=str(tmp_path / "n.onnx")))
 
 

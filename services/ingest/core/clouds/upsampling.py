@@ -1,12 +1,12 @@
 """Depth images from sparse points, along the surfaces they lie on and the edges of the picture (pure).
 
-First the points are joined to triangles (Delaunay's, in the image), which are drawn as the flat pieces they are; none are
-drawn across a jump in depth. What is left lies at jumps and margins, and goes to the side it looks like: each pixel there
-gets the inverse depth of the plane through what is known around it, weighted by how far one walks to it through the
-picture, where a step across an edge is long. The walk is the domain transform of Gastal and Oliveira 2011 ("Domain
-transform for edge-aware image and video processing", equations 11 and 21, recursive form), the weights normalised by those
-of the measured pixels, as in joint bilateral upsampling (Kopf et al. 2007, equation 4). Planes, as inverse depth is linear
-in the image on every flat surface: a plain average makes stairs of a floor between two rings.
+First the points are joined to triangles (Delaunay's, in the image), which are drawn as the flat pieces they are; none
+are drawn across a jump in depth. What is left lies at jumps and margins, and goes to the side it looks like: each pixel
+there gets the inverse depth of the plane through what is known around it, weighted by how far one walks to it through
+the picture, where a step across an edge is long. The walk is the domain transform of Gastal and Oliveira 2011 ("Domain
+transform for edge-aware image and video processing", equations 11 and 21, recursive form), the weights normalised by
+those of the measured pixels, as in joint bilateral upsampling (Kopf et al. 2007, equation 4). Planes, as inverse depth
+is linear in the image on every flat surface: a plain average makes stairs of a floor between two rings.
 """
 
 import cv2
@@ -33,8 +33,8 @@ FAR_M = 1e9
 def upsampled(points_camera: np.ndarray, camera: Intrinsics, picture: np.ndarray | None) -> np.ndarray:
     """Depth (h, w), metres, 0 = no measurement, of points (n, 3) in the camera's frame.
 
-    `picture` (h, w) or (h, w, 3) uint8 is what the camera saw; without one only surfaces are drawn. Pixels that lie farther
-    from all points than the points lie from each other, or that could be of two surfaces, stay empty.
+    `picture` (h, w) or (h, w, 3) uint8 is what the camera saw; without one only surfaces are drawn. Pixels that lie
+    farther from all points than the points lie from each other, or that could be of two surfaces, stay empty.
     """
     points = splatted(points_camera, camera)
     if not points.any():

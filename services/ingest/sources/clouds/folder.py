@@ -1,16 +1,16 @@
 """A folder of clouds of a lidar, with pictures of a camera or without.
 
-lidar/STAMP.npy .pcd .ply .bin   points x y z in the lidar's frame (x forward, y left, z up), and where the sensor writes
-                                 it the time of each: t, time, timestamp, offset_time; .npy (n, 3) or structured, .bin
-                                 as KITTI's (x y z intensity)
+lidar/STAMP.npy .pcd .ply .bin   points x y z in the lidar's frame (x forward, y left, z up), and where the sensor
+                                 writes it the time of each: t, time, timestamp, offset_time; .npy (n, 3) or
+                                 structured, .bin as KITTI's (x y z intensity)
 color/STAMP.jpg or .png          (or rgb/, image/) pictures; without them the lidar gives places that have no appearance
 lidar.json                       {"camera": {"width": …, "height": …, "fx": …, "fy": …, "cx": …, "cy": …, and where it
                                  has them "model", "distortion"}, "camera_from_lidar": 4 x 4, "body_from_lidar": 4 x 4}
 poses.txt                        (any name and format of a list with stamps) world_from_body, the lidar's own where
                                  body_from_lidar is left out; at any rate, as it is interpolated
 
-Each picture gets the sweep nearest in time, each sweep one picture. Points go to where the lidar was when each was measured, then into the camera
-at the picture's stamp, and are upsampled along the picture's edges (core/clouds/upsampling.py). World z up.
+Each picture gets the sweep nearest in time, each sweep one picture. Points go to where the lidar was when each was
+measured, then into the camera at the picture's stamp, and are upsampled (core/clouds/upsampling.py). World z up.
 """
 
 from functools import partial
@@ -68,7 +68,7 @@ def load(path: Path, options: ReadOptions) -> Found:
 
     lidar = Lidar(stamps, partial(_sweep, files, stamps), world_from_lidar)
     colors = folder_of(path, COLORS)
-    notes = (f"the lidar moves as {list_name} says; quaternions are {options.quaternion or 'xyzw'}",)
+    notes: tuple[str, ...] = (f"the lidar moves as {list_name} says; quaternions are {options.quaternion or 'xyzw'}",)
     if colors is None:
         camera, entries, note = view_entries(lidar, rigid)
         notes = (*notes, note)

@@ -87,15 +87,15 @@ def view_entries(lidar: Lidar, of_matrix: Callable[[np.ndarray], np.ndarray]) ->
     poses = [_posed(lidar, stamp_ns) for stamp_ns in lidar.stamps_ns]
     chosen = looked_at(lidar.stamps_ns, poses)
     views = _used_views(lidar, chosen)
-    entries = []
+    entries: list[Entry] = []
     for position in chosen:
         for number, lidar_from_view in enumerate(views):
             stamp_ns = lidar.stamps_ns[position] + number * VIEW_STEP_NS
             pose = partial(_pose, lidar, position, lidar_from_view, of_matrix)
             entries.append(Entry(len(entries), stamp_ns, pose, partial(_images, lidar, position, lidar_from_view)))
     note = (
-        f"there is no camera: {len(chosen)} of {len(poses)} sweeps are looked at in {len(views)} views of 90 degrees, and "
-        "places have no appearance"
+        f"there is no camera: {len(chosen)} of {len(poses)} sweeps are looked at in {len(views)} views of 90 degrees, "
+        "and places have no appearance"
     )
     return Camera(VIEW), entries, note
 

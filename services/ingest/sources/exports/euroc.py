@@ -3,11 +3,12 @@
 mav0/cam0/data/NS.png, mav0/cam1/data/NS.png   pictures, named by their stamps, ns; the left camera first
 mav0/camN/sensor.yaml                          T_BS (body_from_sensor), resolution, intrinsics (fu fv cu cv),
                                                distortion_model, distortion_coefficients
-mav0/state_groundtruth_estimate0/data.csv      stamp (ns), position, quaternion wxyz of the body: world_from_body, z up; or
-                                               mav0/vicon0, leica0, or poses.txt here: rows of stamp tx ty tz qx qy qz qw
+mav0/state_groundtruth_estimate0/data.csv      stamp (ns), position, quaternion wxyz of the body: world_from_body, z
+                                               up; or mav0/vicon0, mocap0, or poses.txt here: rows of stamp tx ty tz
+                                               qx qy qz qw
 
 Depth comes from the two pictures: rectified, then matched by OpenCV's SGBM, or by a network of one's own with
---depth-model (depth_models.py). Poses are interpolated. Cameras with DoubleSphere, and sequences of one camera, are told.
+--depth-model (depth_models.py). Poses are interpolated. Unknown lenses and sequences of one camera are told.
 Source: projects.asl.ethz.ch/datasets, the paper of Burri et al. 2016.
 """
 
@@ -135,7 +136,7 @@ def _numbers(text: str, key: str, count: int) -> list[float]:
     found = re.search(rf"^{key}:\s*\[((?:[\s,]|{NUMBER})*)\]", text, re.DOTALL | re.MULTILINE)
     numbers = [float(number) for number in re.findall(NUMBER, found[1])] if found else []
     if count and len(numbers) != count:
-        raise ValueError(f"it has no {key.split(':')[0]} with {count} numbers")
+        raise ValueError(f"it has no {key.split(':', maxsplit=1)[0]} with {count} numbers")
     return numbers
 
 

@@ -12,7 +12,7 @@ from prior_sg.services.ingest.sources.base import FrameError, Images
 UP = (0.0, 1.0, 0.0)  # of ARKit's world
 FINER = 3  # pixels of a picture for one of depth, along each side: encoders see little in 256 x 192 pixels
 UNSURE = 0  # ARKit's confidence: 0 low, 1 medium, 2 high
-NOTE = f"depth is enlarged {FINER} times, so that pictures keep what can be seen in them; depth of low confidence is left out"
+NOTE = f"depth is enlarged {FINER} times, for the pictures' sake; what has low confidence is left out"
 
 
 def images(picture: np.ndarray, depth_m: np.ndarray, confidence: np.ndarray | None) -> Images:

@@ -1,8 +1,8 @@
 """Recordings of the app Record3D: a .r3d file, or the folder that it unpacks to.
 
 metadata                 JSON: w, h, K (3 x 3 by columns) or perFrameIntrinsicCoeffs (fx fy cx cy), dw, dh, fps or
-                         frameTimestamps (seconds), poses (qx qy qz qw tx ty tz of each frame: world_from_camera, ARKit's
-                         world, y up, OpenGL camera axes)
+                         frameTimestamps (seconds), poses (qx qy qz qw tx ty tz of each frame: world_from_camera,
+                         ARKit's world, y up, OpenGL camera axes)
 rgbd/N.jpg               the pictures
 rgbd/N.depth N.conf      32 bit floats, metres, and bytes 0 to 2, dh x dw, each compressed with LZFSE
 

@@ -3,8 +3,8 @@
 NAME_rgb/STAMP.jpg            the pictures; with --images_id the number of the node in place of the stamp
 NAME_depth/STAMP.png          16 bits, millimetres
 NAME_calib/STAMP.yaml         image_width, image_height, camera_matrix, distortion_coefficients, local_transform
-NAME_camera_poses.txt         world_from_camera, z up, x right, y down, z forward; else NAME_poses.txt: those of the robot,
-                              carried to the camera by local_transform
+NAME_camera_poses.txt         world_from_camera, z up, x right, y down, z forward; else NAME_poses.txt: those of the
+                              robot, carried to the camera by local_transform
                               rows of stamp x y z qx qy qz qw, and the node's number in format 11, the default; format 0
                               has twelve numbers and takes the pictures in their order
 

@@ -2,8 +2,8 @@
 
 rgb.mp4                    the pictures
 depth/NNNNNN.png           16 bits, millimetres, 256 x 192 (older: .npy); confidence/NNNNNN.png 0 to 2
-odometry.csv               timestamp, frame, x, y, z, qx, qy, qz, qw: world_from_camera, ARKit's world (y up), camera axes
-                           x right, y down, z forward
+odometry.csv               timestamp, frame, x, y, z, qx, qy, qz, qw: world_from_camera, ARKit's world (y up), camera
+                           axes x right, y down, z forward
 camera_matrix.csv          3 x 3, for the film's pixels
 
 The picture of a row is the one of its number in the film. Depth is enlarged to pictures that tell something (phone.py).
