@@ -77,6 +77,7 @@ OPTIONS = (
     Option("--depth-topic", "depth_topic", "TOPIC", "its depth images"),
     Option("--info-topic", "info_topic", "TOPIC", "camera info of its colour images"),
     Option("--pose-topic", "pose_topic", "TOPIC", "its odometry, poses or transforms; default: tf, else one of these"),
+    Option("--graph-topic", "graph_topic", "TOPIC", "of a live robot: optimised poses (nav_msgs/Path) of --pose-frame"),
     Option("--fixed-frame", "fixed_frame", "FRAME", "the world, of tf; default: map, world, odom or the root"),
     Option("--pose-frame", "pose_frame", "FRAME", "the frame whose poses --pose-topic has"),
     Option("--depth-model", "depth_model", "FILE", "ONNX file that sees depth in the pictures of a stereo camera"),

@@ -23,6 +23,7 @@ class RawFrame(Message, frozen=True, kw_only=True):
     total: int  # frames in the source, 0 = unknown (live)
     mask: bytes = b""
     origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    pose_only: bool = False  # of a live source, which decodes images only where a keyframe is due
 
     def check(self) -> None:
         check_pose(self.world_from_camera)

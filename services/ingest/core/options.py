@@ -47,6 +47,7 @@ class ReadOptions(msgspec.Struct, frozen=True, kw_only=True):
     depth_topic: str = ""
     info_topic: str = ""  # the colour camera's info
     pose_topic: str = ""  # odometry, poses or transforms; empty = tf where it moves the camera, else one of them
+    graph_topic: str = ""  # of a live robot: its optimised poses (nav_msgs/Path) of pose_frame; empty = jumps of tf
     fixed_frame: str = ""  # of tf: the world; empty = map, world, odom or the root
     pose_frame: str = ""  # the frame whose poses pose_topic has; empty = as its messages say, else the camera's
     depth_model: str = ""  # an ONNX file that sees depth in two pictures; empty = OpenCV's semi-global matching

@@ -119,7 +119,7 @@ def accept(state: State, frame: RawFrame, cfg: Config) -> Iterator[Written]:
         CAMERA_STATE,
         CameraState(robot=state.robot, stamp_ns=frame.stamp_ns, world_from_camera=frame.world_from_camera),
     )
-    if frame.depth and due(state.keyframe, frame, cfg):  # a live source decodes images only where it is due
+    if not frame.pose_only and due(state.keyframe, frame, cfg):
         state.keyframe = state.last
         state.trail.append(state.last)
         keyframe = _keyframe(state, frame)

@@ -14,34 +14,36 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
+import msgspec
 import numpy as np
 
 from prior_sg.services.ingest.core import selection
 from prior_sg.services.ingest.core.config import Config
-from prior_sg.services.ingest.core.frames import BadFrame, Closure, RawFrame, View
+from prior_sg.services.ingest.core.frames import BadFrame, Closure, Correction, RawFrame, View
 from prior_sg.services.ingest.core.options import LIVE, ReadOptions
 from prior_sg.services.ingest.core.poses import Convention, PoseError
-from prior_sg.services.ingest.core.ros.assembly import Assembly, Fault, Jump, Posed, Shot
+from prior_sg.services.ingest.core.ros.assembly import Assembly, Fault, Jump, Posed
+from prior_sg.services.ingest.core.ros.graph import corrected
 from prior_sg.services.ingest.core.ros.posing import Way, way_of
 from prior_sg.services.ingest.core.ros.recent import RecentTransforms
 from prior_sg.services.ingest.core.ros.topics import (
     FIXED_TRANSFORMS,
     NAMED,
-    POSES,
     TF_TYPES,
     Chosen,
     Topic,
     chosen,
+    graph_topic,
     pose_topics,
 )
-from prior_sg.services.ingest.core.ros.transforms import Stamped, transforms_of, written_stamp_ns
+from prior_sg.services.ingest.core.ros.transforms import Stamped, transforms_of
 from prior_sg.services.ingest.sources.base import MILLIMETRE, Event, Found, FrameError, Images, Source, SourceError
 from prior_sg.services.ingest.sources.normalise import UNUSABLE, Normaliser, prepare
 from prior_sg.services.ingest.sources.ros_feed import Feed, Tally
 from prior_sg.services.ingest.sources.ros_look import Look
 from prior_sg.services.ingest.sources.ros_pictures import Pictures, Rig, pictures
+from prior_sg.services.ingest.sources.ros_reader import Reader
 from prior_sg.services.runtime.bus import BusError
 from prior_sg.services.runtime.ros.session import ENDPOINT, Received, RosSession
 from prior_sg.services.runtime.ros.types import Types, shared_types
@@ -51,6 +53,7 @@ NAME = "ros2"
 NODE = "prior_sg_ingest"
 LOOK_S, MOMENT_S = 8.0, 0.1
 SAMPLES = 3
+NEARLY = 0.01  # metres, and about half a degree: less is no correction
 NO_IMAGES = Images(b"", b"")
 
 
@@ -68,6 +71,8 @@ class Robot:
     normaliser: Normaliser
     convention: Convention
     notes: tuple[str, ...]
+    graph: Topic | None  # of optimised poses
+    body_from_camera: np.ndarray  # of the frame whose poses these are
 
     def open(self) -> RosSession:
         """A node. Raises BusError."""
@@ -183,8 +188,9 @@ def robot_of(look: Look, types: Types, path: Path, options: ReadOptions) -> Robo
     transforms, poses = _motions(messages, reader, by_name)
     tree = transforms.tree(stamp_ns, transforms.frames)
     way = way_of(choice.color.frame, tree, options, posing, poses)
+    graph, camera_frame = graph_topic(topics, options), choice.color.frame
     camera, images, how = pictures(Rig(path, choice, options, look.infos(), tree, stamp_ns, within_ns))
-    listened = _listened(topics, choice, way)
+    listened = (*_listened(topics, choice, way), *([graph] if graph else []))
     convention = Convention().changed(options)
     assembly = Assembly(way, within_ns)
     for message in messages:
@@ -198,8 +204,22 @@ def robot_of(look: Look, types: Types, path: Path, options: ReadOptions) -> Robo
     normaliser, notes = prepare(found, options, samples)
     others = f"further images are not read: {', '.join(choice.others[:NAMED])}" if choice.others else ""
     notes = tuple(filter(None, (f"{choice.said()}, {way.said}", others, how, *notes)))
-    endpoint = endpoint_of(str(path))
-    return Robot(endpoint, options.ros_domain, options, choice, way, listened, images, normaliser, convention, notes)
+    body = options.pose_frame or camera_frame
+    body_from_camera = tree.at(body, camera_frame, stamp_ns, within_ns) if graph else np.eye(4)
+    return Robot(
+        endpoint=endpoint_of(str(path)),
+        domain=options.ros_domain,
+        options=options,
+        choice=choice,
+        way=way,
+        topics=listened,
+        pictures=images,
+        normaliser=normaliser,
+        convention=convention,
+        notes=notes,
+        graph=graph,
+        body_from_camera=body_from_camera,
+    )
 
 
 def _motions(
@@ -229,58 +249,6 @@ def _listened(topics: list[Topic], choice: Chosen, way: Way) -> tuple[Topic, ...
     return tuple(topic for topic in topics if topic.name in names or topic.type in TF_TYPES)
 
 
-@dataclass(frozen=True)
-class Reader:
-    """Reads messages as they came, by the clock that was asked for."""
-
-    types: Types
-    options: ReadOptions
-    topics: dict[str, Topic]
-
-    def shot(self, message: Received) -> Shot:
-        """An image. Raises WireError where it has no header."""
-        try:
-            stamp_ns = written_stamp_ns(message.payload)
-        except ValueError as error:
-            raise WireError(str(error)) from error
-        received = self.options.clock == "received"
-        return Shot(message.received_ns if received else stamp_ns, message.received_ns, message.payload)
-
-    def moves(self, topic: Topic) -> bool:
-        """Whether a topic has transforms or poses."""
-        return topic.type in TF_TYPES or topic.taken_for == POSES
-
-    def motions(self, message: Received) -> list[Stamped]:
-        """Transforms or poses of a message. Raises WireError."""
-        found = list(transforms_of(self.types.decode(message.payload, self.topics[message.topic].type)))
-        if self.options.clock == "received":
-            return [replace(one, stamp_ns=message.received_ns) for one in found]
-        return found
-
-    def hand_over(self, message: Received, choice: Chosen, assembly: Assembly) -> Fault | None:
-        """Give a message to where frames are put together; what is wrong with it."""
-        try:
-            if message.topic == choice.color.name:
-                assembly.color(self.shot(message))
-            elif message.topic == choice.depth.name:
-                assembly.depth(self.shot(message))
-            elif self.moves(topic := self.topics[message.topic]):
-                assembly.motion(topic, self.motions(message))
-        except WireError as error:
-            return Fault(f"messages of {message.topic}", str(error))
-        return None
-
-    def images(self, posed: Posed, choice: Chosen, images: Pictures) -> Images:
-        """The decoded pictures of a frame. Raises FrameError and ImageError."""
-        return images(self._image(posed.color, choice.color), self._image(posed.depth, choice.depth))
-
-    def _image(self, shot: Shot, topic: Topic) -> Any:
-        try:
-            return self.types.decode(shot.data, topic.type)
-        except WireError as error:
-            raise FrameError(f"an image of {topic.name} cannot be read: {error}") from error
-
-
 class Stream:
     """What a robot sends from now on."""
 
@@ -293,8 +261,11 @@ class Stream:
     ) -> None:
         self._robot, self._wanted, self._stop, self._clock_ns = robot, wanted, stop, clock_ns
         self._types, self._tally, self._frames = shared_types(), Tally(), 0
+        self._trail: list[View] = []  # all frames, as they were posed
+        self._told: np.ndarray | None = None  # the poses of the last correction
         by_name = {topic.name: topic for topic in robot.topics}
         self._reader = Reader(self._types, robot.options, by_name)
+        self._camera_from_body = np.linalg.inv(robot.body_from_camera)
         self._assembly = Assembly(robot.way, round(robot.options.sync_tolerance_s * 1e9))
 
     def events(self) -> Iterator[Event]:
@@ -313,6 +284,9 @@ class Stream:
     def take(self, messages: list[Received], faults: list[Fault]) -> Iterator[Event]:
         """What comes of messages, and words on what could not be used."""
         for message in messages:
+            if self._robot.graph is not None and message.topic == self._robot.graph.name:
+                yield from self._optimised(message)
+                continue
             fault = self._reader.hand_over(message, self._robot.choice, self._assembly)
             faults += [fault] if fault is not None else []
         for fault in faults:
@@ -326,7 +300,10 @@ class Stream:
     def _complete(self, ended: bool) -> Iterator[Event]:
         """Frames and jumps that are complete, then words on what was of no use."""
         for one in self._assembly.ready(self._clock_ns(), ended):
-            yield self._closure(one) if isinstance(one, Jump) else self._frame(one)
+            if isinstance(one, Posed):
+                yield self._frame(one)
+            elif self._robot.graph is None:
+                yield self._closure(one)
         for fault in self._assembly.faults():
             self._tally.add(fault)
         yield from self._tally.words(ended)
@@ -338,12 +315,35 @@ class Stream:
         try:
             pose = robot.convention.of_matrix(posed.source_from_camera)
             stamp_ns = posed.color.stamp_ns
+            if robot.graph is not None:
+                self._trail.append(View(number, stamp_ns, posed.source_from_camera))
             if not self._wanted(View(number, stamp_ns, robot.normaliser.pose(pose))):
-                return robot.normaliser.bare(number, 0, number, stamp_ns, pose, NO_IMAGES)
+                bare = robot.normaliser.bare(number, 0, number, stamp_ns, pose, NO_IMAGES)
+                return msgspec.structs.replace(bare, pose_only=True)
             images = self._reader.images(posed, robot.choice, robot.pictures)
             return robot.normaliser.frame(number, 0, number, stamp_ns, pose, images)
         except UNUSABLE as error:
             return BadFrame(frame_id=number, reason=str(error), index=number, total=0)
+
+    def _optimised(self, message: Received) -> Iterator[Correction]:
+        """What a graph of optimised poses says of the frames so far, unless that is what was said before."""
+        robot, trail = self._robot, self._trail
+        assert robot.graph is not None
+        try:
+            path = self._types.decode(message.payload, robot.graph.type)
+            nodes = [replace(node, child="") for pose in path.poses for node in transforms_of(pose)]
+            within_ns = round(robot.options.sync_tolerance_s * 1e9)
+            body_trail = [replace(v, world_from_camera=v.world_from_camera @ self._camera_from_body) for v in trail]
+            bodies = corrected(body_trail, nodes, within_ns)
+        except (WireError, PoseError) as error:
+            self._tally.add(Fault(f"messages of {robot.graph.name}", str(error)))
+            return
+        poses = np.stack([robot.convention.of_matrix(body @ robot.body_from_camera) for body in bodies])
+        if self._told is not None and np.allclose(poses[: len(self._told)], self._told, atol=NEARLY):
+            return
+        self._told = poses
+        ids = np.array([view.frame_id for view in trail], np.int64)
+        yield Correction(stamp_ns=trail[-1].stamp_ns, frame_ids=ids, world_from_camera=robot.normaliser.pose(poses))
 
     def _closure(self, jump: Jump) -> Closure:
         """A jump in the world of the frames rather than of the robot."""

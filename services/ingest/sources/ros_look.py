@@ -15,6 +15,7 @@ from prior_sg.services.runtime.ros.session import Received, RosSession
 from prior_sg.services.runtime.ros.types import Types
 from prior_sg.services.runtime.ros.wire import WireError
 
+MOST_TOPICS = 500
 CAMERA_TYPES = (IMAGE, COMPRESSED, CAMERA_INFO)
 IMAGES_KEPT, OTHERS_KEPT = 8, 4000
 SETTLED_S = 1.5  # after the first publisher was seen, all that publishes steadily has been heard
@@ -90,7 +91,7 @@ class Look:
             channel = entity.channel
             if entity.kind != wire.PUBLISHER or channel is None or channel.name in self.heard:
                 continue
-            if channel.type not in READ_TYPES or not self._types.knows(channel.type):
+            if channel.type not in READ_TYPES or not self._types.knows(channel.type) or len(self.heard) >= MOST_TOPICS:
                 continue
             most = IMAGES_KEPT if channel.type in (IMAGE, COMPRESSED) else OTHERS_KEPT
             self.heard[channel.name] = Heard(channel.type, kept=deque(maxlen=most))

@@ -164,7 +164,9 @@ class RosSession:
         self._entities.append(self._session.liveliness().declare_subscriber(pattern, seen, history=True))
 
     def close(self) -> None:
-        """Leave, within a bound."""
+        """Leave, within a bound; who is no longer there is told first, so that nothing comes for nobody."""
+        for entity in reversed(self._entities):
+            quietly(entity.undeclare)
         close_within(self._session, CLOSE_TIMEOUT_S)
 
     def __enter__(self) -> "RosSession":

@@ -1,5 +1,6 @@
 """A live robot over rmw_zenoh's keys: the frames of its recording, whatever order they come in; faults as sentences."""
 
+import asyncio
 import json
 import os
 import struct
@@ -16,13 +17,18 @@ pytest.importorskip("rosbags")
 from prior_sg.deploy.cli.main import main
 from prior_sg.schemas.topics import POSE_UPDATE
 from prior_sg.services.geometry import inverse
+from prior_sg.services.ingest import service
 from prior_sg.services.ingest.core.config import Config
-from prior_sg.services.ingest.core.frames import BadFrame, Closure, RawFrame, Unused
+from prior_sg.services.ingest.core.frames import BadFrame, Closure, Correction, RawFrame, Unused
 from prior_sg.services.ingest.core.options import ReadOptions
 from prior_sg.services.ingest.core.poses import PoseError
+from prior_sg.services.ingest.core.ros.assembly import Assembly, Shot
+from prior_sg.services.ingest.core.ros.posing import Way
+from prior_sg.services.ingest.core.ros.topics import Topic
+from prior_sg.services.ingest.core.ros.transforms import Stamped
 from prior_sg.services.ingest.core.selection import State
 from prior_sg.services.ingest.service import step
-from prior_sg.services.ingest.sources import SourceError, open_source
+from prior_sg.services.ingest.sources import Source, SourceError, open_source
 from prior_sg.services.ingest.sources.ros_live import Due, Stream, robot_of
 from prior_sg.services.ingest.sources.ros_look import Look
 from prior_sg.services.runtime.ros.session import Received
@@ -109,6 +115,29 @@ def test_the_frames_of_the_bag_come_out_whatever_the_order_on_the_way(walked, tm
         for one, other in zip(frames, recorded, strict=True):
             assert (one.frame_id, one.color, one.depth) == (other.frame_id, other.color, other.depth)
             assert np.array_equal(one.world_from_camera, other.world_from_camera)
+
+
+def test_a_colour_image_waits_for_the_closest_depth_image():
+    assembly = Assembly(Way("camera", topic="/pose", body="camera"), 20 * MS)
+    assembly.motion(Topic("/pose", "geometry_msgs/msg/PoseStamped", 1, 0), [pose_at(0), pose_at(1000)])
+    colors = [Shot(at_ms * MS, 0, b"color") for at_ms in (100, 150, 200)]
+    depths = [Shot(at_ms * MS, 0, b"depth") for at_ms in (85, 102, 149, 185, 240)]
+    for shot in (depths[0], colors[0]):
+        (assembly.depth if shot in depths else assembly.color)(shot)
+        assert list(assembly.ready(0)) == []
+    for depth, color in zip(depths[1:], [*colors[1:], None, None], strict=True):
+        assembly.depth(depth)
+        if color:
+            assembly.color(color)
+    frames = list(assembly.ready(0))
+    assert [(f.color.stamp_ns // MS, f.depth.stamp_ns // MS) for f in frames] == [(100, 102), (150, 149)]
+    (last,) = assembly.ready(0, ended=True)
+    assert last.depth is depths[3]
+    assert sorted({fault.what for fault in assembly.faults()}) == ["depth images"]
+
+
+def pose_at(at_ms):
+    return Stamped(at_ms * MS, "world", "", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
 
 
 def test_images_are_decoded_only_of_frames_that_may_become_keyframes(walked):
@@ -214,6 +243,27 @@ def sentences(events):
     return {getattr(event, "example", "") or event.reason for event in events if isinstance(event, Unused | BadFrame)}
 
 
+@pytest.mark.parametrize("body", ["base", ""])
+def test_optimised_poses_of_a_graph_correct_every_frame(walked, body):
+    """Nodes at every third frame, the world turned and moved: all frames stand where that puts them."""
+    after, maker = motion(0.4, 0.2, 0.0, 25, 0, 0), Maker("mcap")
+    poses = WORLD_FROM_BASE if body else WALK
+    nodes = [maker.pose(STAMPS_NS[i], "map", after @ poses[i]) for i in range(0, len(WALK), 3)]
+    late = maker.types["nav_msgs/msg/Path"](maker.header(STAMPS_NS[-1], "map"), nodes)
+    maker.messages = [*walked.messages, ("/graph", STAMPS_NS[-1] + 500 * MS, late)]
+    robot = robot_heard(maker, graph_topic="/graph", pose_frame=body)
+    empty = maker.types["nav_msgs/msg/Path"](maker.header(0, "map"), [])
+    messages = received(maker)
+    said = replace(messages[-1], payload=bytes(maker.store.serialize_cdr(empty, "nav_msgs/msg/Path")))
+    events = streamed(robot, [*messages, messages[-1], said])
+    (update,) = [event for event in events if isinstance(event, Correction)]
+    assert not any(isinstance(event, Closure) for event in events)
+    assert words(events) == {"no pose of the graph has the stamp of a frame"}
+    assert update.frame_ids.tolist() == list(range(len(WALK)))
+    for pose, walk_pose in zip(update.world_from_camera, WALK, strict=True):
+        assert np.abs(pose - after @ walk_pose).max() < 1e-6
+
+
 def test_mutated_messages_cost_themselves_and_one_sentence(walked, rng):
     """PSG_TEST_MUTATIONS=50000 for the long proof."""
     robot = robot_heard(walked)
@@ -290,6 +340,48 @@ def test_a_robot_on_a_router_is_read_like_its_bag(endpoint, walked, capsys):
         assert list(source) == [] and time.monotonic() - begun_s < 0.5
     finally:
         player.close()
+
+
+class Port:
+    """A host that takes all at once."""
+
+    def __init__(self):
+        self.stopping, self.consumed = asyncio.Event(), []
+
+    async def consume(self, message):
+        self.consumed.append(message)
+
+    async def room(self, window):
+        raise AssertionError("a robot waits for nobody")
+
+
+def test_a_robot_is_waited_for_read_without_pace_and_left_at_once(walked, monkeypatch):
+    robot, stop, asked = robot_heard(walked), threading.Event(), []
+    frames = [event for event in streamed(robot, received(walked)) if isinstance(event, RawFrame)]
+
+    def live():
+        yield from frames
+        stop.wait(20)
+
+    def opened(cfg):
+        asked.append(cfg.source)
+        if len(asked) < 3:
+            raise SourceError("nobody is there")
+        intrinsics = robot.normaliser.intrinsics
+        return Source("ros2", Path("ros2:"), intrinsics, 0, live, live=live, close=stop.set)
+
+    async def driven():
+        port = Port()
+        driving = asyncio.create_task(service.drive(port, Config(source="ros2:/", speed=0.01)))
+        while len(port.consumed) < len(frames):
+            await asyncio.sleep(0.01)
+        port.stopping.set()
+        await asyncio.wait_for(driving, 2)
+        return port.consumed
+
+    monkeypatch.setattr(service, "_open", opened)
+    monkeypatch.setattr(service, "SEARCH_S", 0.01)
+    assert asyncio.run(driven()) == frames and asked == ["ros2:/"] * 3
 
 
 def test_where_no_robot_is_the_sentence_says_what_to_do(endpoint, monkeypatch):

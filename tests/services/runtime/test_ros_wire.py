@@ -1,7 +1,9 @@
 """How rmw_zenoh names things, read and written; the texts are those of its design document and of its tokens."""
 
+import json
 import struct
 import time
+from dataclasses import replace
 
 import pytest
 import zenoh
@@ -136,6 +138,38 @@ def test_two_nodes_talk_find_each_other_and_remember_latched_messages(endpoint):
         assert sorted(kinds) == ["MP", "MP", "MP", "NN", "SS"]
         assert ("/talker", wire.SERVER, True) in seen
         assert [service for service, _ in faults] == ["/add"]
+
+
+PEER = {  # what of rmw_zenoh's own settings of a session matters on the way through a router
+    "mode": "peer",
+    "listen": {"endpoints": ["tcp/127.0.0.1:0"]},
+    "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": True}},
+    "timestamping": {"enabled": True},
+}
+
+
+def test_a_peer_with_the_settings_of_rmw_zenoh_is_heard_and_hears(endpoint):
+    settings = zenoh.Config.from_json5(json.dumps(PEER | {"connect": {"endpoints": [endpoint]}}))
+    types, heard, answered = Types(), [], []
+    good = Attachment(1, 2, bytes(16)).written()
+    with zenoh.open(settings) as peer, RosSession(endpoint, domain=9) as node:
+        latching = zx.declare_advanced_publisher(
+            peer,
+            wire.data_key(9, CHATTER),
+            cache=zx.CacheConfig(1),
+            publisher_detection=True,
+            sample_miss_detection=zx.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=0.5),
+        )
+        latching.put(types.encode(types.make("std_msgs/msg/String", "before")), attachment=good)
+        node.subscribe(replace(CHATTER, quality=Quality(1, latched=True)), heard.append, print)
+        wait_for(lambda: heard)
+        assert types.decode(heard[0].payload, CHATTER.type).data == "before"
+        hearing = peer.declare_subscriber("9/back/**", answered.append)
+        publisher = node.publisher(Channel("/back", "std_msgs/msg/String", STRING))
+        wait_for(lambda: publisher.publish(heard[0].payload) or answered)
+        assert len(answered[0].attachment.to_bytes()) == 33
+        hearing.undeclare()
+        latching.undeclare()
 
 
 def test_strangers_messages_are_told_and_passed_over(endpoint):

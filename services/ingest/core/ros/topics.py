@@ -1,7 +1,7 @@
 """Which topics of a recording are the colour, the depth, the camera and the poses (pure)."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from prior_sg.services.ingest.core.options import ReadOptions
 from prior_sg.services.ingest.core.ros.images import COLOR, DEPTH, GREY
@@ -15,11 +15,13 @@ POSE_TYPES = (  # those that say of what their pose is go first
     "geometry_msgs/msg/PoseWithCovarianceStamped",
     "geometry_msgs/msg/PoseStamped",
 )
-READ_TYPES = (IMAGE, COMPRESSED, CAMERA_INFO, *TF_TYPES, *POSE_TYPES)
+PATH = "nav_msgs/msg/Path"
+READ_TYPES = (IMAGE, COMPRESSED, CAMERA_INFO, PATH, *TF_TYPES, *POSE_TYPES)
 STATIC = "tf_static"
 TRANSPORTS = ("/compressed", "/compressedDepth")  # what image_transport adds to a topic's name
 CAMERA, TRANSFORMS, FIXED_TRANSFORMS, POSES = "camera", "transforms", "fixed transforms", "poses"
 CLOUD = "cloud of points"
+GRAPH = "pose graph"  # only where it is told: a path may be one that is planned
 NAMED = 6
 
 
@@ -40,8 +42,9 @@ class Topic:
         """What it can serve as; empty = nothing."""
         if self.type in TF_TYPES:
             return FIXED_TRANSFORMS if self.name.endswith(STATIC) else TRANSFORMS
-        if self.type in (CAMERA_INFO, POINT_CLOUD):
-            return CAMERA if self.type == CAMERA_INFO else CLOUD
+        kinds = {CAMERA_INFO: CAMERA, POINT_CLOUD: CLOUD, PATH: GRAPH}
+        if self.type in kinds:
+            return kinds[self.type]
         return POSES if self.type in POSE_TYPES else self.shows
 
     @property
@@ -117,6 +120,14 @@ def pose_topics(topics: Sequence[Topic], options: ReadOptions) -> list[Topic]:
         return [_told(topics, options.pose_topic, (POSES, TRANSFORMS), "pose")]
     found = [topic for topic in topics if topic.taken_for == POSES and topic.count]
     return sorted(found, key=lambda topic: (POSE_TYPES.index(topic.type), -topic.count, topic.name))
+
+
+def graph_topic(topics: Sequence[Topic], options: ReadOptions) -> Topic | None:
+    """The topic of optimised poses, where one is told; nobody need have published on it. Raises ValueError."""
+    if not options.graph_topic:
+        return None
+    announced = [replace(topic, count=1) if topic.type == PATH else topic for topic in topics]
+    return _told(announced, options.graph_topic, (GRAPH,), "graph")
 
 
 def _candidates(topics: Sequence[Topic], told: str, shows: Sequence[str], option: str) -> list[Topic]:

@@ -16,6 +16,7 @@ from prior_sg.services.geometry import inverse, pose_from_quaternion
 from prior_sg.services.ingest.core.poses import PoseError
 
 LONGEST_GAP_NS = 1_000_000_000  # between two stamps over which is interpolated
+FARTHEST_M = 1e8  # a position beyond, or none, is of a damaged message
 LONGEST_QUATERNION = 1e6  # one beyond, or below its inverse, is no rotation but a damaged message
 NEARLY_PARALLEL = 1 - 1e-9  # cosine of half an angle beyond which an arc is a line
 FIXED_FRAMES = ("map", "world", "odom")  # by preference
@@ -57,9 +58,9 @@ class Stamped:
     quaternion_xyzw: tuple[float, float, float, float]
 
     def is_motion(self) -> bool:
-        """Whether the numbers are finite and the quaternion is one of a rotation, if not normalised."""
+        """Whether the position is on earth and the quaternion is one of a rotation, if not normalised."""
         length = math.hypot(*self.quaternion_xyzw)
-        return bool(np.isfinite(self.position_m).all()) and 1 / LONGEST_QUATERNION < length < LONGEST_QUATERNION
+        return math.hypot(*self.position_m) < FARTHEST_M and 1 / LONGEST_QUATERNION < length < LONGEST_QUATERNION
 
     def matrix(self) -> np.ndarray:
         """parent_from_child (4, 4) of a motion."""
