@@ -1,4 +1,4 @@
-"""What a lidar with few rings costs: the sample's depth, seen along rings only and upsampled again, against the full depth.
+"""What few rings of a lidar cost: the sample's depth, seen along rings only and upsampled again, against all of it.
 
 Rings cover the camera's height of view evenly, and have 1 800 columns a turn, in the camera's own place.
 """
@@ -62,16 +62,15 @@ def along_rings(depth_m: np.ndarray, camera: Intrinsics, rings: int) -> np.ndarr
 def lidar_bench(source: Path) -> tuple[dict, dict]:
     """Depth, places and regions for each number of rings and each way of upsampling, and for the full depth."""
     metrics: dict[str, float] = {}
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
+    with tempfile.TemporaryDirectory() as made:
+        folder = Path(made)
         logs = {"full": source}
         for rings in RINGS:
-            for way in WAYS:
-                key = f"{way}_{rings}"
+            for name, way in WAYS.items():
+                key = f"{name}_{rings}"
                 logs[key] = folder / f"{key}.mcap"
-                metrics |= {
-                    f"{key}_{what}": value for what, value in _pack(source, logs[key], rings, WAYS[way]).items()
-                }
+                packed = _pack(source, logs[key], rings, way)
+                metrics |= {f"{key}_{what}": value for what, value in packed.items()}
         for key, scores in _scores(logs, folder).items():
             metrics |= {f"{key}_{what}": value for what, value in scores.items()}
     return metrics, {"source": source.name, "columns": COLUMNS, "wrong": WRONG, "encoder": "as configured"}
