@@ -10,14 +10,19 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from prior_sg.schemas.frames import Intrinsics
+from prior_sg.schemas.topics import ENCODE, KEYFRAME, PLACE_DELTA
 from prior_sg.services.geometry import inverse, transform
+from prior_sg.services.ingest.core import selection
 from prior_sg.services.ingest.core.clouds.files import columns_of
 from prior_sg.services.ingest.core.clouds.sweep import CloudError, in_world, sweep_of
 from prior_sg.services.ingest.core.clouds.upsampling import upsampled
+from prior_sg.services.ingest.core.config import Config
 from prior_sg.services.ingest.core.frames import RawFrame
 from prior_sg.services.ingest.core.options import ReadOptions
 from prior_sg.services.ingest.core.ros.clouds import columns_of_message
 from prior_sg.services.ingest.sources import SourceError, open_source
+from prior_sg.services.registry import BY_NAME
+from prior_sg.services.runtime.runner import Runner
 from tests.help.bags import Maker
 from tests.services.ingest.test_sources import ROBOT, cast, off_wall, shade
 
@@ -274,6 +279,21 @@ def test_a_lidar_without_a_camera_is_seen_from_where_it_was(tmp_path, fov_deg, v
         assert frame.color == b""
         assert share > 0.4
         assert (off_wall(points) < 0.05).mean() > 0.95
+
+
+def test_a_lidar_without_a_camera_gives_places_and_nothing_to_encode(tmp_path):
+    frames = list(open_source(folder(tmp_path / "d", pictures=False)))
+    place_graph, ingest = Runner(BY_NAME["place_graph"]), selection.State(robot="robot1")
+    told = [one for frame in frames for one in selection.accept(ingest, frame, Config())]
+    keyframes = [message for topic, message in told if topic is KEYFRAME]
+    assert len(keyframes) == len(frames)
+    assert not [topic for topic, _ in told if topic is ENCODE]
+    assert not ingest.encoding
+    deltas = [
+        message for keyframe in keyframes for topic, message in place_graph.feed(keyframe) if topic is PLACE_DELTA
+    ]
+    ids = {place for delta in deltas for place in delta.place_ids.tolist()}
+    assert len(ids) > 20
 
 
 @pytest.fixture(scope="module")
