@@ -21,7 +21,7 @@ from prior_sg.services.runtime.ros.session import RosSession
 from prior_sg.services.runtime.ros.wire import SUBSCRIPTION
 from tests.help.paths import ROOT, SAMPLE
 
-FRAMES = 3
+FRAMES = 2
 SPACE = "conse/efficientnet-lite0/minilm-l6-v2"  # the smallest that the extras bring
 TYPES = {
     "/camera/color/image_raw/compressed": "sensor_msgs/msg/CompressedImage",
@@ -74,7 +74,7 @@ def test_a_node_of_ros_gives_the_scene_of_the_file(log, endpoint):
             process.kill()
             process.wait()
     filed = scene_of(open_source(log))
-    assert live.places.ids.tolist() == filed.places.ids.tolist() and len(live.places.ids) > 5
+    assert live.places.ids.tolist() == filed.places.ids.tolist() and len(live.places.ids) >= 5
     assert np.abs(live.places.positions_m - filed.places.positions_m).max() < 1e-6
     assert live.places.labels.tolist() == filed.places.labels.tolist()
     assert live.regions.labels.tolist() == filed.regions.labels.tolist() and len(live.regions) > 0

@@ -7,7 +7,6 @@ import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-import cv2
 import msgspec
 import numpy as np
 from scipy.ndimage import distance_transform_edt
@@ -20,7 +19,7 @@ from prior_sg.deploy.settings import DEMO_ENVIRONMENT
 from prior_sg.schemas.frames import Intrinsics, Keyframe
 from prior_sg.services.ingest.core.clouds.upsampling import splatted, upsampled
 from prior_sg.services.ingest.core.frames import RawFrame
-from prior_sg.services.ingest.core.pixels import encoded, millimetres
+from prior_sg.services.ingest.core.pixels import eight_bit, encoded, millimetres, stored
 from prior_sg.services.ingest.sources import open_source
 from prior_sg.services.registry import BY_NAME
 
@@ -84,8 +83,8 @@ def _pack(source: Path, log: Path, rings: int, way: Upsample) -> dict[str, float
         for frame in open_source(source):
             if not isinstance(frame, RawFrame):
                 continue
-            true_m = cv2.imdecode(np.frombuffer(frame.depth, np.uint8), cv2.IMREAD_UNCHANGED) * frame.depth_scale_m
-            picture = cv2.imdecode(np.frombuffer(frame.color, np.uint8), cv2.IMREAD_COLOR)
+            true_m = stored(frame.depth) * np.float64(frame.depth_scale_m)
+            picture = eight_bit(frame.color)
             depth_m = way(along_rings(true_m, frame.intrinsics, rings), frame.intrinsics, picture)
             both = (depth_m > 0) & (true_m > 0)
             wrong = np.abs(depth_m - true_m)[both] > WRONG * true_m[both]

@@ -171,6 +171,7 @@ def measure(seconds: float, source: str, frames: int, settings: list[str]) -> di
             result = run(job, Terminal(stderr=True))
         finally:
             player.stopped.set()
+            player.join()
             watch.close()
             stop_router()
     ingest = result.counts.ingest

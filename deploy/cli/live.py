@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from prior_sg.deploy.cli.check import before_start
 from prior_sg.deploy.cli.doors import API_PORT, port_in
 from prior_sg.deploy.cli.jobs import add_run_options, settings_of
+from prior_sg.deploy.cli.ros_results import add_ros, bridge_arguments, check_ros
 from prior_sg.deploy.cli.shared import Commands, add_bus, add_router, console, open_client
 from prior_sg.deploy.cli.source_options import add_source_options, read_options
 from prior_sg.deploy.edge import names_in
@@ -37,6 +38,7 @@ def add_commands(commands: Commands) -> None:
     up.add_argument(
         "--api", nargs="?", type=port_in, const=API_PORT, default=None, metavar="PORT", help="also serve HTTP there"
     )
+    add_ros(up)
     add_run_options(up)
     add_source_options(up)
 
@@ -81,6 +83,8 @@ def cmd_up(arguments: argparse.Namespace) -> int:
             raise UserError(f"there is no service {name!r}; known: {', '.join(BY_NAME)}")
     if arguments.api is not None:
         extras.require("api", "prior-sg up --api")
+    if arguments.ros is not None:
+        check_ros(arguments)
     with claimed_folder(arguments.out):
         return _stay_up(arguments, names)
 
@@ -117,6 +121,8 @@ def _stay_up(arguments: argparse.Namespace, names: list[str]) -> int:
             supervisor.start(name, arguments.workers if BY_NAME[name].job is not None else 1)
         if arguments.api is not None:
             _open_api(supervisor, arguments.api)
+        if arguments.ros is not None:
+            supervisor.start_door("ros", "prior_sg.deploy.ros.process", bridge_arguments(arguments))
         listening = " and ".join((arguments.connect, *arguments.listen))
         console.print(f"router {listening}; logs in {supervisor.log_folder}; Ctrl-C stops")
         while True:

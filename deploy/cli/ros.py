@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from rich.table import Table
 
+from prior_sg.deploy.cli.ros_results import add_results
 from prior_sg.deploy.cli.shared import Commands, console
 from prior_sg.deploy.errors import UserError
 from prior_sg.deploy.json_text import json_text
@@ -27,6 +28,7 @@ def add_commands(commands: Commands) -> None:
     topics.add_argument("--domain", type=int, default=0, help="ROS_DOMAIN_ID of a robot (default: %(default)s)")
     topics.add_argument("--seconds", type=float, default=3.0, help="to listen to a robot (default: %(default)s)")
     topics.add_argument("--json", action="store_true", help="print JSON")
+    add_results(actions)
 
 
 def cmd_topics(arguments: argparse.Namespace) -> int:

@@ -104,6 +104,12 @@ def add_source_options(parser: argparse.ArgumentParser) -> None:
         )
 
 
+def source_option(arguments: argparse.Namespace, flag: str) -> str | None:
+    """What was told for one of them, as it was written."""
+    told: str | None = getattr(arguments, next(option.dest for option in OPTIONS if option.flag == flag))
+    return told
+
+
 def source_settings(arguments: argparse.Namespace) -> list[str]:
     """Settings of ingest for the options that were given; none for a command that has no such options."""
     given = ((option, getattr(arguments, option.dest, None)) for option in OPTIONS)

@@ -45,7 +45,7 @@ def cmd_view(arguments: argparse.Namespace) -> int:
             f"the page has no login, so it is served to this machine alone, not on {arguments.host}; from elsewhere, "
             f"open a tunnel: ssh -L {arguments.port}:127.0.0.1:{arguments.port} USER@THIS-MACHINE"
         )
-    source = _source(arguments)
+    source = source_of(arguments)
     options = Options(
         arguments.host, arguments.port, not arguments.light, max(arguments.interval, 0.02), arguments.max_mbit
     )
@@ -63,7 +63,8 @@ def cmd_view(arguments: argparse.Namespace) -> int:
         source.close()
 
 
-def _source(arguments: argparse.Namespace) -> "Source":
+def source_of(arguments: argparse.Namespace) -> "Source":
+    """What is looked at: a run that is over, or the robot on the bus."""
     if arguments.source is not None:
         from prior_sg.deploy.viewing.recorded import open_recorded
 

@@ -10,6 +10,7 @@ import sys
 import time
 import uuid
 from pathlib import Path
+from typing import Any
 
 from prior_sg import services
 from prior_sg.deploy.edge import check_arguments
@@ -22,7 +23,7 @@ from prior_sg.services.runtime.config import ConfigError
 from prior_sg.services.runtime.host.host import Host
 from prior_sg.services.runtime.logs import start_logging
 from prior_sg.services.runtime.record import LogError
-from prior_sg.services.runtime.service import Identity, ServiceError
+from prior_sg.services.runtime.service import Identity, Service, ServiceError
 from prior_sg.services.runtime.zenoh_bus import ZenohBus
 
 log = logging.getLogger(__name__)
@@ -56,13 +57,18 @@ async def serve(arguments: argparse.Namespace, instance: str) -> None:
 
     service = BY_NAME[arguments.service]
     cfg = resolved_config(service, arguments.config, arguments.set)
-    bus = await asyncio.to_thread(ZenohBus, arguments.connect)
     robot = arguments.robot if service.scope == "robot" else "*"
-    host = Host(service, bus, cfg, Identity(robot, instance, time.time_ns()))
+    await stay(service, cfg, Identity(robot, instance, time.time_ns()), arguments.connect, arguments.parent)
+
+
+async def stay(service: Service, cfg: Any, identity: Identity, connect: str, parent: int = 0) -> None:
+    """Run a service on the bus of a router until a signal, or until the parent, if there is one, is gone."""
+    bus = await asyncio.to_thread(ZenohBus, connect)
+    host = Host(service, bus, cfg, identity)
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, host.stop)
-    watcher = asyncio.create_task(_stop_with_parent(host, arguments.parent))
+    watcher = asyncio.create_task(_stop_with_parent(host, parent))
     try:
         await host.run()
     finally:

@@ -27,16 +27,26 @@ MODULES = {  # by extra; what the build file lists there, by the names that code
     "mcp": ("mcp",),
     "view": ("viser",),
     "rerun": ("rerun",),
+    "foxglove": ("foxglove",),
     "ros": ("rosbags",),
+<<<<<<< HEAD
     "record3d": ("lzfse",),
+=======
+    "hydra": ("zmq", "spark_dsg"),
+>>>>>>> main
 }
 CONTAINS = {
     "view": ("map",),
     "encode": ("map",),
     "clip": ("encode", "map"),
     "export": ("clip", "encode", "map"),
+    "foxglove": ("map",),
     "ros": ("map",),
+<<<<<<< HEAD
     "record3d": ("map",),
+=======
+    "hydra": ("map",),
+>>>>>>> main
 }
 
 

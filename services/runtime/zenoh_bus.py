@@ -89,11 +89,13 @@ def client_config(endpoint: str, bundle: Bundle | None = None) -> zenoh.Config:
 
 
 def router_settings(endpoint: str, beyond: Beyond | None = None) -> dict[str, Any]:
-    """Zenoh's settings of a router: for the processes of its host on loopback, and `beyond` for those with keys."""
+    """Zenoh's settings of a router: for the processes of its host on loopback, and `beyond` for those with keys. On
+    loopback alone it gossips: nodes of ROS, which are peers, find each other by that.
+    """
     settings: dict[str, Any] = {
         "mode": "router",
         "listen": {"endpoints": [endpoint, *(beyond.listen if beyond else ())]},
-        "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
+        "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": beyond is None}},
         "timestamping": {"enabled": True},
         "transport": _transport(beyond.bundle if beyond else None),
     }

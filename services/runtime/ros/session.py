@@ -225,7 +225,7 @@ def _open(endpoint: str, wait_s: float) -> zenoh.Session:
                 check_host(endpoint)
                 raise BusError(
                     f"no Zenoh router of ROS answers on {endpoint}: start one (`ros2 run rmw_zenoh_cpp rmw_zenohd`), "
-                    "or name another: ros2:/tcp/HOST:PORT"
+                    "or name another: ros2:/tcp/HOST:PORT, or --ros-router tcp/HOST:PORT of the bridge"
                 ) from error
             time.sleep(0.2)
 
