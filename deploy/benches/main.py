@@ -80,19 +80,18 @@ def view() -> tuple[dict, dict]:
     return view_bench()
 
 
-<<<<<<< HEAD
 def lidar() -> tuple[dict, dict]:
     """The sample as lidars of few rings see it; see `prior_sg.deploy.benches.lidar`."""
     from prior_sg.deploy.benches.lidar import lidar_bench  # needs an encoder
 
     return lidar_bench(SAMPLE)
-=======
+
+
 def hydra() -> tuple[dict, dict]:
     """The bridge to Hydra; see `prior_sg.deploy.benches.hydra`."""
     from prior_sg.deploy.benches.hydra import hydra_bench  # needs the extra `hydra`
 
     return hydra_bench()
->>>>>>> main
 
 
 def e2e() -> tuple[dict, dict]:

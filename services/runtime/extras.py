@@ -29,11 +29,8 @@ MODULES = {  # by extra; what the build file lists there, by the names that code
     "rerun": ("rerun",),
     "foxglove": ("foxglove",),
     "ros": ("rosbags",),
-<<<<<<< HEAD
     "record3d": ("lzfse",),
-=======
     "hydra": ("zmq", "spark_dsg"),
->>>>>>> main
 }
 CONTAINS = {
     "view": ("map",),
@@ -42,11 +39,8 @@ CONTAINS = {
     "export": ("clip", "encode", "map"),
     "foxglove": ("map",),
     "ros": ("map",),
-<<<<<<< HEAD
     "record3d": ("map",),
-=======
     "hydra": ("map",),
->>>>>>> main
 }
 
 
