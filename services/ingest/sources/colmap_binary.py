@@ -29,7 +29,7 @@ def cameras_of(path: Path) -> dict[str, list[Any]]:
             values = struct.unpack_from(f"<{parameters}d", data, at + CAMERA.size)
             cameras[str(number)] = [name, width, height, *values]
             at += CAMERA.size + 8 * parameters
-    except (struct.error, IndexError) as error:
+    except (struct.error, IndexError, OverflowError) as error:
         raise SourceError(f"{path} is damaged, or of a model of cameras that is not known: {error}") from error
     return cameras
 
@@ -47,7 +47,7 @@ def images_of(path: Path) -> list[list[Any]]:
             images.append([number, *pose, str(camera), name])
             (points,) = COUNT.unpack_from(data, end + 1)
             at = end + 1 + COUNT.size + POINT_BYTES * points
-    except (struct.error, ValueError) as error:
+    except (struct.error, ValueError, OverflowError) as error:
         raise SourceError(f"{path} is damaged: {error}") from error
     return images
 
