@@ -1,7 +1,6 @@
 """Commands for services that stay, and for what is done to them while they run."""
 
 import argparse
-import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -9,7 +8,7 @@ from prior_sg.deploy.cli.check import before_start
 from prior_sg.deploy.cli.doors import API_PORT, port_in
 from prior_sg.deploy.cli.jobs import add_run_options, settings_of
 from prior_sg.deploy.cli.ros_results import add_ros, bridge_arguments, check_ros
-from prior_sg.deploy.cli.shared import Commands, add_bus, add_router, console, open_client
+from prior_sg.deploy.cli.shared import Commands, add_bus, add_router, console, open_client, until_interrupted, wait
 from prior_sg.deploy.cli.source_options import add_source_options, read_options
 from prior_sg.deploy.edge import names_in
 from prior_sg.deploy.errors import UserError
@@ -90,7 +89,6 @@ def cmd_up(arguments: argparse.Namespace) -> int:
 
 
 def _stay_up(arguments: argparse.Namespace, names: list[str]) -> int:
-    from prior_sg.deploy.interrupts import insist
     from prior_sg.deploy.keys.routing import beyond_this_host
     from prior_sg.deploy.running.job import require_files
     from prior_sg.deploy.running.supervisor import Supervisor
@@ -117,25 +115,25 @@ def _stay_up(arguments: argparse.Namespace, names: list[str]) -> int:
     stop_router = (lambda: None) if arguments.no_router else open_router(arguments.connect, beyond)
     supervisor = Supervisor(arguments.connect, arguments.robot, arguments.out / "logs", settings, arguments.config)
     try:
-        for name in sorted(names, key=lambda name: name == "ingest"):
-            supervisor.start(name, arguments.workers if BY_NAME[name].job is not None else 1)
-        if arguments.api is not None:
-            _open_api(supervisor, arguments.api)
-        if arguments.ros is not None:
-            supervisor.start_door("ros", "prior_sg.deploy.ros.process", bridge_arguments(arguments))
-        listening = " and ".join((arguments.connect, *arguments.listen))
-        console.print(f"router {listening}; logs in {supervisor.log_folder}; Ctrl-C stops")
-        while True:
-            insist()
-            for event in supervisor.check():
-                console.print(event)
-            time.sleep(0.2)
-    except KeyboardInterrupt:
-        console.print("stopping")
+        with until_interrupted():
+            for name in sorted(names, key=lambda name: name == "ingest"):
+                supervisor.start(name, arguments.workers if BY_NAME[name].job is not None else 1)
+            if arguments.api is not None:
+                _open_api(supervisor, arguments.api)
+            if arguments.ros is not None:
+                supervisor.start_door("ros", "prior_sg.deploy.ros.process", bridge_arguments(arguments))
+            listening = " and ".join((arguments.connect, *arguments.listen))
+            console.print(f"router {listening}; logs in {supervisor.log_folder}; Ctrl-C stops")
+            wait(lambda: _tell(supervisor))
         return 0
     finally:
         supervisor.stop()
         stop_router()
+
+
+def _tell(supervisor: "Supervisor") -> None:
+    for event in supervisor.check():
+        console.print(event)
 
 
 def _open_api(supervisor: "Supervisor", port: int) -> None:

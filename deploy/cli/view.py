@@ -1,10 +1,9 @@
 """The live page: `prior-sg view`."""
 
 import argparse
-import time
 from typing import TYPE_CHECKING
 
-from prior_sg.deploy.cli.shared import Commands, add_bus, console
+from prior_sg.deploy.cli.shared import Commands, add_bus, console, until_interrupted, wait
 from prior_sg.deploy.errors import UserError
 
 if TYPE_CHECKING:
@@ -37,7 +36,6 @@ def add_commands(commands: Commands) -> None:
 
 def cmd_view(arguments: argparse.Namespace) -> int:
     """Serve the page until Ctrl-C."""
-    from prior_sg.deploy.interrupts import insist
     from prior_sg.deploy.viewing.page import Options, Page
 
     if arguments.host not in LOOPBACK:
@@ -52,11 +50,8 @@ def cmd_view(arguments: argparse.Namespace) -> int:
     page = Page(source, options)
     console.print(f"look at it: {page.address} ({source.title}); Ctrl-C stops")
     try:
-        while True:
-            insist()
-            time.sleep(0.2)
-    except KeyboardInterrupt:
-        console.print("stopping")
+        with until_interrupted():
+            wait()
         return 0
     finally:
         page.close()

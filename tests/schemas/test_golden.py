@@ -13,6 +13,7 @@ import pytest
 
 from prior_sg.schemas.codec import ARRAY_EXT_CODE, DTYPES, Message, decode, encode, message_types
 from prior_sg.schemas.migrations import current
+from prior_sg.schemas.queries import Spot
 from tests.help.examples import EXAMPLES, unset_fields
 
 GOLDEN = Path(__file__).parent / "golden"
@@ -66,6 +67,11 @@ def test_what_was_written_before_the_store_kept_history_means_the_present(name, 
     for field in defaults:
         del fields[field]
     assert decode(type(message), msgpack.packb(fields)) == msgspec.structs.replace(message, **defaults)
+
+
+def test_what_was_asked_before_routes_could_begin_here_begins_elsewhere():
+    asked = msgpack.packb({"point_m": [1.0, 2.0, 3.0], "what": None, "id": None, "label": ""})
+    assert msgspec.msgpack.decode(asked, type=Spot) == Spot(point_m=(1.0, 2.0, 3.0))
 
 
 def test_the_digest_of_a_prior_stays():
