@@ -80,6 +80,7 @@ OPTIONS = (
     Option("--graph-topic", "graph_topic", "TOPIC", "of a live robot: optimised poses (nav_msgs/Path) of --pose-frame"),
     Option("--fixed-frame", "fixed_frame", "FRAME", "the world, of tf; default: map, world, odom or the root"),
     Option("--pose-frame", "pose_frame", "FRAME", "the frame whose poses --pose-topic has"),
+    Option("--depth-model", "depth_model", "FILE", "ONNX file that sees depth in the pictures of a stereo camera"),
     Option(
         "--sync-tolerance", "sync_tolerance_s", "SECONDS", "most between stamps of one frame's colour, depth and pose"
     ),

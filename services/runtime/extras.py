@@ -29,6 +29,7 @@ MODULES = {  # by extra; what the build file lists there, by the names that code
     "rerun": ("rerun",),
     "foxglove": ("foxglove",),
     "ros": ("rosbags",),
+    "record3d": ("lzfse",),
     "hydra": ("zmq", "spark_dsg"),
 }
 CONTAINS = {
@@ -38,6 +39,7 @@ CONTAINS = {
     "export": ("clip", "encode", "map"),
     "foxglove": ("map",),
     "ros": ("map",),
+    "record3d": ("map",),
     "hydra": ("map",),
 }
 

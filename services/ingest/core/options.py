@@ -50,6 +50,7 @@ class ReadOptions(msgspec.Struct, frozen=True, kw_only=True):
     graph_topic: str = ""  # of a live robot: its optimised poses (nav_msgs/Path) of pose_frame; empty = jumps of tf
     fixed_frame: str = ""  # of tf: the world; empty = map, world, odom or the root
     pose_frame: str = ""  # the frame whose poses pose_topic has; empty = as its messages say, else the camera's
+    depth_model: str = ""  # an ONNX file that sees depth in two pictures; empty = OpenCV's semi-global matching
     sync_tolerance_s: float = 0.02  # most between stamps of colour, depth and pose that belong together
     ros_domain: int = 0  # of a live robot: its ROS_DOMAIN_ID
     end_after_s: float = 30.0  # a live source has ended after so long without a frame; 0 = never

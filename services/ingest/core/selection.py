@@ -125,9 +125,10 @@ def accept(state: State, frame: RawFrame, cfg: Config) -> Iterator[Written]:
         keyframe = _keyframe(state, frame)
         state.archive.put(keyframe, cfg.archive_mb * 1e6)
         state.keyframes += 1
-        state.encoding.add(keyframe.frame_id)
         yield KEYFRAME, keyframe
-        yield ENCODE, keyframe
+        if keyframe.color:  # a lidar alone sees nothing that could be encoded
+            state.encoding.add(keyframe.frame_id)
+            yield ENCODE, keyframe
     yield progress(state)
 
 
@@ -158,6 +159,8 @@ def encoded(state: State, done: JobDone) -> Iterator[Written]:
 def backfill(state: State, wish: Backfill) -> Iterator[Written]:
     """Encode archived keyframes again, in one space: those that the asking reader lacks. They give way to new ones."""
     for keyframe in state.archive.lacked(wish):
+        if not keyframe.color:
+            continue
         yield ENCODE, msgspec.structs.replace(keyframe, space=wish.space)
 
 

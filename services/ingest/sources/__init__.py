@@ -23,12 +23,31 @@ from prior_sg.services.ingest.sources import (
     tum,
 )
 from prior_sg.services.ingest.sources.base import Source, SourceError
+from prior_sg.services.ingest.sources.clouds import folder as clouds_folder
+from prior_sg.services.ingest.sources.exports import euroc, record3d, rtabmap, stray_scanner
 from prior_sg.services.ingest.sources.hints import hint
 from prior_sg.services.ingest.sources.normalise import finish
 
 __all__ = ["LAYOUT_NAMES", "ReadOptions", "Source", "SourceError", "open_source"]
 
-LAYOUTS = (dataset, seven_scenes, tum, icl_nuim, replica, scannet, hm3d, tartanground, coda, generic, ros)
+LAYOUTS = (
+    dataset,
+    seven_scenes,
+    tum,
+    icl_nuim,
+    replica,
+    scannet,
+    hm3d,
+    tartanground,
+    coda,
+    clouds_folder,
+    stray_scanner,
+    record3d,
+    rtabmap,
+    euroc,
+    generic,
+    ros,
+)
 LAYOUT_NAMES = (*(layout.NAME for layout in LAYOUTS), recording.NAME)
 
 

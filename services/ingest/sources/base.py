@@ -89,7 +89,7 @@ class Camera:
 class Images:
     """The pictures of one frame as their files hold them; depth may be an array of metres (h, w) already."""
 
-    color: bytes
+    color: bytes | None  # None = a sensor that sees no colour
     depth: bytes | np.ndarray
     mask: bytes = b""
 

@@ -3,6 +3,7 @@
 sensor_msgs/Image, CompressedImage    colour (raw, JPEG, PNG) and depth (16UC1 in millimetres, 32FC1 in metres, raw or
                                       compressedDepth with PNG)
 sensor_msgs/CameraInfo                the cameras; of images named …rect… the projection matrix counts
+sensor_msgs/PointCloud2               depth of a lidar, where there is none of a camera (clouds/ros.py)
 tf2_msgs/TFMessage                    /tf and /tf_static; or nav_msgs/Odometry, geometry_msgs/TransformStamped,
                                       PoseStamped, PoseWithCovarianceStamped
 
@@ -24,7 +25,7 @@ from prior_sg.services.ingest.core.options import ReadOptions
 from prior_sg.services.ingest.core.pairing import associate
 from prior_sg.services.ingest.core.poses import Convention, PoseError
 from prior_sg.services.ingest.core.ros.posing import Way, way_of
-from prior_sg.services.ingest.core.ros.topics import NAMED, Chosen, chosen, pose_topics
+from prior_sg.services.ingest.core.ros.topics import NAMED, Chosen, chosen, cloud_chosen, pose_topics
 from prior_sg.services.ingest.core.ros.transforms import Track
 from prior_sg.services.ingest.sources.base import (
     MILLIMETRE,
@@ -34,6 +35,7 @@ from prior_sg.services.ingest.sources.base import (
     SourceError,
     truth_beside,
 )
+from prior_sg.services.ingest.sources.clouds import ros as clouds_ros
 from prior_sg.services.ingest.sources.ros_bag import Bag, is_recording
 from prior_sg.services.ingest.sources.ros_pictures import Pictures, pictures
 from prior_sg.services.ingest.sources.ros_recorded import Recorded
@@ -55,6 +57,8 @@ def load(path: Path, options: ReadOptions) -> Found:
     bag = Bag(path)
     topics = bag.topics()
     try:
+        if (clouds := cloud_chosen(topics, options)) is not None:
+            return clouds_ros.load(NAME, bag, topics, clouds, options)
         choice, posing = chosen(topics, options), pose_topics(topics, options)
     except ValueError as error:
         raise SourceError(f"{path}: {error}") from error

@@ -129,7 +129,8 @@ class Bag:
         count = sum(connection.msgcount for connection in connections)
         kind, duration_s = connections[0].msgtype, self._reader.duration / 1e9
         topic = Topic(name, kind, count, count / duration_s if count > 1 and duration_s > 0 else 0.0)
-        if kind not in (ros_topics.IMAGE, ros_topics.COMPRESSED, ros_topics.CAMERA_INFO) or not count:
+        looked_at = (ros_topics.IMAGE, ros_topics.COMPRESSED, ros_topics.CAMERA_INFO, ros_topics.POINT_CLOUD)
+        if kind not in looked_at or not count:
             return topic
         return self._looked_at(topic)
 
@@ -141,7 +142,7 @@ class Bag:
             except FrameError:
                 continue
             frame = frame_name(message.header.frame_id)
-            if topic.type == ros_topics.CAMERA_INFO:
+            if topic.type in (ros_topics.CAMERA_INFO, ros_topics.POINT_CLOUD):
                 return Topic(topic.name, topic.type, topic.count, topic.rate_hz, frame=frame)
             said = encoding_of(message), frame, shown_by(message)
             return Topic(topic.name, topic.type, topic.count, topic.rate_hz, *said)

@@ -112,6 +112,11 @@ def pictures(rig: Rig) -> tuple[Camera, Pictures, str]:
     return pinhole, reader, how
 
 
+def color_camera(rig: Rig) -> Camera:
+    """The camera of colour, as its info or the options say. Raises SourceError."""
+    return _camera(rig, rig.choice.color, rig.choice.color_info) or _told_camera(rig.path, rig.options)
+
+
 def _camera(rig: Rig, image: Topic, info: Topic | None) -> Camera | None:
     """The camera that an info says; None where there is none. Raises SourceError."""
     if info is None or info.name not in rig.infos:
