@@ -51,7 +51,7 @@ def cmd_topics(arguments: argparse.Namespace) -> int:
 
 def _recorded(path: Path) -> "list[Topic]":
     """Topics of a recording. Raises UserError and SourceError."""
-    from prior_sg.services.ingest.sources.ros_bag import Bag, is_recording
+    from prior_sg.services.ingest.sources.ros.bag import Bag, is_recording
 
     if not path.exists() or not is_recording(path):
         raise UserError(
@@ -62,7 +62,7 @@ def _recorded(path: Path) -> "list[Topic]":
 
 def _heard(arguments: argparse.Namespace) -> "list[Topic]":
     """Topics of a running robot, of the types that can serve. Raises SourceError."""
-    from prior_sg.services.ingest.sources.ros_live import heard
+    from prior_sg.services.ingest.sources.ros.live import heard
 
     with console.status(f"listening to {arguments.source}"):
         return heard(arguments.source, arguments.domain, arguments.seconds)

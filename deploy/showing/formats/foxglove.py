@@ -77,6 +77,6 @@ def _images(material: Material) -> Iterator[Told]:
     for logged in read_log(material.log, (KEYFRAME,)):
         with contextlib.suppress(DecodeError):
             frame = decode(Keyframe, logged.payload)
-            if frame.robot == robot:
+            if frame.robot == robot and frame.color:  # a lidar without a camera has no picture
                 pose = poses.pose(frame.frame_id, frame.world_from_camera)
                 yield max(frame.stamp_ns, 0), 0, _Image(bytes(frame.color), frame.intrinsics, pose)

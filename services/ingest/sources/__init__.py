@@ -15,8 +15,6 @@ from prior_sg.services.ingest.sources import (
     icl_nuim,
     recording,
     replica,
-    ros,
-    ros_live,
     scannet,
     seven_scenes,
     tartanground,
@@ -27,6 +25,8 @@ from prior_sg.services.ingest.sources.clouds import folder as clouds_folder
 from prior_sg.services.ingest.sources.exports import euroc, record3d, rtabmap, stray_scanner
 from prior_sg.services.ingest.sources.hints import hint
 from prior_sg.services.ingest.sources.normalise import finish
+from prior_sg.services.ingest.sources.ros import live as ros_live
+from prior_sg.services.ingest.sources.ros import recordings as ros_recordings
 
 __all__ = ["LAYOUT_NAMES", "ReadOptions", "Source", "SourceError", "open_source"]
 
@@ -46,7 +46,7 @@ LAYOUTS = (
     rtabmap,
     euroc,
     generic,
-    ros,
+    ros_recordings,
 )
 LAYOUT_NAMES = (*(layout.NAME for layout in LAYOUTS), recording.NAME)
 
@@ -75,7 +75,7 @@ def open_source(
         raise SourceError(f"the source {path} does not exist: give {known}")
     if options.layout:
         return _as_told(path, options)
-    if path.is_file() and path.suffix == ".mcap" and not ros.fits(path):
+    if path.is_file() and path.suffix == ".mcap" and not ros_recordings.fits(path):
         return recording.load(path, options)
     for layout in LAYOUTS:
         if layout.fits(path):

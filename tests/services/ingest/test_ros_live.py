@@ -29,8 +29,8 @@ from prior_sg.services.ingest.core.ros.transforms import Stamped
 from prior_sg.services.ingest.core.selection import State
 from prior_sg.services.ingest.service import step
 from prior_sg.services.ingest.sources import Source, SourceError, open_source
-from prior_sg.services.ingest.sources.ros_live import Due, Stream, robot_of
-from prior_sg.services.ingest.sources.ros_look import Look
+from prior_sg.services.ingest.sources.ros.live import Due, Stream, robot_of
+from prior_sg.services.ingest.sources.ros.look import Look
 from prior_sg.services.runtime.ros.session import Received
 from prior_sg.services.runtime.ros.types import shared_types
 from prior_sg.services.runtime.ros.wire import PUBLISHER, Attachment, Channel, Entity
@@ -385,7 +385,7 @@ def test_a_robot_is_waited_for_read_without_pace_and_left_at_once(walked, monkey
 
 
 def test_where_no_robot_is_the_sentence_says_what_to_do(endpoint, monkeypatch):
-    monkeypatch.setattr("prior_sg.services.ingest.sources.ros_live.LOOK_S", 0.3)
+    monkeypatch.setattr("prior_sg.services.ingest.sources.ros.live.LOOK_S", 0.3)
     with pytest.raises(SourceError, match=r"it has no colour images; .*nobody publishes on domain 12\)"):
         open_source(f"ros2:/{endpoint}", options=ReadOptions(ros_domain=12))
     with pytest.raises(SourceError, match="leave out --rate"):

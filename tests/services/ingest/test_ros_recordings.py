@@ -325,7 +325,7 @@ def read_whole(store, name, data):
     """A message of any topic, all the way; raises what makes a bad frame."""
     try:
         message = store.deserialize_cdr(data, name)
-    except Exception as error:  # as sources/ros_bag.py does
+    except Exception as error:  # as sources/ros/bag.py does
         raise FrameError(str(error)) from error
     if hasattr(message, "transforms") or hasattr(message, "pose"):
         tree = TransformTree(list(transforms_of(message)))

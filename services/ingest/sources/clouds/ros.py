@@ -28,9 +28,9 @@ from prior_sg.services.ingest.sources.base import (
     truth_beside,
 )
 from prior_sg.services.ingest.sources.clouds.swept import Drawing, Lidar, Posed, view_entries
-from prior_sg.services.ingest.sources.ros_bag import Bag, Index
-from prior_sg.services.ingest.sources.ros_pictures import color_camera
-from prior_sg.services.ingest.sources.ros_recorded import Recorded
+from prior_sg.services.ingest.sources.ros.bag import Bag, Index
+from prior_sg.services.ingest.sources.ros.pictures import color_camera
+from prior_sg.services.ingest.sources.ros.recorded import Recorded
 
 EDGE_NS = 100_000_000  # a last sweep may end so long after the last pose
 

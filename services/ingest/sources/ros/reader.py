@@ -8,7 +8,7 @@ from prior_sg.services.ingest.core.ros.assembly import Assembly, Fault, Posed, S
 from prior_sg.services.ingest.core.ros.topics import POSES, TF_TYPES, Chosen, Topic
 from prior_sg.services.ingest.core.ros.transforms import Stamped, transforms_of, written_stamp_ns
 from prior_sg.services.ingest.sources.base import FrameError, Images
-from prior_sg.services.ingest.sources.ros_pictures import Pictures
+from prior_sg.services.ingest.sources.ros.pictures import Pictures
 from prior_sg.services.runtime.ros.session import Received
 from prior_sg.services.runtime.ros.types import Types
 from prior_sg.services.runtime.ros.wire import WireError

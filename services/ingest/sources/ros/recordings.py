@@ -36,9 +36,9 @@ from prior_sg.services.ingest.sources.base import (
     truth_beside,
 )
 from prior_sg.services.ingest.sources.clouds import ros as clouds_ros
-from prior_sg.services.ingest.sources.ros_bag import Bag, is_recording
-from prior_sg.services.ingest.sources.ros_pictures import Pictures, pictures
-from prior_sg.services.ingest.sources.ros_recorded import Recorded
+from prior_sg.services.ingest.sources.ros.bag import Bag, is_recording
+from prior_sg.services.ingest.sources.ros.pictures import Pictures, pictures
+from prior_sg.services.ingest.sources.ros.recorded import Recorded
 
 NAME = "ros"
 LOOKS = "a recording of ROS (a rosbag2 folder with metadata.yaml, .db3, .mcap or .bag)"

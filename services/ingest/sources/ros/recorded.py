@@ -15,8 +15,8 @@ from prior_sg.services.ingest.core.ros.transforms import Stamped, TransformTree,
 from prior_sg.services.ingest.sources.base import (
     FrameError,
 )
-from prior_sg.services.ingest.sources.ros_bag import Bag, Index
-from prior_sg.services.ingest.sources.ros_pictures import Rig
+from prior_sg.services.ingest.sources.ros.bag import Bag, Index
+from prior_sg.services.ingest.sources.ros.pictures import Rig
 
 
 class Recorded:

@@ -9,7 +9,7 @@ from prior_sg.services.ingest.core.ros.assembly import Fault
 from prior_sg.services.ingest.core.ros.images import encoding_of, shown_by
 from prior_sg.services.ingest.core.ros.topics import CAMERA_INFO, COMPRESSED, IMAGE, READ_TYPES, Topic
 from prior_sg.services.ingest.core.ros.transforms import frame_name
-from prior_sg.services.ingest.sources.ros_feed import Feed, Tally
+from prior_sg.services.ingest.sources.ros.feed import Feed, Tally
 from prior_sg.services.runtime.ros import wire
 from prior_sg.services.runtime.ros.session import Received, RosSession
 from prior_sg.services.runtime.ros.types import Types

@@ -40,10 +40,10 @@ from prior_sg.services.ingest.core.ros.topics import (
 from prior_sg.services.ingest.core.ros.transforms import Stamped, transforms_of
 from prior_sg.services.ingest.sources.base import MILLIMETRE, Event, Found, FrameError, Images, Source, SourceError
 from prior_sg.services.ingest.sources.normalise import UNUSABLE, Normaliser, prepare
-from prior_sg.services.ingest.sources.ros_feed import Feed, Tally
-from prior_sg.services.ingest.sources.ros_look import Look
-from prior_sg.services.ingest.sources.ros_pictures import Pictures, Rig, pictures
-from prior_sg.services.ingest.sources.ros_reader import Reader
+from prior_sg.services.ingest.sources.ros.feed import Feed, Tally
+from prior_sg.services.ingest.sources.ros.look import Look
+from prior_sg.services.ingest.sources.ros.pictures import Pictures, Rig, pictures
+from prior_sg.services.ingest.sources.ros.reader import Reader
 from prior_sg.services.runtime.bus import BusError
 from prior_sg.services.runtime.ros.session import ENDPOINT, Received, RosSession
 from prior_sg.services.runtime.ros.types import Types, shared_types

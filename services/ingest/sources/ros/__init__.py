@@ -1,0 +1,1 @@
+"""Recordings of ROS and robots that speak it."""
