@@ -44,6 +44,22 @@ class Started(Message, frozen=True, kw_only=True):
     versions: dict[str, int] = {}  # of messages, by name, where it is not 1
 
 
+class EpochRequest(Message, frozen=True, kw_only=True):
+    """Ask `keeper`, a service that follows deltas, how far the epochs of a robot's `topic` have come."""
+
+    robot: str
+    topic: str
+    keeper: str
+
+
+class EpochKnown(Message, frozen=True, kw_only=True):
+    """The epoch that is followed; -1 = none yet."""
+
+    robot: str
+    topic: str
+    epoch: int
+
+
 class Tick(Message, frozen=True, kw_only=True):
     """Time, as a message."""
 
@@ -105,3 +121,4 @@ class ServiceStatus(Message, frozen=True, kw_only=True):
     waiting_for: list[str]  # questions without an answer yet
     topics: list[TopicCount]
     losses: list[Loss] = []  # most frequent first
+    step_s: float = 0.0  # since when it has been at one input

@@ -9,6 +9,15 @@ import numpy as np
 from prior_sg.schemas.frames import PoseUpdate
 
 Verdict = Literal["apply", "stale", "gap"]
+LAST_EPOCH = 2**62
+BELIEVED_NS = 10 * 365 * 86400 * 10**9  # how far one epoch may lie above the one before: clocks mended, long rests
+
+
+def next_epoch(now_ns: int, known: int) -> int:
+    """The epoch of a writer that starts now, where `known` is the highest seen (-1 = none): the time, which no other
+    draws, unless the clock is behind what was seen or too far ahead to be believed.
+    """
+    return now_ns if known < 0 or known < now_ns <= known + BELIEVED_NS else known + 1
 
 
 class Delta(Protocol):

@@ -37,6 +37,11 @@ def add_commands(commands: Commands) -> None:
     up.add_argument(
         "--api", nargs="?", type=port_in, const=API_PORT, default=None, metavar="PORT", help="also serve HTTP there"
     )
+    up.add_argument(
+        "--restart-hung",
+        action="store_true",
+        help="kill and start again what exists and is not heard; default: say so, for it may be stopped on purpose",
+    )
     add_run_options(up)
     add_source_options(up)
 
@@ -89,6 +94,7 @@ def _stay_up(arguments: argparse.Namespace, names: list[str]) -> int:
     from prior_sg.deploy.interrupts import insist
     from prior_sg.deploy.keys.routing import beyond_this_host
     from prior_sg.deploy.running.job import require_files
+    from prior_sg.deploy.running.roll import Roll
     from prior_sg.deploy.running.supervisor import Supervisor
     from prior_sg.deploy.settings import check_settings
     from prior_sg.services.registry import BY_NAME
@@ -110,6 +116,8 @@ def _stay_up(arguments: argparse.Namespace, names: list[str]) -> int:
         open_client(arguments.connect).bus.close()  # finds out at once whether a router is there
     stop_router = (lambda: None) if arguments.no_router else open_router(arguments.connect, beyond)
     supervisor = Supervisor(arguments.connect, arguments.robot, arguments.out / "logs", settings, arguments.config)
+    client = open_client(arguments.connect)
+    roll = Roll(client.bus)
     try:
         for name in sorted(names, key=lambda name: name == "ingest"):
             supervisor.start(name, arguments.workers if BY_NAME[name].job is not None else 1)
@@ -119,7 +127,10 @@ def _stay_up(arguments: argparse.Namespace, names: list[str]) -> int:
         console.print(f"router {listening}; logs in {supervisor.log_folder}; Ctrl-C stops")
         while True:
             insist()
-            for event in supervisor.check():
+            silence, hung = roll.check(supervisor.children)
+            for child in hung if arguments.restart_hung else ():
+                child.kill()
+            for event in (*silence, *supervisor.check()):
                 console.print(event)
             time.sleep(0.2)
     except KeyboardInterrupt:
@@ -127,6 +138,7 @@ def _stay_up(arguments: argparse.Namespace, names: list[str]) -> int:
         return 0
     finally:
         supervisor.stop()
+        client.bus.close()
         stop_router()
 
 

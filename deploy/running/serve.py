@@ -9,26 +9,31 @@ import signal
 import sys
 import time
 import uuid
+from collections.abc import Coroutine
 from pathlib import Path
+from typing import Any
 
 from prior_sg import services
 from prior_sg.deploy.edge import check_arguments
 from prior_sg.deploy.errors import UserError
 from prior_sg.deploy.settings import DEFAULT_ROBOT, add_keys, connect_in_force, resolved_config, use_keys
 from prior_sg.deploy.terminal import complain
+from prior_sg.schemas.topics import EPOCH
 from prior_sg.services.runtime import extras
 from prior_sg.services.runtime.bus import BusError
 from prior_sg.services.runtime.config import ConfigError
 from prior_sg.services.runtime.host.host import Host
+from prior_sg.services.runtime.host.lease import Fence, Lease, SupersededError
 from prior_sg.services.runtime.logs import start_logging
 from prior_sg.services.runtime.record import LogError
-from prior_sg.services.runtime.service import Identity, ServiceError
+from prior_sg.services.runtime.service import Identity, Service, ServiceError
 from prior_sg.services.runtime.zenoh_bus import ZenohBus
 
 log = logging.getLogger(__name__)
 PARENT_CHECK_S = 1.0
 HOPELESS = (ConfigError, BusError, ServiceError, LogError)  # their messages say what to do
 EXIT_HOPELESS = 2  # starting again would fail again
+EXIT_SUPERSEDED = 3  # another is in charge: started again, it waits for that one's end
 
 
 def service_names() -> list[str]:
@@ -57,23 +62,63 @@ async def serve(arguments: argparse.Namespace, instance: str) -> None:
     service = BY_NAME[arguments.service]
     cfg = resolved_config(service, arguments.config, arguments.set)
     bus = await asyncio.to_thread(ZenohBus, arguments.connect)
-    robot = arguments.robot if service.scope == "robot" else "*"
-    host = Host(service, bus, cfg, Identity(robot, instance, time.time_ns()))
+    stopping = asyncio.Event()
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):
-        loop.add_signal_handler(number, host.stop)
-    watcher = asyncio.create_task(_stop_with_parent(host, arguments.parent))
+        loop.add_signal_handler(number, stopping.set)
+    watcher = asyncio.create_task(_stop_with_parent(stopping, arguments.parent))
     try:
-        await host.run()
+        host = await _unless(stopping, _in_charge(service, bus, cfg, arguments.robot, instance))
+        if host is not None:
+            await _stopped_by(stopping, host)
     finally:
         watcher.cancel()
         bus.close()  # also when the service never got so far as to leave by itself
 
 
-async def _stop_with_parent(host: Host, parent: int) -> None:
+async def _in_charge(service: Service, bus: ZenohBus, cfg: Any, robot: str, instance: str) -> Host:
+    """The host of a service, once it may write."""
+    from prior_sg.services.registry import LEASED, SERVICES
+
+    robot = robot if service.scope == "robot" else "*"
+    fence = await asyncio.to_thread(Fence, bus, robot, LEASED)
+    if service.scope != "robot":
+        return Host(service, bus, cfg, Identity(robot, instance, time.time_ns()), fence=fence)
+    topics = [topic for topic in service.writes if topic.name in LEASED]
+    keepers = [other.name for other in SERVICES if EPOCH in other.answers and other is not service]
+    lease = Lease(bus, robot, service.name, instance, topics=topics, keepers=keepers)
+    return Host(service, bus, cfg, Identity(robot, instance, await lease.take()), lease=lease, fence=fence)
+
+
+async def _unless(stopping: asyncio.Event, starting: Coroutine[Any, Any, Host]) -> Host | None:
+    """What is awaited, or None where the process is to stop before."""
+    start, stop = asyncio.create_task(starting), asyncio.create_task(stopping.wait())
+    await asyncio.wait((start, stop), return_when=asyncio.FIRST_COMPLETED)
+    stop.cancel()
+    if start.done():
+        return start.result()
+    start.cancel()
+    return None
+
+
+async def _stopped_by(stopping: asyncio.Event, host: Host) -> None:
+    """Run a host until it ends or is told to."""
+
+    async def tell() -> None:
+        await stopping.wait()
+        host.stop()
+
+    telling = asyncio.create_task(tell())
+    try:
+        await host.run()
+    finally:
+        telling.cancel()
+
+
+async def _stop_with_parent(stopping: asyncio.Event, parent: int) -> None:
     while not parent or os.getppid() == parent:
         await asyncio.sleep(PARENT_CHECK_S)
-    host.stop()
+    stopping.set()
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -90,6 +135,9 @@ def run(arguments: argparse.Namespace) -> int:
     except HOPELESS as error:
         log.error(str(error))
         return EXIT_HOPELESS
+    except SupersededError as error:
+        log.error(str(error))
+        return EXIT_SUPERSEDED
     except Exception as error:
         if isinstance(error, ModuleNotFoundError) and (advice := extras.advice(error)) is not None:
             log.error(advice)

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import msgspec
 
@@ -13,8 +13,9 @@ from prior_sg.schemas.priors import Prior, Task, TaskInForce, TaskRequest
 from prior_sg.schemas.queries import SceneAnswer, SceneQuery
 from prior_sg.schemas.regions import RegionDelta
 from prior_sg.schemas.scene import HistoryRequest, RevisionList, Scene, SceneRequest
-from prior_sg.schemas.status import Tick
+from prior_sg.schemas.status import EpochKnown, EpochRequest, Tick
 from prior_sg.schemas.topics import (
+    EPOCH,
     HISTORY,
     OBJECT_DELTA,
     OBJECT_SNAPSHOT,
@@ -182,6 +183,18 @@ def answer_task(state: State, request: TaskRequest, cfg: core.Config) -> TaskInF
     return TaskInForce(robot=request.robot, task=robot.graph.task if robot else None)
 
 
+def answer_epoch(state: State, request: EpochRequest, cfg: core.Config) -> EpochKnown:
+    """How far a writer's epochs have come, for its successor."""
+    robot = state.robots.get(request.robot) or _robot(core.Graph(request.robot))
+    followers: dict[str, Follower[Any]] = {
+        PLACE_DELTA.name: robot.places,
+        REGION_DELTA.name: robot.regions,
+        OBJECT_DELTA.name: robot.objects,
+    }
+    follower = followers.get(request.topic)
+    return EpochKnown(robot=request.robot, topic=request.topic, epoch=-1 if follower is None else follower.epoch)
+
+
 def close(state: State) -> None:
     """Close the database."""
     state.database.close()
@@ -196,7 +209,14 @@ SERVICE = Service(
     step=step,
     reads=(PLACE_DELTA, REGION_DELTA, OBJECT_DELTA, TASK, PRIOR),
     writes=(SCENE_REVISION,),
-    answers={SCENE: answer_scene, SCENE_QUERY: answer_query, HISTORY: answer_history, TASK_IN_FORCE: answer_task},
+    answers={
+        SCENE: answer_scene,
+        SCENE_QUERY: answer_query,
+        HISTORY: answer_history,
+        TASK_IN_FORCE: answer_task,
+        EPOCH: answer_epoch,
+    },
+    key_fields=lambda cfg: {"keeper": "scene_store"},
     asks=(PLACE_SNAPSHOT, REGION_SNAPSHOT, OBJECT_SNAPSHOT),
     tick_s=CHECKPOINT_S,
     close=close,

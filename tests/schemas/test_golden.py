@@ -68,6 +68,13 @@ def test_what_was_written_before_the_store_kept_history_means_the_present(name, 
     assert decode(type(message), msgpack.packb(fields)) == msgspec.structs.replace(message, **defaults)
 
 
+def test_what_was_written_before_a_long_step_was_told_has_none():
+    message = next(example for example in EXAMPLES if by_name(example) == "ServiceStatus")
+    fields = msgpack.unpackb(encode(message), ext_hook=msgpack.ExtType)
+    del fields["step_s"]
+    assert decode(type(message), msgpack.packb(fields)) == msgspec.structs.replace(message, step_s=0.0)
+
+
 def test_the_digest_of_a_prior_stays():
     prior = next(example for example in EXAMPLES if by_name(example) == "Prior")
     assert prior.digest() == "eab9114663fcaab470acb71942c653fc"

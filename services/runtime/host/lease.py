@@ -1,0 +1,197 @@
+"""One writer for each robot and service: who is in charge holds a token that names its epoch.
+
+The token is Zenoh's liveliness: it goes when its holder ends, dies or cannot be reached. An epoch is drawn above every
+one seen: in tokens, and by the keepers, the services that follow the writer. Where two are in charge, after a link was
+cut or when both began at once, the higher epoch wins and the other stops itself. One that starts while another is in
+charge waits for its end.
+"""
+
+import asyncio
+import logging
+import re
+import time
+from collections.abc import Callable, Iterable, Sequence
+from typing import NamedTuple
+
+from prior_sg.schemas.codec import DecodeError, decode, encode
+from prior_sg.schemas.status import EpochKnown, EpochRequest
+from prior_sg.schemas.topics import EPOCH, WAITING, Topic, lease_key
+from prior_sg.services.deltas import LAST_EPOCH, next_epoch
+from prior_sg.services.errors import PriorSgError
+from prior_sg.services.runtime.bus import Answer, Bus
+
+log = logging.getLogger(__name__)
+
+GRACE_S = 1.5  # a router that was started again hears within a second from everybody who lost it
+CHECK_S = 5.0
+ANSWER_S = 2.0
+
+
+class SupersededError(PriorSgError):
+    """This process is not the one that writes: it has stopped itself, and says why."""
+
+
+class Holder(NamedTuple):
+    """Who is in charge; of several, the greatest."""
+
+    epoch: int
+    instance: str
+
+
+class Standing(NamedTuple):
+    """What one token says."""
+
+    robot: str
+    service: str
+    holder: Holder | None  # None = waits
+    instance: str
+
+
+def standing(key: str) -> Standing | None:
+    """What a token of a lease says; None where it is none."""
+    parts = key.split("/")
+    if len(parts) != 6:
+        return None
+    _, robot, _, service, number, instance = parts
+    if number == WAITING:
+        return Standing(robot, service, None, instance)
+    if not re.fullmatch(r"[1-9]\d{0,18}", number) or int(number) > LAST_EPOCH:
+        return None
+    return Standing(robot, service, Holder(int(number), instance), instance)
+
+
+class Lease:
+    """The right of one process to write for a robot. `await take()`, then `await keep()`, which ends by
+    SupersededError.
+    """
+
+    def __init__(
+        self,
+        bus: Bus,
+        robot: str,
+        service: str,
+        instance: str,
+        *,
+        topics: Sequence[Topic] = (),
+        keepers: Sequence[str] = (),
+    ) -> None:
+        self._bus, self._robot, self._service, self._instance = bus, robot, service, instance
+        self._asked = [(topic.name, keeper) for topic in topics for keeper in keepers]
+        self._pattern = lease_key(robot, service, "*", "*")
+        self._loop = asyncio.get_running_loop()
+        self._changed = asyncio.Event()
+        self.holder = Holder(-1, instance)
+
+    async def take(self) -> int:
+        """Wait until nobody else is in charge, then be it; returns the epoch."""
+        await asyncio.to_thread(self._bus.watch, self._pattern, self._saw)
+        await self._wait_for_others()
+        while True:
+            others = await self._others()
+            known = await self._known()
+            epoch = next_epoch(time.time_ns(), max([known, *(other.epoch for other in others)]))
+            self.holder = Holder(epoch, self._instance)
+            withdraw = await asyncio.to_thread(self._announce, str(epoch))
+            others = await self._others()
+            if max([self.holder, *others]) == self.holder:
+                return epoch
+            withdraw()
+            await self._wait_for_others()
+
+    async def keep(self) -> None:
+        """Until another is in charge. Raises SupersededError."""
+        while True:
+            self._changed.clear()
+            if (other := max([self.holder, *await self._others()])) != self.holder:
+                raise SupersededError(
+                    f"{other.instance} is in charge of {self._what} since epoch {other.epoch}, after this process "
+                    f"(epoch {self.holder.epoch}): this one stops; end the other if it is not meant to write"
+                )
+            if (known := await self._known()) > self.holder.epoch:
+                raise SupersededError(
+                    f"readers follow epoch {known} of {self._what}, and nobody is in charge of it: this process (epoch "
+                    f"{self.holder.epoch}) starts again above it"
+                )
+            try:
+                await asyncio.wait_for(self._changed.wait(), CHECK_S)
+            except TimeoutError:
+                continue
+
+    @property
+    def _what(self) -> str:
+        return f"{self._service} of {self._robot}"
+
+    def _announce(self, epoch: str) -> Callable[[], None]:
+        return self._bus.announce(lease_key(self._robot, self._service, epoch, self._instance))
+
+    async def _wait_for_others(self) -> None:
+        if not (others := await self._others()):
+            return
+        log.warning(
+            f"{max(others).instance} is in charge of {self._what}: waiting for its end, then this one takes over"
+        )
+        withdraw = await asyncio.to_thread(self._announce, WAITING)
+        while True:
+            self._changed.clear()
+            if not await self._others():
+                await asyncio.sleep(GRACE_S)
+                if not await self._others() and self._bus.connected():
+                    break
+            else:
+                await self._changed.wait()
+        withdraw()
+        log.warning(f"nobody is in charge of {self._what} any more: this process takes over")
+
+    async def _others(self) -> list[Holder]:
+        """The others in charge now."""
+        keys = await asyncio.to_thread(self._bus.announced, self._pattern, ANSWER_S)
+        told = [one.holder for key in keys if (one := standing(key)) is not None]
+        return [holder for holder in told if holder is not None and holder != self.holder]
+
+    async def _known(self) -> int:
+        """The highest epoch that a keeper follows; -1 where there is none."""
+        return max(await asyncio.gather(*(self._ask(*asked) for asked in self._asked)), default=-1)
+
+    async def _ask(self, topic: str, keeper: str) -> int:
+        request = EpochRequest(robot=self._robot, topic=topic, keeper=keeper)
+        answered: asyncio.Future[Answer] = self._loop.create_future()
+
+        def receive(answer: Answer) -> None:
+            self._loop.call_soon_threadsafe(answered.set_result, answer)
+
+        await asyncio.to_thread(self._bus.call, EPOCH.key_of(request), encode(request), ANSWER_S, receive)
+        payload = (await answered).payload
+        try:
+            return -1 if payload is None else min(decode(EpochKnown, payload).epoch, LAST_EPOCH)
+        except DecodeError as error:
+            log.warning("epoch not understood", extra={"keeper": keeper, "why": str(error)[:200]})
+            return -1
+
+    def _saw(self, key: str, alive: bool) -> None:
+        self._loop.call_soon_threadsafe(self._changed.set)
+
+
+class Fence:
+    """Which epochs of which writers are let in: none above that of the one in charge, where somebody is. `services`
+    names the service that writes each topic."""
+
+    def __init__(self, bus: Bus, robot: str, services: dict[str, str]) -> None:
+        self._services = services
+        self._holders: dict[tuple[str, str], set[Holder]] = {}
+        for service in sorted({*services.values()}):
+            bus.watch(lease_key(robot, service, "*", "*"), self._saw)
+
+    def fault_of(self, topic: str, robot: str, epoch: int) -> str:
+        """Why a delta of this epoch is not let in, as a sentence; empty when it is."""
+        service = self._services.get(topic, "")
+        holders: Iterable[Holder] = tuple(self._holders.get((robot, service), ()))
+        top = max(holders, default=None)
+        if top is None or epoch <= top.epoch:
+            return ""
+        return f"it is of epoch {epoch}, and {top.instance} is in charge of {service} of {robot} with epoch {top.epoch}"
+
+    def _saw(self, key: str, alive: bool) -> None:
+        one = standing(key)
+        if one is not None and one.holder is not None:
+            known = self._holders.get((one.robot, one.service), set())
+            self._holders[one.robot, one.service] = known | {one.holder} if alive else known - {one.holder}
