@@ -25,6 +25,7 @@ log = logging.getLogger(__name__)
 GRACE_S = 1.5  # a router that was started again hears within a second from everybody who lost it
 CHECK_S = 5.0
 ANSWER_S = 2.0
+HISTORY_S = 0.3  # in which a watch hears of who is there
 
 
 class SupersededError(PriorSgError):
@@ -80,11 +81,16 @@ class Lease:
         self._pattern = lease_key(robot, service, "*", "*")
         self._loop = asyncio.get_running_loop()
         self._changed = asyncio.Event()
+        self._seen: frozenset[str] = frozenset()
         self.holder = Holder(-1, instance)
 
     async def take(self) -> int:
         """Wait until nobody else is in charge, then be it; returns the epoch."""
+        others = (
+            await self._others()
+        )  # before watching: Zenoh answers from what a watch has heard so far, which is nothing
         await asyncio.to_thread(self._bus.watch, self._pattern, self._saw)
+        await asyncio.sleep(HISTORY_S if others else 0.0)
         await self._wait_for_others()
         while True:
             others = await self._others()
@@ -102,12 +108,10 @@ class Lease:
         """Until another is in charge. Raises SupersededError."""
         while True:
             self._changed.clear()
-            if (other := max([self.holder, *await self._others()])) != self.holder:
-                raise SupersededError(
-                    f"{other.instance} is in charge of {self._what} since epoch {other.epoch}, after this process "
-                    f"(epoch {self.holder.epoch}): this one stops; end the other if it is not meant to write"
-                )
+            await self._check_others()
             if (known := await self._known()) > self.holder.epoch:
+                await asyncio.sleep(GRACE_S)  # after a pause or a cut, who is in charge is heard a moment later
+                await self._check_others()
                 raise SupersededError(
                     f"readers follow epoch {known} of {self._what}, and nobody is in charge of it: this process (epoch "
                     f"{self.holder.epoch}) starts again above it"
@@ -116,6 +120,13 @@ class Lease:
                 await asyncio.wait_for(self._changed.wait(), CHECK_S)
             except TimeoutError:
                 continue
+
+    async def _check_others(self) -> None:
+        if (other := max([self.holder, *await self._others()])) != self.holder:
+            raise SupersededError(
+                f"{other.instance} is in charge of {self._what} since epoch {other.epoch}, after this process (epoch "
+                f"{self.holder.epoch}): this one stops; end the other if it is not meant to write"
+            )
 
     @property
     def _what(self) -> str:
@@ -144,7 +155,7 @@ class Lease:
 
     async def _others(self) -> list[Holder]:
         """The others in charge now."""
-        keys = await asyncio.to_thread(self._bus.announced, self._pattern, ANSWER_S)
+        keys = self._seen | await asyncio.to_thread(self._bus.announced, self._pattern, ANSWER_S)
         told = [one.holder for key in keys if (one := standing(key)) is not None]
         return [holder for holder in told if holder is not None and holder != self.holder]
 
@@ -168,6 +179,7 @@ class Lease:
             return -1
 
     def _saw(self, key: str, alive: bool) -> None:
+        self._seen = self._seen | {key} if alive else self._seen - {key}
         self._loop.call_soon_threadsafe(self._changed.set)
 
 
