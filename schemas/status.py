@@ -53,11 +53,12 @@ class EpochRequest(Message, frozen=True, kw_only=True):
 
 
 class EpochKnown(Message, frozen=True, kw_only=True):
-    """The epoch that is followed; -1 = none yet."""
+    """The epoch that is followed, and its newest revision; -1 = none yet."""
 
     robot: str
     topic: str
     epoch: int
+    revision: int
 
 
 class Tick(Message, frozen=True, kw_only=True):

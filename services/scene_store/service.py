@@ -1,5 +1,6 @@
 """Keeps every robot's scene graph durably: reads deltas, writes revisions, answers with the scene."""
 
+import logging
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, TypeVar
@@ -38,6 +39,7 @@ from prior_sg.services.scene_store.core.queries.answering import reply
 from prior_sg.services.scene_store.core.queries.index import Index
 from prior_sg.services.scene_store.database import Database
 
+log = logging.getLogger(__name__)
 CHECKPOINT_S = 1.0  # the write-ahead log is folded into the file between deltas, not within a commit
 D = TypeVar("D", PlaceDelta, RegionDelta, ObjectDelta)
 
@@ -88,6 +90,10 @@ def step(state: State, message: Message, cfg: core.Config) -> Iterator[Output]:
         case Prior():
             state.database.put_prior(message)
         case Tick():
+            for robot in state.robots.values():
+                if (task := core.mend_task(robot.graph, message.stamp_ns)) is not None:
+                    log.warning("a task was stamped in the far future: it is stamped anew", extra={"robot": task.robot})
+                    state.database.put_task(robot.graph, task)
             state.database.rest(robot.graph for robot in state.robots.values())
 
 
@@ -102,8 +108,9 @@ def _resume(state: State) -> Iterator[Output]:
 
 def _take_places(state: State, robot: Robot, delta: PlaceDelta) -> Iterator[Output]:
     """Where the cameras were is known even while the delta itself must wait."""
+    verdict = robot.places.verdict(delta)
     cameras = core.note_cameras(robot.graph, delta)
-    if cameras and robot.places.verdict(delta) != "apply":
+    if cameras and verdict != "apply":
         state.database.put_cameras(robot.graph, delta)
     yield from _follow(state, robot, robot.places, delta, apply=core.apply_places, snapshot=PLACE_SNAPSHOT)
 
@@ -191,8 +198,8 @@ def answer_epoch(state: State, request: EpochRequest, cfg: core.Config) -> Epoch
         REGION_DELTA.name: robot.regions,
         OBJECT_DELTA.name: robot.objects,
     }
-    follower = followers.get(request.topic)
-    return EpochKnown(robot=request.robot, topic=request.topic, epoch=-1 if follower is None else follower.epoch)
+    follower = followers.get(request.topic, Follower())
+    return EpochKnown(robot=request.robot, topic=request.topic, epoch=follower.epoch, revision=follower.revision)
 
 
 def close(state: State) -> None:

@@ -31,6 +31,7 @@ from prior_sg.schemas.topics import (
     TEXT,
     topic_of,
 )
+from prior_sg.services.deltas import Follower
 from prior_sg.services.runtime.service import Ask, Identity, Output, Service, ServiceError
 from prior_sg.services.segmenter.core import report, update
 from prior_sg.services.segmenter.core.config import Config
@@ -79,8 +80,8 @@ def answer_posterior(state: State, request: PosteriorRequest, cfg: Config) -> Po
 
 def answer_epoch(state: State, request: EpochRequest, cfg: Config) -> EpochKnown:
     """How far the epochs of the place graph have come, for its successor."""
-    epoch = state.map.follower.epoch if request.topic == PLACE_DELTA.name else -1
-    return EpochKnown(robot=request.robot, topic=request.topic, epoch=epoch)
+    follower = state.map.follower if request.topic == PLACE_DELTA.name else Follower()
+    return EpochKnown(robot=request.robot, topic=request.topic, epoch=follower.epoch, revision=follower.revision)
 
 
 SERVICE = Service(

@@ -18,6 +18,7 @@ import msgspec
 import psutil
 
 from prior_sg.schemas.codec import DecodeError, Message, decode, encode, versions
+from prior_sg.schemas.priors import Task, TaskInForce
 from prior_sg.schemas.status import Consumed, JobDone, ServiceStatus, Started, StatusRequest, Tick, TopicCount
 from prior_sg.schemas.topics import (
     DELTAS,
@@ -30,7 +31,7 @@ from prior_sg.schemas.topics import (
     topic_of,
     worker_keys,
 )
-from prior_sg.services.refusals import InputRefused, NotYet
+from prior_sg.services.refusals import InputRefused, NotYet, fault_of_stamp
 from prior_sg.services.runtime.bus import Bus, Request, Sample
 from prior_sg.services.runtime.host.asks import Asks, Reply
 from prior_sg.services.runtime.host.door import Door
@@ -211,7 +212,9 @@ class Host:
             sample.payload,
             name=topic.name,
             key=key,
-            fault_of=lambda message: topic.fault_of(key, message) or self._fault_of_writer(message),
+            fault_of=lambda message: (
+                topic.fault_of(key, message) or self._fault_of_writer(message) or _fault_of_clock(message)
+            ),
             writer=sample.writer,
         )
         if message is None:
@@ -237,7 +240,9 @@ class Host:
             reply.payload,
             name=query.name,
             key=query.key,
-            fault_of=lambda told: _fault_of_reply(reply.ask.request, told) or self._fault_of_writer(told),
+            fault_of=lambda told: (
+                _fault_of_reply(reply.ask.request, told) or self._fault_of_writer(told) or _fault_of_clock(told)
+            ),
         )
         if message is None:
             self._asks.ask_later(reply.ask)
@@ -337,6 +342,8 @@ class Host:
             group = getattr(message, "space", "")  # of a back-fill, which gives way to the stream
             self._pools[topic].submit(job_id, encode(message), group, later=bool(group))
         else:
+            if self._lease is not None and topic in DELTAS:
+                self._lease.tells(topic.name, message.revision)  # type: ignore[attr-defined]
             self._outbox.put(topic, message)
 
     def _ask(self, ask: Ask) -> None:
@@ -424,3 +431,9 @@ def _fault_of_reply(request: Message, reply: Message) -> str:
     """Why this is no answer to the request: it speaks of another robot."""
     asked, told = (getattr(message, "robot", None) for message in (request, reply))
     return "" if None in (asked, told) or asked == told else f"asked about {asked!r}, told about {told!r}"
+
+
+def _fault_of_clock(message: Message) -> str:
+    """Why a task cannot be as new as it says. Looked at here, where there is a clock: what is refused is no input."""
+    task = message.task if isinstance(message, TaskInForce) else message
+    return fault_of_stamp("the task", task.stamp_ns, time.time_ns()) if isinstance(task, Task) else ""

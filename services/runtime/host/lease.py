@@ -81,21 +81,21 @@ class Lease:
         self._pattern = lease_key(robot, service, "*", "*")
         self._loop = asyncio.get_running_loop()
         self._changed = asyncio.Event()
+        self._revisions: dict[str, int] = {}  # told last, by topic
         self._seen: frozenset[str] = frozenset()
         self.holder = Holder(-1, instance)
 
     async def take(self) -> int:
         """Wait until nobody else is in charge, then be it; returns the epoch."""
-        others = (
-            await self._others()
-        )  # before watching: Zenoh answers from what a watch has heard so far, which is nothing
+        others = await self._others()  # first: beside a watch, Zenoh answers from what that has heard so far
         await asyncio.to_thread(self._bus.watch, self._pattern, self._saw)
         await asyncio.sleep(HISTORY_S if others else 0.0)
         await self._wait_for_others()
         while True:
             others = await self._others()
             known = await self._known()
-            epoch = next_epoch(time.time_ns(), max([known, *(other.epoch for other in others)]))
+            followed = max((epoch for epoch, _ in known.values()), default=-1)
+            epoch = next_epoch(time.time_ns(), max([followed, *(other.epoch for other in others)]))
             self.holder = Holder(epoch, self._instance)
             withdraw = await asyncio.to_thread(self._announce, str(epoch))
             others = await self._others()
@@ -109,12 +109,12 @@ class Lease:
         while True:
             self._changed.clear()
             await self._check_others()
-            if (known := await self._known()) > self.holder.epoch:
+            if ahead := [topic for topic, told in (await self._known()).items() if told > self._told(topic)]:
                 await asyncio.sleep(GRACE_S)  # after a pause or a cut, who is in charge is heard a moment later
                 await self._check_others()
                 raise SupersededError(
-                    f"readers follow epoch {known} of {self._what}, and nobody is in charge of it: this process (epoch "
-                    f"{self.holder.epoch}) starts again above it"
+                    f"readers of {', '.join(ahead)} follow what {self._what} did not write, and no other is in charge: "
+                    f"this process (epoch {self.holder.epoch}) starts again above it"
                 )
             try:
                 await asyncio.wait_for(self._changed.wait(), CHECK_S)
@@ -159,11 +159,22 @@ class Lease:
         told = [one.holder for key in keys if (one := standing(key)) is not None]
         return [holder for holder in told if holder is not None and holder != self.holder]
 
-    async def _known(self) -> int:
-        """The highest epoch that a keeper follows; -1 where there is none."""
-        return max(await asyncio.gather(*(self._ask(*asked) for asked in self._asked)), default=-1)
+    def tells(self, topic: str, revision: int) -> None:
+        """This process is about to tell a revision."""
+        self._revisions[topic] = revision
 
-    async def _ask(self, topic: str, keeper: str) -> int:
+    def _told(self, topic: str) -> tuple[int, int]:
+        return self.holder.epoch, self._revisions.get(topic, -1)
+
+    async def _known(self) -> dict[str, tuple[int, int]]:
+        """The highest epoch and revision that a keeper follows, by topic; those before any left out."""
+        known: dict[str, tuple[int, int]] = {}
+        for told in await asyncio.gather(*(self._ask(*asked) for asked in self._asked)):
+            if told is not None:
+                known[told.topic] = max(known.get(told.topic, (-1, -1)), (min(told.epoch, LAST_EPOCH), told.revision))
+        return known
+
+    async def _ask(self, topic: str, keeper: str) -> EpochKnown | None:
         request = EpochRequest(robot=self._robot, topic=topic, keeper=keeper)
         answered: asyncio.Future[Answer] = self._loop.create_future()
 
@@ -173,10 +184,10 @@ class Lease:
         await asyncio.to_thread(self._bus.call, EPOCH.key_of(request), encode(request), ANSWER_S, receive)
         payload = (await answered).payload
         try:
-            return -1 if payload is None else min(decode(EpochKnown, payload).epoch, LAST_EPOCH)
+            return None if payload is None else decode(EpochKnown, payload)
         except DecodeError as error:
             log.warning("epoch not understood", extra={"keeper": keeper, "why": str(error)[:200]})
-            return -1
+            return None
 
     def _saw(self, key: str, alive: bool) -> None:
         self._seen = self._seen | {key} if alive else self._seen - {key}

@@ -15,7 +15,7 @@ from prior_sg.schemas.places import MapRequest, SnapshotRequest, VoxelMap
 from prior_sg.schemas.priors import Task, TaskInForce
 from prior_sg.schemas.status import Consumed, JobDone, Started, Tick
 from prior_sg.schemas.topics import ENCODE, JOURNAL, KEYFRAME, PLACE_SNAPSHOT, TASK, TASK_IN_FORCE, VOXEL_MAP, job_key
-from prior_sg.services.refusals import InputRefused
+from prior_sg.services.refusals import InputRefused, fault_of_stamp
 from prior_sg.services.runtime.bus import Hub, LocalBus, pack_header
 from prior_sg.services.runtime.client import BusClient
 from prior_sg.services.runtime.host.host import Host
@@ -403,3 +403,35 @@ def test_undeclared_outputs_are_faults_of_the_service(output):
             await asyncio.wait_for(host.run(), 5)
 
     asyncio.run(main())
+
+
+def task_step(state, message, cfg):
+    if isinstance(message, Task):
+        state.append(message.stamp_ns)
+    yield from ()
+
+
+TASKED = Service("reader", "", "robot", Config, lambda cfg, me: [], task_step, reads=(TASK,))
+DAY_NS = 86_400 * 10**9
+
+
+def test_a_task_stamped_far_ahead_is_refused_in_a_sentence_and_one_by_a_clock_a_little_ahead_is_not(new_bus, caplog):
+    now_ns = time.time_ns()
+    stamps = [now_ns + 400 * DAY_NS, 2**63 - 1, now_ns + 90 * 10**9, 5]
+
+    async def main():
+        async with running(new_bus, (TASKED, Config(), "a")) as (reader,):
+            with BusClient(await asyncio.to_thread(new_bus)) as client:
+                for stamp_ns in stamps:
+                    client.publish(TASK, Task(robot="r", stamp_ns=stamp_ns, environment="home", task="tidy"))
+                await until(lambda: len(reader._state) == 2)
+            assert reader._state == stamps[2:] and reader.inbox.of("TASK").malformed == 2
+
+    asyncio.run(main())
+    whys = [record.why for record in caplog.records if hasattr(record, "why")]
+    assert any("the task is stamped 400 days ahead of the clock here: set the clock" in why for why in whys)
+
+
+@pytest.mark.parametrize(("now_ns", "refused"), [(10**18, False), (1_800_000_000 * 10**9, True)])
+def test_a_host_without_a_clock_judges_no_stamp(now_ns, refused):
+    assert bool(fault_of_stamp("it", now_ns + 10**18, now_ns)) is refused
