@@ -14,6 +14,7 @@ from prior_sg.schemas.status import Loss
 
 Pose = Annotated[np.ndarray, Shape("float64", 4, 4)]
 ROTATION_TOLERANCE = 1e-3
+MOST_PIXELS = 2**25  # 8K; decoded, colour and depth take 300 MB
 
 
 class Intrinsics(msgspec.Struct, frozen=True):
@@ -29,6 +30,8 @@ class Intrinsics(msgspec.Struct, frozen=True):
     def __post_init__(self) -> None:
         if not (0 < self.width_px <= 16384 and 0 < self.height_px <= 16384):
             raise ValueError(f"image size {self.width_px} x {self.height_px} is out of range")
+        if self.width_px * self.height_px > MOST_PIXELS:
+            raise ValueError(f"an image of {self.width_px} x {self.height_px} has more than {MOST_PIXELS} pixels")
         if not (self.fx_px > 0 and self.fy_px > 0):
             raise ValueError("focal lengths must be positive")
 

@@ -10,6 +10,7 @@ from prior_sg.schemas.frames import PoseUpdate
 from prior_sg.services.refusals import InputRefused
 
 Verdict = Literal["apply", "stale", "gap"]
+MOST_DELTAS = 4096  # that wait for a missing one
 LAST_EPOCH = 2**62
 BELIEVED_REVISIONS = 2**32  # how far one revision may lie above the one before: years of an absent reader
 BELIEVED_NS = 10 * 365 * 86400 * 10**9  # how far one epoch may lie above the one before: clocks mended, long rests
@@ -46,7 +47,7 @@ class Follower(Generic[D]):
     while `needs_snapshot` is set. Deltas that arrive during a gap wait for the snapshot.
     """
 
-    def __init__(self, epoch: int = -1, revision: int = -1, waiting_limit: int = 4096) -> None:
+    def __init__(self, epoch: int = -1, revision: int = -1, waiting_limit: int = MOST_DELTAS) -> None:
         self.epoch, self.revision = epoch, revision
         self.needs_snapshot = False
         self._waiting: dict[tuple[int, int], D] = {}  # by epoch and revision

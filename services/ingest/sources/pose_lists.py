@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from prior_sg.services.ingest.core.headers import ImageError
+from prior_sg.services.headers import ImageError
 from prior_sg.services.ingest.core.pixels import array_of
 from prior_sg.services.ingest.core.poses import Convention
 from prior_sg.services.ingest.sources.tables import SourceError, lines_of, read_json, words_of

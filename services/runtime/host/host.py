@@ -43,7 +43,7 @@ from prior_sg.services.runtime.host.port import Fed, Port
 from prior_sg.services.runtime.host.timing import Timing
 from prior_sg.services.runtime.jobs.board import Ended
 from prior_sg.services.runtime.jobs.dispatcher import CREDITS
-from prior_sg.services.runtime.jobs.pool import JobPool
+from prior_sg.services.runtime.jobs.pool import JobPool, done
 from prior_sg.services.runtime.service import Ask, Identity, Service
 
 log = logging.getLogger(__name__)
@@ -283,14 +283,16 @@ class Host:
         self.inbox.of(job.name).consumed += 1
         if self.service.prepare is not None:
             self.service.prepare(self._state, [message, *self._waiting_jobs()], self.cfg)
+        before = self._outbox.written
         try:
             self._step(message)
         except Exception as error:  # jobs are independent of each other: one that cannot be done ends no worker
             log.exception("job failed", extra={"topic": job.name, "frame_id": getattr(message, "frame_id", -1)})
             work.request.refuse(f"failed: {error}")
             return
+        results = self._outbox.written - before
         self._outbox.journal(job.name, frame_id=getattr(message, "frame_id", -1))
-        work.request.reply(b"done")
+        work.request.reply(done(results if self.service.writes else 1))
 
     def _fault_of_writer(self, message: Message) -> str:
         """Why a delta is not let in: another than its writer is in charge."""
