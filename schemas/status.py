@@ -4,7 +4,7 @@ from typing import ClassVar
 
 import msgspec
 
-from prior_sg.schemas.codec import Message
+from prior_sg.schemas.codec import Message, Number, NumberOrNone, Stamp
 
 
 class Consumed(Message, frozen=True, kw_only=True):
@@ -19,11 +19,11 @@ class Consumed(Message, frozen=True, kw_only=True):
     robot: str
     service: str
     instance: str
-    order: int  # 0, 1, 2, … per instance
+    order: Number  # 0, 1, 2, … per instance
     topic: str  # topic, query or message name
-    frame_id: int = -1  # of a keyframe
+    frame_id: NumberOrNone = -1  # of a keyframe
     writer: str = ""
-    sequence: int = -1
+    sequence: NumberOrNone = -1
     inline: bytes = b""
     key: str = ""
 
@@ -38,7 +38,7 @@ class Started(Message, frozen=True, kw_only=True):
     robot: str
     service: str
     instance: str
-    epoch: int
+    epoch: NumberOrNone
     config: bytes  # the resolved config as JSON
     reads: list[str] = []  # names of the topics it reads
     versions: dict[str, int] = {}  # of messages, by name, where it is not 1
@@ -57,23 +57,23 @@ class EpochKnown(Message, frozen=True, kw_only=True):
 
     robot: str
     topic: str
-    epoch: int
-    revision: int
+    epoch: NumberOrNone
+    revision: NumberOrNone
 
 
 class Tick(Message, frozen=True, kw_only=True):
     """Time, as a message."""
 
-    stamp_ns: int
+    stamp_ns: Stamp
 
 
 class JobDone(Message, frozen=True, kw_only=True):
     """A job this process dispatched has been finished by a worker."""
 
     topic: str
-    frame_id: int
+    frame_id: NumberOrNone
     worker: str
-    attempts: int  # 1 unless workers died or hung
+    attempts: Number  # 1 unless workers died or hung
     error: str = ""  # why it was given up, when it was
 
 
@@ -112,9 +112,9 @@ class ServiceStatus(Message, frozen=True, kw_only=True):
     service: str
     instance: str
     robot: str
-    pid: int
+    pid: Number
     uptime_s: float
-    backlog: int  # inputs waiting
+    backlog: Number  # inputs waiting
     busy_share: float  # share of the last seconds spent computing
     step_ms_p50: float
     step_ms_p99: float

@@ -11,7 +11,6 @@ from prior_sg.services.refusals import InputRefused
 
 Verdict = Literal["apply", "stale", "gap"]
 MOST_DELTAS = 4096  # that wait for a missing one
-LAST_EPOCH = 2**62
 BELIEVED_REVISIONS = 2**32  # how far one revision may lie above the one before: years of an absent reader
 BELIEVED_NS = 10 * 365 * 86400 * 10**9  # how far one epoch may lie above the one before: clocks mended, long rests
 

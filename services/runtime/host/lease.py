@@ -13,10 +13,10 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple
 
-from prior_sg.schemas.codec import DecodeError, decode, encode
+from prior_sg.schemas.codec import LAST_NUMBER, DecodeError, decode, encode
 from prior_sg.schemas.status import EpochKnown, EpochRequest
 from prior_sg.schemas.topics import EPOCH, WAITING, Topic, lease_key
-from prior_sg.services.deltas import LAST_EPOCH, next_epoch
+from prior_sg.services.deltas import next_epoch
 from prior_sg.services.errors import PriorSgError
 from prior_sg.services.runtime.bus import Answer, Bus
 
@@ -56,7 +56,7 @@ def standing(key: str) -> Standing | None:
     _, robot, _, service, number, instance = parts
     if number == WAITING:
         return Standing(robot, service, None, instance)
-    if not re.fullmatch(r"[1-9]\d{0,18}", number) or int(number) > LAST_EPOCH:
+    if not re.fullmatch(r"[1-9]\d{0,18}", number) or int(number) > LAST_NUMBER:
         return None
     return Standing(robot, service, Holder(int(number), instance), instance)
 
@@ -171,7 +171,7 @@ class Lease:
         known: dict[str, tuple[int, int]] = {}
         for told in await asyncio.gather(*(self._ask(*asked) for asked in self._asked)):
             if told is not None:
-                known[told.topic] = max(known.get(told.topic, (-1, -1)), (min(told.epoch, LAST_EPOCH), told.revision))
+                known[told.topic] = max(known.get(told.topic, (-1, -1)), (min(told.epoch, LAST_NUMBER), told.revision))
         return known
 
     async def _ask(self, topic: str, keeper: str) -> EpochKnown | None:
