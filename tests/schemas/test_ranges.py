@@ -71,7 +71,7 @@ def test_no_message_of_a_robot_with_an_odd_name_is_let_in(robot):
                 decode(type(example), packed(example, "robot", robot))
 
 
-@settings(max_examples=300, deadline=None, database=None, derandomize=True, suppress_health_check=list(HealthCheck))
+@settings(max_examples=100, deadline=None, database=None, derandomize=True, suppress_health_check=list(HealthCheck))
 @given(st.data())
 def test_what_is_let_in_has_one_plain_key_or_none(data):
     place = data.draw(st.sampled_from([*TOPICS, *QUERIES]))
