@@ -102,8 +102,6 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
     # Keyframes heard without an answer from ingest's archive before the map is told as it is; its publisher's cache
     # brings 32 at once, behind which the answer waits.
     archive_patience: int = 64
-        20  # keyframes heard without an answer from ingest's archive before the map is told as it is
-    )
 
     # Distances and Voronoi diagram.
     max_distance_m: float = 3.0  # distances end here: half the height of the highest halls (Clio 3.0, habitat 4.5)
