@@ -70,7 +70,7 @@ class Keyframe(Message, frozen=True, kw_only=True):
     stamp_ns: Stamp
     intrinsics: Intrinsics
     world_from_camera: Pose
-    color: bytes  # a JPEG or PNG file, 8 bit RGB
+    color: bytes  # a JPEG or PNG file, 8 bit RGB; empty = the sensor sees no colour
     depth: bytes  # a PNG file, 16 bit, 0 = no measurement; depth along the optical axis
     depth_scale_m: float  # metres per depth unit
     mask: bytes = b""  # a PNG file, 8 bit, not 0 = something that moves, kept out of the map; empty = nothing does

@@ -89,8 +89,8 @@ class ObjectsInRegions(Part, frozen=True, kw_only=True, tag="objects_in_regions"
 
 
 class Spot(Part, frozen=True, kw_only=True):
-    """An end of a route: a point; or a place, region or object by its id; or whatever carries the label and is reached
-    first, regions before objects where `what` is left out.
+    """An end of a route: a point; or `here`, where the camera was last; or a place, region or object by its id; or
+    whatever carries the label and is reached first, regions before objects where `what` is left out.
 
     A region stands for its place nearest to its middle, an object and a point for the place nearest to them; where that
     one leads nowhere, a place stands for a point that it has free space around, or for an object, up to 1 m farther.
@@ -100,6 +100,7 @@ class Spot(Part, frozen=True, kw_only=True):
     what: What | None = None
     id: int | None = None
     label: Text = ""
+    here: bool = False
 
 
 class RouteBetween(Part, frozen=True, kw_only=True, tag="route_between"):

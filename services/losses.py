@@ -25,14 +25,14 @@ class Losses:
 
     _found: dict[tuple[str, str], Loss] = field(default_factory=dict)
 
-    def add(self, what: str, text: str, *, reason: str = "", of: str = "") -> None:
-        """Count one loss; its reason defaults to the kind of the text. `of` names the one that was lost."""
+    def add(self, what: str, text: str, *, reason: str = "", of: str = "", count: int = 1) -> None:
+        """Count losses; their reason defaults to the kind of the text. `of` names the one that was lost."""
         reason = reason or kind_of(text)
         if (what, reason) not in self._found and len(self._found) >= MOST_REASONS:
             reason = OTHER_REASONS
         key, example = (what, reason), f"{of}: {text}" if of else text
         known = self._found.get(key) or Loss(what=what, reason=reason, count=0, example=example)
-        self._found[key] = msgspec.structs.replace(known, count=known.count + 1)
+        self._found[key] = msgspec.structs.replace(known, count=known.count + count)
 
     def copy(self) -> "Losses":
         """The same counts, to be counted on elsewhere."""

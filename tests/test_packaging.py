@@ -43,7 +43,7 @@ def test_the_wheel_holds_one_package_with_its_data(wheel):
     assert {name.split("/")[0] for name in sizes} == {"prior_sg", f"prior_sg-{PROJECT['version']}.dist-info"}
     code = {f"prior_sg/{path.relative_to(ROOT)}" for folder in FOLDERS for path in (ROOT / folder).rglob("*.py")}
     assert {name for name in sizes if name.endswith(".py")} == code | {"prior_sg/__init__.py"}
-    assert "prior_sg/py.typed" in sizes
+    assert {"prior_sg/py.typed", "prior_sg/deploy/ros/prior_sg.rviz"} <= set(sizes)
     assert {f"prior_sg/deploy/showing/formats/page/page.{kind}" for kind in ("html", "css", "js")} <= set(sizes)
     data = {name for name in sizes if name.startswith("prior_sg/") and not name.endswith(".py")}
     assert sum(name.endswith(".toml") for name in data) == len(list((ROOT / "services").rglob("*.toml")))

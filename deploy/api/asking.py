@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from prior_sg.deploy.api.errors import NotInSceneError
+from prior_sg.deploy.api.spots import spot_in
 from prior_sg.deploy.api.vectors import RecentVectors
 from prior_sg.schemas.objects import SceneObject
 from prior_sg.schemas.priors import Prior
@@ -115,8 +116,9 @@ class Asking(ABC):
         return neighbours
 
     def route(self, start: SpotLike, goal: SpotLike, clearance_m: float = 0.0) -> Route:
-        """The shortest way on which nothing is closer than `clearance_m`. Both ends are a label, a point, a Thing, a
-        Region, a SceneObject or a Spot. `found` says whether there is one, and `reason` why not.
+        """The shortest way on which nothing is closer than `clearance_m`. Both ends are a point, a Thing, a Region, a
+        SceneObject, a Spot, or text: a label, "here" (where the camera was last), "region:7", "1.0,2.0,0.5". `found`
+        says whether there is one, and `reason` why not. Raises ValueError where an end is none of these.
         """
         route: Route
         (route,) = self.ask(RouteBetween(start=_spot(start), goal=_spot(goal), clearance_m=clearance_m))  # type: ignore[assignment]
@@ -181,7 +183,7 @@ def _spot(value: SpotLike) -> Spot:
         case Spot():
             return value
         case str():
-            return Spot(label=value)
+            return spot_in(value)
         case Thing():
             return Spot(what=value.what, id=value.id)
         case Region():

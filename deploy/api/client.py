@@ -19,8 +19,18 @@ from prior_sg.deploy.settings import DEFAULT_CONNECT, DEFAULT_ROBOT
 from prior_sg.schemas.codec import DecodeError, Message
 from prior_sg.schemas.features import TextEmbeddings, TextRequest
 from prior_sg.schemas.frames import PoseUpdate
+from prior_sg.schemas.objects import ObjectDelta
 from prior_sg.schemas.priors import Prior, PriorList, PriorRequest, Task
-from prior_sg.schemas.queries import Answer, ChangedSince, Difference, Question, SceneAnswer, SceneQuery, checked
+from prior_sg.schemas.queries import (
+    Answer,
+    ChangedSince,
+    Difference,
+    Question,
+    SceneAnswer,
+    SceneQuery,
+    WordsInUse,
+    checked,
+)
 from prior_sg.schemas.regions import PosteriorReply, PosteriorRequest, RegionDelta
 from prior_sg.schemas.scene import HistoryRequest, RevisionList, SceneRequest, StoredRevision
 from prior_sg.schemas.scene import Scene as SceneMessage
@@ -45,6 +55,8 @@ from prior_sg.services.runtime.zenoh_bus import ZenohBus
 
 ROUTER_WAIT_S = 2.0
 STORE_POLL_S = 0.1
+NAMES_WAIT_S = 5.0  # for the objects' names, which follow a task's regions
+MOST_PRIORS = 16  # that a client keeps
 DELTAS = (PLACE_DELTA, REGION_DELTA, OBJECT_DELTA)
 
 
@@ -147,6 +159,8 @@ class Client(Asking):
         if digest not in self._priors:
             known: PriorList = self._client.ask(PRIORS, PriorRequest(digest=digest))
             self._priors |= {prior.digest(): prior for prior in known.priors}
+            while len(self._priors) > MOST_PRIORS:
+                self._priors.pop(next(iter(self._priors)))
         return self._priors.get(digest)
 
     def embed(self, space: str, phrases: Sequence[str]) -> np.ndarray[Any, Any]:
@@ -180,8 +194,13 @@ class Client(Asking):
         waiting: Callable[[str], None] = lambda reason: None,
         on_prior: Callable[[Prior], None] = lambda prior: None,
     ) -> Switch:
-        """As `task`, with all that came of it. `waiting` is told why there is no prior yet, `on_prior` the prior."""
-        environment = environment or self.scene().environment
+        """As `task`, with all that came of it. `waiting` is told why there is no prior yet, `on_prior` the prior.
+
+        Objects get their names a moment after the regions; the scene has them, unless that takes long.
+        """
+        before: Any
+        (before,) = self.ask(WordsInUse())
+        environment = environment or before.environment
         if not environment:
             raise TaskError(f"{self.robot} has no environment yet; name one (--environment) with the task")
         task = Task(
@@ -192,19 +211,28 @@ class Client(Asking):
             regions=list(regions or ()),
         )
         arrivals = _Arrivals(task)
-        with self._client.listening(REGION_DELTA, self.robot, arrivals.see):
+        with contextlib.ExitStack() as listening:
+            for topic in (REGION_DELTA, OBJECT_DELTA):
+                listening.enter_context(self._client.listening(topic, self.robot, arrivals.see))
             prior = self._client.give_task(task, timeout_s, waiting)
             on_prior(prior)
-            end_s = time.monotonic() + timeout_s
-            seconds = arrivals.wait(prior.digest(), end_s)
-        scene = self._stored(prior.digest(), end_s) if seconds is not None else None
-        if seconds is None or scene is None:
-            raise TaskError(f"no regions for the new task within {timeout_s:.0f} s; see `prior-sg health`")
+            digest, end_s = prior.digest(), time.monotonic() + timeout_s
+            if digest == before.prior_digest:  # nothing will come: the regions follow it already
+                return Switch(self.scene(), prior, arrivals.seconds())
+            seconds = arrivals.wait(digest, end_s)
+            scene = None if seconds is None else self._stored(lambda now: now.prior_digest == digest, end_s)
+            if seconds is None or scene is None:
+                raise TaskError(f"no regions for the new task within {timeout_s:.0f} s; see `prior-sg health`")
+            if prior.objects and scene.message.objects:
+                end_s = time.monotonic() + NAMES_WAIT_S
+                arrived = arrivals.wait_for_names(digest, end_s)
+                named = self._stored(lambda now: arrivals.are_in(now, digest), end_s) if arrived else None
+                scene = named or self.scene()
         return Switch(scene, prior, seconds)
 
-    def _stored(self, prior_digest: str, end_s: float) -> Scene | None:
-        """The scene once the store has taken the regions of this prior; None when it has not by then."""
-        while (scene := self.scene()).message.prior_digest != prior_digest:
+    def _stored(self, is_it: Callable[[SceneMessage], bool], end_s: float) -> Scene | None:
+        """The scene once the store has taken what is waited for; None when it has not by then."""
+        while not is_it((scene := self.scene()).message):
             if time.monotonic() > end_s:
                 return None
             time.sleep(STORE_POLL_S)
@@ -282,25 +310,47 @@ class Client(Asking):
 
 
 class _Arrivals:
-    """When the regions of a task arrived, by the prior they follow."""
+    """When the regions of a task arrived, by the prior they follow, and what names its objects got."""
 
     def __init__(self, task: Task) -> None:
         self._task, self._given_ns = task, time.time_ns()
         self._since_s = time.monotonic()
         self._found_s: dict[str, float] = {}
+        self._names: dict[str, dict[int, str]] = {}  # by object, by prior
         self._changed = threading.Condition()
 
     def see(self, sample: Sample) -> None:
         """A delta sent after the task was given counts; the history may hold older ones of the same task."""
         with contextlib.suppress(DecodeError):
-            delta: RegionDelta = message_in(sample)
-            if sample.sent_ns > self._given_ns and delta.task == self._task.task:
-                with self._changed:
+            delta: RegionDelta | ObjectDelta = message_in(sample)
+            if sample.sent_ns <= self._given_ns:
+                return
+            with self._changed:
+                if isinstance(delta, ObjectDelta):
+                    told = {item.id: item.label for item in delta.objects}
+                    self._names[delta.prior_digest] = self._names.get(delta.prior_digest, {}) | told
+                elif delta.task == self._task.task:
                     self._found_s.setdefault(delta.prior_digest, time.monotonic())
-                    self._changed.notify()
+                self._changed.notify()
+
+    def seconds(self) -> float:
+        """Since the task was given."""
+        return time.monotonic() - self._since_s
 
     def wait(self, prior_digest: str, end_s: float) -> float | None:
         """Seconds from the task to the first regions of this prior; None when there are none by then."""
+        return self._found_s[prior_digest] - self._since_s if self._wait(prior_digest, self._found_s, end_s) else None
+
+    def wait_for_names(self, prior_digest: str, end_s: float) -> bool:
+        """Whether objects got names of this prior by then."""
+        return self._wait(prior_digest, self._names, end_s)
+
+    def are_in(self, scene: SceneMessage, prior_digest: str) -> bool:
+        """Whether the objects of a scene have the names of this prior that have arrived."""
         with self._changed:
-            there = self._changed.wait_for(lambda: prior_digest in self._found_s, max(end_s - time.monotonic(), 0))
-        return self._found_s[prior_digest] - self._since_s if there else None
+            names = dict(self._names[prior_digest])
+        return all(names.get(item.id, item.label) == item.label for item in scene.objects)
+
+    def _wait(self, prior_digest: str, arrived: Mapping[str, object], end_s: float) -> bool:
+        with self._changed:
+            return self._changed.wait_for(lambda: prior_digest in arrived, max(end_s - time.monotonic(), 0))

@@ -35,8 +35,9 @@ from prior_sg.schemas.topics import (
     TASK,
     VOXEL_MAP,
 )
-from prior_sg.services.ingest.core.frames import BadFrame, Correction, RawFrame
+from prior_sg.services.ingest.core.frames import BadFrame, RawFrame
 from prior_sg.services.ingest.sources import Source, SourceError, open_source
+from prior_sg.services.ingest.sources.base import Event
 from prior_sg.services.losses import line, merged
 from prior_sg.services.registry import SERVICES
 from prior_sg.services.runtime import extras
@@ -53,7 +54,6 @@ IN_MEMORY: dict[str, dict[str, Any]] = {
     "prior_gateway": {"archive": ""},
 }
 
-Event = RawFrame | BadFrame | Correction
 Progress = Callable[[int, int], None]  # frames read, frames in all (0 = unknown)
 
 
@@ -139,7 +139,7 @@ class Mapper:
         before, count = self.progress, 0
         for event in opened.events():
             self._take(event)
-            if progress is not None and not isinstance(event, Correction):
+            if progress is not None and isinstance(event, RawFrame | BadFrame):
                 count += 1
                 progress(count, opened.total)
         now = self.progress

@@ -80,6 +80,20 @@ def view() -> tuple[dict, dict]:
     return view_bench()
 
 
+def lidar() -> tuple[dict, dict]:
+    """The sample as lidars of few rings see it; see `prior_sg.deploy.benches.lidar`."""
+    from prior_sg.deploy.benches.lidar import lidar_bench  # needs an encoder
+
+    return lidar_bench(SAMPLE)
+
+
+def hydra() -> tuple[dict, dict]:
+    """The bridge to Hydra; see `prior_sg.deploy.benches.hydra`."""
+    from prior_sg.deploy.benches.hydra import hydra_bench  # needs the extra `hydra`
+
+    return hydra_bench()
+
+
 def e2e() -> tuple[dict, dict]:
     """Keyframe in hand → region delta that follows from it, encoder time excluded, without transport."""
     keyframes = _sample_keyframes()
@@ -121,7 +135,9 @@ BENCHES: dict[str, Callable[[], tuple[dict, dict]]] = {
 LONG: dict[str, Callable[[float], tuple[dict, dict]]] = {  # no part of `all`; the pool lasts as long as it is told to
     "pool": attacked_pool,
     "store_crashes": lambda seconds: crashes(),
+    "lidar": lambda seconds: lidar(),  # seven minutes and more
     "view": lambda seconds: view(),  # needs an extra and a browser
+    "hydra": lambda seconds: hydra(),  # needs an extra
 }
 
 

@@ -33,7 +33,7 @@ def add_commands(commands: Commands) -> None:
         "prior-sg check recordings/home",
         needs="map",
     )
-    parser.add_argument("source", help="a folder in a known layout (docs/sources.md) or an MCAP log")
+    parser.add_argument("source", help="a folder in a known layout (docs/sources.md), a recording, or ros2:/")
     parser.add_argument("--json", action="store_true", help="print JSON")
     add_settings(parser)
     add_source_options(parser)

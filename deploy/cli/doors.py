@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from prior_sg.deploy.cli.shared import Commands, add_bus, console
+from prior_sg.deploy.cli.shared import Commands, add_bus, console, until_interrupted
 from prior_sg.deploy.errors import UserError
 
 API_PORT, MCP_PORT = 8000, 8001
@@ -55,10 +55,8 @@ def cmd_serve_api(arguments: argparse.Namespace) -> int:
     from prior_sg.deploy.serving.gate import entrance
 
     entry = entrance(arguments.host, arguments.token_file)
-    try:
+    with until_interrupted():
         serve_api(arguments.connect, arguments.robot, entry, arguments.port, say_until)
-    except KeyboardInterrupt:
-        console.print("stopping")
     return 0
 
 
@@ -73,10 +71,8 @@ def cmd_mcp(arguments: argparse.Namespace) -> int:
         serve_planner_here(arguments.connect, arguments.robot)
         return 0
     entry = entrance(arguments.host, arguments.token_file)
-    try:
+    with until_interrupted():
         serve_planner(arguments.connect, arguments.robot, entry, arguments.port, say_until)
-    except KeyboardInterrupt:
-        console.print("stopping")
     return 0
 
 

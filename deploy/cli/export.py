@@ -60,6 +60,8 @@ def cmd_export(arguments: argparse.Namespace) -> int:
         raise UserError(f"{out} is what is read; name another file with --out")
     with console.status(f"reading {arguments.source or arguments.connect}"):
         material = replace(_material(arguments, chosen), crs=arguments.crs)
+    if material.log is not None and out.resolve() == material.log.resolve():
+        raise UserError(f"{out} is what is read; name another file with --out")
     with console.status(f"writing {out}"):
         formats.save(material, out, chosen.name)
     console.print(f"{len(material.scene.place_ids)} places, {len(material.scene.regions)} regions: {out}")

@@ -35,11 +35,11 @@ def add_commands(commands: Commands) -> None:
     run = commands.add(
         "run",
         cmd_run,
-        "turn a recording into a scene graph",
+        "turn a recording, or what a robot sees, into a scene graph",
         'prior-sg run deploy/sample/home.mcap --environment "residential home" --task "serve drinks to guests"',
         needs="encode",
     )
-    run.add_argument("source", help="a folder in a known layout (docs/sources.md) or an MCAP log")
+    run.add_argument("source", help="a folder in a known layout (docs/sources.md), a recording, or ros2:/ for a robot")
     run.add_argument("--environment", required=True, help="what kind of place it is, in plain words")
     run.add_argument("--task", required=True, help="what the robot is to do, in plain words")
     run.add_argument("--regions", default="", help="fixed region names, separated by commas; default: the prior's")
@@ -111,8 +111,9 @@ def cmd_run(arguments: argparse.Namespace) -> int:
     from prior_sg.deploy.cli import report
     from prior_sg.deploy.cli.mending import check_mapped
     from prior_sg.deploy.running.job import Job, run
+    from prior_sg.services.ingest.core.options import is_live
 
-    if not Path(arguments.source).exists():
+    if not (is_live(arguments.source) or Path(arguments.source).exists()):
         raise UserError(f"{arguments.source} does not exist")
     beside = before_start(arguments.source, read_options(arguments), console).beside
     job = Job(

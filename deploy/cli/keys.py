@@ -5,7 +5,7 @@ import json
 import time
 from pathlib import Path
 
-from prior_sg.deploy.cli.shared import Commands, Run, add_bus, add_router, console
+from prior_sg.deploy.cli.shared import Commands, Run, add_bus, add_router, console, until_interrupted, wait
 from prior_sg.deploy.errors import UserError
 from prior_sg.services.folders import user_settings
 
@@ -131,7 +131,6 @@ def _list(arguments: argparse.Namespace) -> int:
 
 
 def _router(arguments: argparse.Namespace) -> int:
-    from prior_sg.deploy.interrupts import insist
     from prior_sg.deploy.keys.routing import beyond_this_host
     from prior_sg.services.runtime.zenoh_bus import check_router, open_router, router_settings
 
@@ -144,11 +143,8 @@ def _router(arguments: argparse.Namespace) -> int:
     stop = open_router(arguments.connect, beyond)
     console.print(f"router {' and '.join((arguments.connect, *arguments.listen))}; Ctrl-C stops")
     try:
-        while True:
-            insist()
-            time.sleep(0.2)
-    except KeyboardInterrupt:
-        console.print("stopping")
+        with until_interrupted():
+            wait()
         return 0
     finally:
         stop()

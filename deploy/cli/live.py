@@ -1,14 +1,14 @@
 """Commands for services that stay, and for what is done to them while they run."""
 
 import argparse
-import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from prior_sg.deploy.cli.check import before_start
 from prior_sg.deploy.cli.doors import API_PORT, port_in
 from prior_sg.deploy.cli.jobs import add_run_options, settings_of
-from prior_sg.deploy.cli.shared import Commands, add_bus, add_router, console, open_client
+from prior_sg.deploy.cli.ros_results import add_ros, bridge_arguments, check_ros
+from prior_sg.deploy.cli.shared import Commands, add_bus, add_router, console, open_client, until_interrupted, wait
 from prior_sg.deploy.cli.source_options import add_source_options, read_options
 from prior_sg.deploy.edge import names_in
 from prior_sg.deploy.errors import UserError
@@ -30,18 +30,22 @@ def add_commands(commands: Commands) -> None:
         needs="map",
     )
     up.add_argument("services", nargs="*", help="services to start; default: all")
-    up.add_argument("--source", default="", help="what ingest reads; default: nothing")
+    up.add_argument("--source", default="", help="what ingest reads, ros2:/ for a robot; default: nothing")
     up.add_argument("--out", type=Path, default=Path("out/up"), help="folder for the database and logs")
     up.add_argument("--no-router", action="store_true", help="use the router at --connect instead of starting one")
     add_router(up)
     up.add_argument(
         "--api", nargs="?", type=port_in, const=API_PORT, default=None, metavar="PORT", help="also serve HTTP there"
     )
+<<<<<<< HEAD
     up.add_argument(
         "--restart-hung",
         action="store_true",
         help="kill and start again what exists and is not heard; default: say so, for it may be stopped on purpose",
     )
+=======
+    add_ros(up)
+>>>>>>> main
     add_run_options(up)
     add_source_options(up)
 
@@ -86,17 +90,19 @@ def cmd_up(arguments: argparse.Namespace) -> int:
             raise UserError(f"there is no service {name!r}; known: {', '.join(BY_NAME)}")
     if arguments.api is not None:
         extras.require("api", "prior-sg up --api")
+    if arguments.ros is not None:
+        check_ros(arguments)
     with claimed_folder(arguments.out):
         return _stay_up(arguments, names)
 
 
 def _stay_up(arguments: argparse.Namespace, names: list[str]) -> int:
-    from prior_sg.deploy.interrupts import insist
     from prior_sg.deploy.keys.routing import beyond_this_host
     from prior_sg.deploy.running.job import require_files
     from prior_sg.deploy.running.roll import Roll
     from prior_sg.deploy.running.supervisor import Supervisor
     from prior_sg.deploy.settings import check_settings
+    from prior_sg.services.ingest.core.options import is_live
     from prior_sg.services.registry import BY_NAME
     from prior_sg.services.runtime.zenoh_bus import open_router
 
@@ -108,7 +114,8 @@ def _stay_up(arguments: argparse.Namespace, names: list[str]) -> int:
         raise UserError("--listen and --join are of the router that `up` starts; leave out --no-router")
     settings = [f"scene_store.path={arguments.out / 'scene.sqlite'}", f"ingest.speed={arguments.speed}"]
     if arguments.source:
-        before_start(arguments.source, read_options(arguments), console)
+        if not is_live(arguments.source):  # a robot may come later, through the router that is started here
+            before_start(arguments.source, read_options(arguments), console)
         settings.append(f"ingest.source={arguments.source}")
     settings += settings_of(arguments)
     check_settings(arguments.config, settings)
@@ -119,6 +126,7 @@ def _stay_up(arguments: argparse.Namespace, names: list[str]) -> int:
     client = open_client(arguments.connect)
     roll = Roll(client.bus)
     try:
+<<<<<<< HEAD
         for name in sorted(names, key=lambda name: name == "ingest"):
             supervisor.start(name, arguments.workers if BY_NAME[name].job is not None else 1)
         if arguments.api is not None:
@@ -135,11 +143,28 @@ def _stay_up(arguments: argparse.Namespace, names: list[str]) -> int:
             time.sleep(0.2)
     except KeyboardInterrupt:
         console.print("stopping")
+=======
+        with until_interrupted():
+            for name in sorted(names, key=lambda name: name == "ingest"):
+                supervisor.start(name, arguments.workers if BY_NAME[name].job is not None else 1)
+            if arguments.api is not None:
+                _open_api(supervisor, arguments.api)
+            if arguments.ros is not None:
+                supervisor.start_door("ros", "prior_sg.deploy.ros.process", bridge_arguments(arguments))
+            listening = " and ".join((arguments.connect, *arguments.listen))
+            console.print(f"router {listening}; logs in {supervisor.log_folder}; Ctrl-C stops")
+            wait(lambda: _tell(supervisor))
+>>>>>>> main
         return 0
     finally:
         supervisor.stop()
         client.bus.close()
         stop_router()
+
+
+def _tell(supervisor: "Supervisor") -> None:
+    for event in supervisor.check():
+        console.print(event)
 
 
 def _open_api(supervisor: "Supervisor", port: int) -> None:

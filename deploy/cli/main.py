@@ -14,6 +14,8 @@ def build_parser() -> argparse.ArgumentParser:
         doors,
         encoders,
         export,
+        foxglove,
+        hydra,
         jobs,
         keys,
         live,
@@ -32,7 +34,23 @@ def build_parser() -> argparse.ArgumentParser:
         **with_example("prior-sg demo"),
     )
     commands = Commands(parser, "command", "COMMAND")
-    for module in (jobs, live, view, query, doors, check, ros, packing, export, tools, priors, encoders, keys):
+    for module in (
+        jobs,
+        live,
+        view,
+        foxglove,
+        query,
+        doors,
+        check,
+        ros,
+        hydra,
+        packing,
+        export,
+        tools,
+        priors,
+        encoders,
+        keys,
+    ):
         module.add_commands(commands)
     return parser
 

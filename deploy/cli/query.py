@@ -1,6 +1,7 @@
 """`prior-sg query`: ask the map, in a sentence or by position, label and route."""
 
 import argparse
+import contextlib
 import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -24,13 +25,14 @@ what to ask:
   label LABEL                      all that carries it
   objects [LABEL] [in REGION]      objects of a label in regions of a label
   region ID, place ID, object ID   one of them in full: beliefs, neighbours, what it holds
-  route FROM TO                    the shortest way; each a label, place:ID, region:ID, object:ID or X,Y,Z
+  route FROM TO                    the shortest way; each a label, here (where the camera was last), place:ID,
+                                   region:ID, object:ID or X,Y,Z
   changed REVISION                 what is different since a revision (running store only)
 
 examples:
   prior-sg query "somewhere to sit and eat" --scene out/demo
   prior-sg query near 1.0 2.0 0.5 --what region
-  prior-sg query route kitchen bedroom --clearance 0.3"""
+  prior-sg query route here "dining room" --clearance 0.3"""
 WHATS = ("place", "region", "object")
 DECIMALS = 2
 
@@ -87,19 +89,6 @@ def cmd_query(arguments: argparse.Namespace) -> int:
     return 0
 
 
-class _Saved:
-    """A saved scene where a client, which is closed in the end, would be."""
-
-    def __init__(self, scene: "Asking") -> None:
-        self._scene = scene
-
-    def __enter__(self) -> "Asking":
-        return self._scene
-
-    def __exit__(self, *_: object) -> None:
-        pass
-
-
 def _opened(arguments: argparse.Namespace) -> Any:
     """The running system, or a saved scene. Raises PriorSgError."""
     if arguments.scene is None:
@@ -108,7 +97,7 @@ def _opened(arguments: argparse.Namespace) -> Any:
         return Client(arguments.connect, arguments.robot)
     from prior_sg.deploy.api.scene import Scene
 
-    return _Saved(Scene.read(arguments.scene, arguments.robot))
+    return contextlib.nullcontext(Scene.read(arguments.scene, arguments.robot))
 
 
 def _find(scene: "Asking", arguments: argparse.Namespace, words: Sequence[str]) -> "list[Thing]":
@@ -149,7 +138,7 @@ def _one(scene: "Asking", arguments: argparse.Namespace, words: Sequence[str]) -
 def _route(scene: "Asking", arguments: argparse.Namespace, words: Sequence[str]) -> "Route":
     if len(words) != 2:
         raise UserError("a route needs two ends: prior-sg query route kitchen bedroom (quote names of several words)")
-    return scene.route(_end(words[0]), _end(words[1]), arguments.clearance)
+    return scene.route(words[0], words[1], arguments.clearance)
 
 
 def _changed(scene: "Asking", arguments: argparse.Namespace, words: Sequence[str]) -> "Difference":
@@ -158,20 +147,6 @@ def _changed(scene: "Asking", arguments: argparse.Namespace, words: Sequence[str
     if not isinstance(scene, Client):
         raise UserError("a saved scene is of one revision; ask the running store, without --scene")
     return scene.changed_since(_id(words))
-
-
-def _end(word: str) -> Any:
-    """A label, `region:7`, or a point `1.0,2.0,0.5`."""
-    from prior_sg.schemas.queries import Spot
-
-    what, colon, number = word.partition(":")
-    if colon and what in WHATS and number.lstrip("-").isdigit():
-        return Spot(what=what, id=int(number))  # type: ignore[arg-type]
-    parts = word.split(",")
-    try:
-        return [float(part) for part in parts] if len(parts) == 3 else word
-    except ValueError:
-        return word
 
 
 def _numbers(words: Sequence[str], count: int, form: str) -> list[float]:

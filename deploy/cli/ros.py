@@ -1,4 +1,4 @@
-"""`prior-sg ros`: what a recording of ROS holds."""
+"""`prior-sg ros`: what a recording of ROS holds, or a robot publishes."""
 
 import argparse
 from pathlib import Path
@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from rich.table import Table
 
+from prior_sg.deploy.cli.ros_results import add_results
 from prior_sg.deploy.cli.shared import Commands, console
 from prior_sg.deploy.errors import UserError
 from prior_sg.deploy.json_text import json_text
@@ -16,26 +17,27 @@ if TYPE_CHECKING:
 
 def add_commands(commands: Commands) -> None:
     """`ros` and its actions."""
-    parser = commands.add("ros", cmd_topics, "look into a recording of ROS", "prior-sg ros topics walk.bag", "ros")
+    what = "look into a recording of ROS, or at a robot"
+    parser = commands.add("ros", cmd_topics, what, "prior-sg ros topics walk.bag", "ros")
     actions = Commands(parser, "action", "ACTION", "prior-sg ros ")
-    topics = actions.add(
-        "topics", cmd_topics, "list the topics of a recording and what each would serve as", "topics walk.bag", "ros"
+    listing = "list the topics of a recording, or of a robot, and what each would serve as"
+    topics = actions.add("topics", cmd_topics, listing, "topics ros2:/", "ros")
+    topics.add_argument(
+        "source", help="a rosbag2 folder, a file ending in .mcap, .db3 or .bag, or ros2:/ for a robot (docs/sources.md)"
     )
-    topics.add_argument("source", type=Path, help="a rosbag2 folder, or a file ending in .mcap, .db3 or .bag")
+    topics.add_argument("--domain", type=int, default=0, help="ROS_DOMAIN_ID of a robot (default: %(default)s)")
+    topics.add_argument("--seconds", type=float, default=3.0, help="to listen to a robot (default: %(default)s)")
     topics.add_argument("--json", action="store_true", help="print JSON")
+    add_results(actions)
 
 
 def cmd_topics(arguments: argparse.Namespace) -> int:
     """List topics by name, and mark those that a run would read. Raises UserError and SourceError."""
-    from prior_sg.services.ingest.core.options import ReadOptions
+    from prior_sg.services.ingest.core.options import ReadOptions, is_live
     from prior_sg.services.ingest.core.ros.topics import chosen
-    from prior_sg.services.ingest.sources.ros_bag import Bag, is_recording
 
-    if not arguments.source.exists() or not is_recording(arguments.source):
-        raise UserError(
-            f"{arguments.source} is no recording of ROS: give a rosbag2 folder, or a file ending in .mcap, .db3 or .bag"
-        )
-    topics = Bag(arguments.source).topics()
+    live = is_live(arguments.source)
+    topics = _heard(arguments) if live else _recorded(Path(arguments.source))
     if arguments.json:
         print(json_text([_as_builtins(topic) for topic in topics], None))
         return 0
@@ -45,6 +47,25 @@ def cmd_topics(arguments: argparse.Namespace) -> int:
     except ValueError as error:
         console.print(f"would not be read: {error}", soft_wrap=True)
     return 0
+
+
+def _recorded(path: Path) -> "list[Topic]":
+    """Topics of a recording. Raises UserError and SourceError."""
+    from prior_sg.services.ingest.sources.ros_bag import Bag, is_recording
+
+    if not path.exists() or not is_recording(path):
+        raise UserError(
+            f"{path} is no recording of ROS: give a rosbag2 folder, a file ending in .mcap, .db3 or .bag, or ros2:/"
+        )
+    return Bag(path).topics()
+
+
+def _heard(arguments: argparse.Namespace) -> "list[Topic]":
+    """Topics of a running robot, of the types that can serve. Raises SourceError."""
+    from prior_sg.services.ingest.sources.ros_live import heard
+
+    with console.status(f"listening to {arguments.source}"):
+        return heard(arguments.source, arguments.domain, arguments.seconds)
 
 
 def _table(topics: "list[Topic]") -> Table:

@@ -1,11 +1,14 @@
 """What the commands of `prior-sg` share: the terminal, options and the way onto the bus."""
 
 import argparse
+import contextlib
 import resource
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING
 
 from prior_sg.deploy.errors import UserError
+from prior_sg.deploy.interrupts import insist
 from prior_sg.deploy.settings import DEFAULT_ROBOT, add_keys, connect_in_force
 from prior_sg.deploy.terminal import Terminal
 from prior_sg.schemas.names import shown
@@ -16,6 +19,7 @@ if TYPE_CHECKING:
     from prior_sg.services.runtime.client import BusClient
 
 MEMORY_NEEDED_B = 2_000_000 * 1024  # addresses, not memory in use
+POLL_S = 0.2
 console = Terminal()
 
 Run = Callable[[argparse.Namespace], int]  # does what a command was told; its exit status
@@ -86,3 +90,20 @@ def open_client(connect: str) -> "BusClient":
     from prior_sg.services.runtime.zenoh_bus import ZenohBus
 
     return BusClient(ZenohBus(connect, wait_s=2.0))
+
+
+@contextlib.contextmanager
+def until_interrupted() -> Iterator[None]:
+    """Ctrl-C ends what goes on within, and it is said."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        console.print("stopping")
+
+
+def wait(meanwhile: Callable[[], object] = lambda: None) -> None:
+    """Until Ctrl-C; `meanwhile` is done five times a second. Raises KeyboardInterrupt."""
+    while True:
+        insist()
+        meanwhile()
+        time.sleep(POLL_S)

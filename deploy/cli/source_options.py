@@ -77,11 +77,15 @@ OPTIONS = (
     Option("--depth-topic", "depth_topic", "TOPIC", "its depth images"),
     Option("--info-topic", "info_topic", "TOPIC", "camera info of its colour images"),
     Option("--pose-topic", "pose_topic", "TOPIC", "its odometry, poses or transforms; default: tf, else one of these"),
+    Option("--graph-topic", "graph_topic", "TOPIC", "of a live robot: optimised poses (nav_msgs/Path) of --pose-frame"),
     Option("--fixed-frame", "fixed_frame", "FRAME", "the world, of tf; default: map, world, odom or the root"),
     Option("--pose-frame", "pose_frame", "FRAME", "the frame whose poses --pose-topic has"),
+    Option("--depth-model", "depth_model", "FILE", "ONNX file that sees depth in the pictures of a stereo camera"),
     Option(
         "--sync-tolerance", "sync_tolerance_s", "SECONDS", "most between stamps of one frame's colour, depth and pose"
     ),
+    Option("--domain", "ros_domain", "ID", "ROS_DOMAIN_ID of a live robot (default: 0)"),
+    Option("--end-after", "end_after_s", "SECONDS", "without a frame, a live source has ended (default: 30; 0: never)"),
     Option("--clock", "clock", "CLOCK", "stamps of a ROS recording: of its", choices=("header", "received")),
 )
 
@@ -98,6 +102,12 @@ def add_source_options(parser: argparse.ArgumentParser) -> None:
             metavar=option.metavar,
             help=option.help + (f": {', '.join(option.choices)}" if option.choices else ""),
         )
+
+
+def source_option(arguments: argparse.Namespace, flag: str) -> str | None:
+    """What was told for one of them, as it was written."""
+    told: str | None = getattr(arguments, next(option.dest for option in OPTIONS if option.flag == flag))
+    return told
 
 
 def source_settings(arguments: argparse.Namespace) -> list[str]:

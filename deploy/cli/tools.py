@@ -105,7 +105,7 @@ def _add_system(commands: Commands) -> None:
     bench.add_argument(
         "name",
         help="bus, places, features, kernel, swap, segmenter, task, learning, queries, e2e, store, all of these, pool, "
-        "or store_crashes",
+        "store_crashes or lidar",
     )
     bench.add_argument("--seconds", type=float, default=300.0, help="how long pool lasts (default: %(default)s)")
     bench.add_argument("--json", action="store_true", help="print one JSON object per measurement")

@@ -1,10 +1,9 @@
 """The live page: `prior-sg view`."""
 
 import argparse
-import time
 from typing import TYPE_CHECKING
 
-from prior_sg.deploy.cli.shared import Commands, add_bus, console
+from prior_sg.deploy.cli.shared import Commands, add_bus, console, until_interrupted, wait
 from prior_sg.deploy.errors import UserError
 
 if TYPE_CHECKING:
@@ -37,7 +36,6 @@ def add_commands(commands: Commands) -> None:
 
 def cmd_view(arguments: argparse.Namespace) -> int:
     """Serve the page until Ctrl-C."""
-    from prior_sg.deploy.interrupts import insist
     from prior_sg.deploy.viewing.page import Options, Page
 
     if arguments.host not in LOOPBACK:
@@ -45,25 +43,23 @@ def cmd_view(arguments: argparse.Namespace) -> int:
             f"the page has no login, so it is served to this machine alone, not on {arguments.host}; from elsewhere, "
             f"open a tunnel: ssh -L {arguments.port}:127.0.0.1:{arguments.port} USER@THIS-MACHINE"
         )
-    source = _source(arguments)
+    source = source_of(arguments)
     options = Options(
         arguments.host, arguments.port, not arguments.light, max(arguments.interval, 0.02), arguments.max_mbit
     )
     page = Page(source, options)
     console.print(f"look at it: {page.address} ({source.title}); Ctrl-C stops")
     try:
-        while True:
-            insist()
-            time.sleep(0.2)
-    except KeyboardInterrupt:
-        console.print("stopping")
+        with until_interrupted():
+            wait()
         return 0
     finally:
         page.close()
         source.close()
 
 
-def _source(arguments: argparse.Namespace) -> "Source":
+def source_of(arguments: argparse.Namespace) -> "Source":
+    """What is looked at: a run that is over, or the robot on the bus."""
     if arguments.source is not None:
         from prior_sg.deploy.viewing.recorded import open_recorded
 

@@ -21,6 +21,7 @@ from prior_sg.services.losses import kind_of
 
 PAIRS, LIMIT_S = 40, 3.5
 BRIEF_PAIRS, BRIEF_FRAMES, BRIEF_LIMIT_S = 6, 60, 0.8
+LIVE_FRAMES = 100  # of a running robot
 COLORS = 12  # colour images decoded at most
 Progress = Callable[[int, int], None]  # frames read, of how many
 
@@ -81,7 +82,8 @@ def look(
     end_s = time.monotonic() + (BRIEF_LIMIT_S if brief else LIMIT_S)
     recording = Recording(source.total, source.depth_unit_m)
     state = selection.State(robot="sample")  # nobody reads what it would publish
-    frames = min(source.total, BRIEF_FRAMES) if brief else source.total
+    total = source.total or LIVE_FRAMES
+    frames = min(total, BRIEF_FRAMES) if brief else total
     wants = Picker(frames, BRIEF_PAIRS if brief else PAIRS).wants
     color_every = max(1, min(frames, 2 * PAIRS) // COLORS)
     for frame in source if source.thinned is None else source.thinned(wants):
@@ -94,8 +96,10 @@ def look(
             if frame.depth if source.thinned else wants(frame.index, recording.world_from_camera[-1]):
                 _decode(recording, frame, with_color=not brief and len(recording.shots) % color_every == 0)
         progress(recording.read, frames)
-        if time.monotonic() > end_s or (brief and recording.read >= frames):
+        if time.monotonic() > end_s or (recording.read >= frames and (brief or not source.total)):
             break
+    if source.live is not None:
+        source.close()
     for held in state.continuity.release():
         recording.refused[kind_of(held.refusal.text)] += 1
     return recording
@@ -129,7 +133,8 @@ def summary(source: Source, recording: Recording) -> str:
     if any(map(len, depths_m)):
         low_m, high_m = np.percentile(np.concatenate(depths_m), (1, 99), method="nearest")
         depth = f", depth {low_m:.3g} to {high_m:.3g} m"
-    return f"{source.layout}: {source.total} frames, {camera.width_px} x {camera.height_px} pixels{rate}{depth}"
+    frames = f"{source.total} frames" if source.total else "live"
+    return f"{source.layout}: {frames}, {camera.width_px} x {camera.height_px} pixels{rate}{depth}"
 
 
 def _remember(recording: Recording, frame: RawFrame) -> None:

@@ -61,12 +61,27 @@ async def serve(arguments: argparse.Namespace, instance: str) -> None:
 
     service = BY_NAME[arguments.service]
     cfg = resolved_config(service, arguments.config, arguments.set)
+<<<<<<< HEAD
     bus = await asyncio.to_thread(ZenohBus, arguments.connect)
     stopping = asyncio.Event()
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, stopping.set)
     watcher = asyncio.create_task(_stop_with_parent(stopping, arguments.parent))
+=======
+    robot = arguments.robot if service.scope == "robot" else "*"
+    await stay(service, cfg, Identity(robot, instance, time.time_ns()), arguments.connect, arguments.parent)
+
+
+async def stay(service: Service, cfg: Any, identity: Identity, connect: str, parent: int = 0) -> None:
+    """Run a service on the bus of a router until a signal, or until the parent, if there is one, is gone."""
+    bus = await asyncio.to_thread(ZenohBus, connect)
+    host = Host(service, bus, cfg, identity)
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, host.stop)
+    watcher = asyncio.create_task(_stop_with_parent(host, parent))
+>>>>>>> main
     try:
         host = await _unless(stopping, _in_charge(service, bus, cfg, arguments.robot, instance))
         if host is not None:

@@ -81,6 +81,8 @@ def pack_source(  # noqa: PLR0917
     The log is complete or absent. Raises PackError, SourceError or LogError.
     """
     source = open_source(path, options=options)
+    if source.live is not None:
+        raise PackError(f"{path} is a running robot: record it (`ros2 bag record`), or pack the log.mcap of a run")
     refused: Counter[str] = Counter()
     partial = log_path.with_name(f"{log_path.name}.partial")
     try:
@@ -104,7 +106,7 @@ def _messages(
         elif isinstance(event, RawFrame):
             progress(event.index + 1, source.total)
             yield keyframe_of(event, robot, event.color, event.depth)
-        else:
+        elif isinstance(event, Correction):
             yield pose_update_of(event, robot, revision)
             revision += 1
 

@@ -28,12 +28,14 @@ class NewTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class TaskTaken(msgspec.Struct, frozen=True):
-    """What came of a task. With status 202 the regions do not follow it yet, and `note` says so."""
+    """What came of a task. With status 202 the regions do not follow it yet, and `note` says so; with 200 it says where
+    the map still grows. `may_be` is what regions can be called: the names that were asked for, else the prior's."""
 
     robot: str
     prior_digest: str
     prior_note: str
     seconds: float
+    may_be: list[str]
     labels: list[str] = []  # that regions have now
     note: str = ""
 
@@ -66,11 +68,10 @@ async def switch_task(state: State, robot: Robot, data: JSONBody[NewTask]) -> Re
     when only the prior is."""
     given = await system_of(state).give_task(robot, data.task, data.environment, data.regions, data.wait_s)
     prior, note = given.prior, given.prior.provenance.note
-    if given.scene is None:
-        waiting = TaskTaken(robot, prior.digest(), note, given.seconds, note=given.note)
-        return Response(waiting, status_code=202)
-    labels = sorted({region.label for region in given.scene.message.regions})
-    return Response(TaskTaken(robot, prior.digest(), note, given.seconds, labels))
+    regions = given.scene.message.regions if given.scene is not None else []
+    labels, may_be = sorted({region.label for region in regions}), [region.name for region in prior.regions]
+    taken = TaskTaken(robot, prior.digest(), note, given.seconds, may_be, labels, given.note)
+    return Response(taken, status_code=202 if given.scene is None else 200)
 
 
 @post("/v1/{robot:str}/poses", status_code=200, responses=FAULTS)

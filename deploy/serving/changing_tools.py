@@ -56,7 +56,8 @@ def switch_task(system: System) -> Tool:
         if given.scene is None:
             return f"the prior is there, the regions do not follow it yet: {one_line(given.note)}"
         regions = ", ".join(sorted({one_line(region.label) for region in given.scene.message.regions}))
-        return f"the task is in force after {given.seconds:.1f} s; regions now: {regions or 'none'}"
+        growing = f"; {one_line(given.note)}" if given.note else ""
+        return f"the task is in force after {given.seconds:.1f} s; regions now: {regions or 'none'}{growing}"
 
     return switch_task
 

@@ -25,6 +25,7 @@ from prior_sg.services.runtime.client import NoPriorError
 
 log = logging.getLogger(__name__)
 LARGEST_BODY_B = 4 * 2**20
+BODY = "data"  # as the framework calls it
 LEFT = "client disconnected prematurely"  # as the framework says it
 STATUS_OF: dict[type[Exception], int] = {  # the first that fits
     RecursionError: 400,  # of a body that is nested too deeply
@@ -83,5 +84,8 @@ def _told(request: Request[Any, Any, Any], error: Exception) -> Response[dict[st
 def _detail(error: HTTPException) -> str:
     """The sentence of an error of the framework, with the fields that it names."""
     named = error.extra if isinstance(error.extra, list) else []
-    fields = [f"{one.get('key') or 'the body'}: {one.get('message', '')}" for one in named if isinstance(one, dict)]
+    told = {(one.get("key") or BODY, one.get("message", "")) for one in named if isinstance(one, dict)}
+    if (BODY, repr(BODY)) in told:
+        return "the body is missing: send JSON, as /openapi/openapi.json describes it"
+    fields = [f"{'the body' if key == BODY else key}: {message}" for key, message in sorted(told)]
     return "; ".join(fields) or error.detail

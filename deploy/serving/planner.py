@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import inspect
 from collections.abc import AsyncIterator, Callable
 from typing import Any
 from urllib.parse import quote
@@ -64,7 +65,7 @@ def planner_app(system: System, entrance: Entrance) -> App:
 
 
 def _add(server: MCPServer[None], tool: Tool, annotations: ToolAnnotations) -> None:
-    server.add_tool(tool, annotations=annotations, structured_output=False)
+    server.add_tool(tool, description=inspect.getdoc(tool), annotations=annotations, structured_output=False)
 
 
 def uri(robot: str, name: str) -> str:

@@ -9,9 +9,9 @@ from litestar.datastructures import State
 from litestar.params import FromPath, FromQuery, JSONBody, QueryParameter
 
 from prior_sg.deploy.api.errors import NotInSceneError
+from prior_sg.deploy.api.spots import ENDS, spot_in
 from prior_sg.deploy.serving.errors import FaultyRequestError
 from prior_sg.deploy.serving.parameters import FAULTS, Coordinate, Count, Distance, Label, Robot, system_of
-from prior_sg.deploy.serving.spots import ENDS, spot_in
 from prior_sg.deploy.serving.system import EVERYWHERE, LONGEST_SEARCH, MOST_QUESTIONS
 from prior_sg.schemas.queries import (
     MOST_LISTED,
@@ -70,6 +70,16 @@ class Alive(msgspec.Struct, frozen=True):
 
     processes: list[ServiceStatus]
     silent: dict[str, str]  # why they do not answer, by instance
+
+
+class Progress(msgspec.Struct, frozen=True):
+    """How far a source is read."""
+
+    robot: str
+    frames_read: int
+    frames_total: int  # 0 = unknown, as of a live source
+    encoded: int  # keyframes
+    finished: bool
 
 
 @get("/health", responses=FAULTS)
@@ -172,9 +182,8 @@ async def route(
     clearance_m: Distance = 0.0,
 ) -> Answered:
     """The shortest way over the place graph on which nothing is closer than `clearance_m`."""
-    return await _one(
-        state, robot, _asked(RouteBetween, start=spot_in(start), goal=spot_in(goal), clearance_m=clearance_m)
-    )
+    ends = {"start": _asked(spot_in, text=start), "goal": _asked(spot_in, text=goal)}
+    return await _one(state, robot, _asked(RouteBetween, **ends, clearance_m=clearance_m))
 
 
 @get("/v1/{robot:str}/search", responses=FAULTS)
@@ -194,6 +203,13 @@ async def search(
 async def changes(state: State, robot: Robot, since: Annotated[int, QueryParameter(ge=-1)]) -> Answered:
     """What is new, gone and renamed since a revision; `reason` where that one is not kept."""
     return await _one(state, robot, _asked(ChangedSince, revision=since))
+
+
+@get("/v1/{robot:str}/source", responses=FAULTS)
+async def source(state: State, robot: Robot) -> Progress:
+    """How far the source is read; once `finished`, the map grows no more."""
+    read = system_of(state).source(robot)
+    return Progress(robot, read.frames_read, read.frames_total, read.encoded, read.finished)
 
 
 @get("/v1/{robot:str}/task", responses=FAULTS)
@@ -216,6 +232,7 @@ READING = [
     route,
     search,
     changes,
+    source,
     task,
 ]
 

@@ -16,6 +16,8 @@ from prior_sg.deploy.serving.gate import App
 BACKLOG = 128
 GRACE_S = 2  # for answers that are under way at the end
 PARENT_CHECK_S = 1.0
+IDLE_CHECK_S, LONGEST_IDLE_S = 1.0, 30.0  # in which a connection has to ask for something, or to have asked
+MOST_CONNECTIONS = 1000
 STUCK_MS = 30_000  # after which a connection is given up whose other end takes nothing
 
 
@@ -56,6 +58,7 @@ class Server(uvicorn.Server):
             server_header=False,
             proxy_headers=False,
             timeout_graceful_shutdown=GRACE_S,
+            limit_concurrency=MOST_CONNECTIONS,
             ws="none",
         )
         super().__init__(config)
@@ -68,11 +71,24 @@ class Server(uvicorn.Server):
 
     async def main_loop(self) -> None:
         """As its base."""
-        watcher = asyncio.create_task(self._stop_with_parent())
+        watchers = [asyncio.create_task(watch) for watch in (self._stop_with_parent(), self._drop_the_idle())]
         try:
             await super().main_loop()
         finally:
-            watcher.cancel()
+            for watcher in watchers:
+                watcher.cancel()
+
+    async def _drop_the_idle(self) -> None:
+        """Close connections that have asked for nothing for long, or are as long about their first lines."""
+        now, since_s = asyncio.get_running_loop().time, dict[tuple[Any, Any], float]()
+        while True:
+            await asyncio.sleep(IDLE_CHECK_S)
+            connections = [(one, one.cycle) for one in self.server_state.connections]  # type: ignore[union-attr]
+            idle = [one for one in connections if one[1] is None or one[1].response_complete]
+            since_s = {one: since_s.get(one, now()) for one in idle}
+            for (connection, _), begun_s in since_s.items():
+                if now() - begun_s > LONGEST_IDLE_S and connection.transport is not None:
+                    connection.transport.close()
 
     async def _stop_with_parent(self) -> None:
         while not self._parent or os.getppid() == self._parent:

@@ -6,7 +6,7 @@ import threading
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, TypeVar
 
@@ -18,6 +18,7 @@ from prior_sg.deploy.api.errors import NotInSceneError, TaskError
 from prior_sg.deploy.api.scene import Scene
 from prior_sg.deploy.serving.errors import BusyError, FaultyRequestError
 from prior_sg.schemas.codec import DecodeError
+from prior_sg.schemas.frames import IngestState
 from prior_sg.schemas.names import fault_of_robot, normal
 from prior_sg.schemas.priors import Prior, fault_of_task
 from prior_sg.schemas.queries import (
@@ -31,7 +32,7 @@ from prior_sg.schemas.queries import (
 )
 from prior_sg.schemas.scene import Scene as SceneMessage
 from prior_sg.schemas.scene import SceneRevision
-from prior_sg.schemas.topics import SCENE_REVISION
+from prior_sg.schemas.topics import INGEST_STATE, SCENE_REVISION
 from prior_sg.services.runtime.bus import Bus, Sample, message_in
 
 MOST_ROBOTS = 64  # whose clients are kept
@@ -51,7 +52,7 @@ class TaskGiven:
     prior: Prior
     scene: Scene | None
     seconds: float
-    note: str = ""  # why there is no scene
+    note: str = ""  # why there is no scene, or why another one will follow
 
 
 class System:
@@ -70,7 +71,9 @@ class System:
         self._reading = ThreadPoolExecutor(READERS, "reader")
         self._writing = ThreadPoolExecutor(WRITERS, "writer")
         self.on_revision: list[Callable[[SceneRevision], None]] = []  # each is called on a foreign thread
-        self._bus.subscribe(SCENE_REVISION, SCENE_REVISION.pattern("*"), self._saw, lambda topic, number: None)
+        self._sources: dict[str, IngestState] = {}  # by robot
+        for topic, saw in ((SCENE_REVISION, self._saw), (INGEST_STATE, self._saw_source)):
+            self._bus.subscribe(topic, topic.pattern("*"), saw, lambda topic, number: None)
 
     def close(self) -> None:
         """Leave the system; what waits for it ends."""
@@ -141,7 +144,21 @@ class System:
             raise FaultyRequestError("the task is empty: say what the robot is to do")
         if fault := fault_of_task(environment, task, list(regions)):
             raise FaultyRequestError(fault)
-        return await self._change(robot, lambda client: _switch(client, task, environment, regions, wait_s))
+        given = await self._change(robot, lambda client: _switch(client, task, environment, regions, wait_s))
+        read = self._sources.get(robot)
+        if read is None or read.finished or given.scene is None:
+            return given
+        of = f" of {read.frames_total}" if read.frames_total else ""
+        return replace(given, note=f"the map still grows: {read.frames_read}{of} frames are read; regions go with it")
+
+    def source(self, robot: str) -> IngestState:
+        """How far the robot's source is read. Raises FaultyRequestError, NotInSceneError."""
+        _check_robot(robot)
+        if robot not in self._sources:
+            raise NotInSceneError(
+                f"no ingest of {robot} has said how far its source is read: start one with a --source"
+            )
+        return self._sources[robot]
 
     async def correct_poses(self, robot: str, poses: dict[int, np.ndarray[Any, Any]], wait_s: float) -> float:
         """Give keyframes other poses; seconds until the map took them. Raises as `give_task`, and PosesError."""
@@ -189,6 +206,12 @@ class System:
                 self._seen.add(revision.robot)
             for told in self.on_revision:
                 told(revision)
+
+    def _saw_source(self, sample: Sample) -> None:
+        with contextlib.suppress(DecodeError):
+            state: IngestState = message_in(sample)
+            if state.robot in self._sources or len(self._sources) < MOST_ROBOTS:
+                self._sources[state.robot] = state
 
 
 def _check_robot(robot: str) -> None:

@@ -58,7 +58,7 @@ def scene_of_graph(graph: spark_dsg.DynamicSceneGraph) -> Scene:
         space=about.get("embedding_space", ""),
         labels=labels,
         regions=[_region(room, names, columns, layers) for room in layers["rooms"]],
-        objects=[_object(graph, item) for item in objects],
+        objects=[object_of(graph, item) for item in objects],
         trajectory=np.array(about.get("trajectory_m", ()), np.float32).reshape(-1, 3),
         origin_m=tuple(about.get("origin_m", (0.0, 0.0, 0.0))),
         revision=-1,  # of no store
@@ -104,13 +104,13 @@ def _columns(places: list[Item], rooms: list[Item], labels: list[str]) -> dict[s
     regions = {room.node.id.value: room.id for room in rooms}
     posteriors = [[place.told.get("posterior", {}).get(label, 0.0) for label in labels] for place in places]
     parents = [regions.get(item.node.get_parent(), NO_REGION) if item.node.has_parent() else -1 for item in places]
-    openings = [(place.id, *found) for place in places if (found := _opening(place)) is not None]
-    surfaces = [(place.id, *flat) for place in places if (flat := _ground(place)) is not None]
+    openings = [(place.id, *found) for place in places if (found := opening_of(place)) is not None]
+    surfaces = [(place.id, *flat) for place in places if (flat := ground_of(place)) is not None]
     return {
         "place_ids": np.array([place.id for place in places], np.int64),
         "positions_m": np.array([place.node.attributes.position for place in places], np.float32).reshape(-1, 3),
-        "radii_m": np.array([_radius_m(place) for place in places], np.float32),
-        "basis_points": np.array([_basis_points(place) for place in places], np.int16),
+        "radii_m": np.array([radius_m_of(place) for place in places], np.float32),
+        "basis_points": np.array([basis_points_of(place) for place in places], np.int16),
         "place_regions": np.array(parents, np.int64),
         "posteriors": np.array(posteriors, np.float16).reshape(len(places), len(labels)),
         "unknown": np.array([place.told.get("unknown", 0.0) for place in places], np.float16),
@@ -125,7 +125,7 @@ def _columns(places: list[Item], rooms: list[Item], labels: list[str]) -> dict[s
     }
 
 
-def _radius_m(place: Item) -> float:
+def radius_m_of(place: Item) -> float:
     """Of a sphere its distance to the nearest obstacle; of a piece of ground the short half axis."""
     attributes = place.node.attributes
     if isinstance(attributes, spark_dsg.PlaceNodeAttributes):
@@ -133,12 +133,13 @@ def _radius_m(place: Item) -> float:
     return float(place.told.get("radius_m", _axes(attributes)[1]))
 
 
-def _basis_points(place: Item) -> int:
+def basis_points_of(place: Item) -> int:
+    """Obstacle points at the distance of its radius."""
     attributes = place.node.attributes
     return int(place.told.get("basis_points", getattr(attributes, "num_basis_points", 0)))
 
 
-def _opening(place: Item) -> tuple[np.ndarray, float] | None:
+def opening_of(place: Item) -> tuple[np.ndarray, float] | None:
     """Direction and area of a frontier: as we wrote them, else the x axis and the size that Spark-DSG keeps."""
     if (told := place.told.get("frontier")) is not None:
         return np.array(told["direction"]), told["area_m2"]
@@ -150,7 +151,7 @@ def _opening(place: Item) -> tuple[np.ndarray, float] | None:
     return direction, float(attributes.frontier_scale[1] * attributes.frontier_scale[2])
 
 
-def _ground(place: Item) -> tuple[tuple[float, float, float], np.ndarray] | None:
+def ground_of(place: Item) -> tuple[tuple[float, float, float], np.ndarray] | None:
     """Ellipse (half axes, angle of the long one) and hull (corner, 2) of a piece of ground."""
     attributes = place.node.attributes
     if not isinstance(attributes, spark_dsg.Place2dNodeAttributes) or not len(attributes.boundary):
@@ -200,7 +201,7 @@ def _region(room: Item, names: dict[int, str], columns: dict[str, Any], layers: 
     )
 
 
-def _object(graph: spark_dsg.DynamicSceneGraph, item: Item) -> SceneObject:
+def object_of(graph: spark_dsg.DynamicSceneGraph, item: Item) -> SceneObject:
     """An object without a valid box is as small as its position."""
     attributes = item.node.attributes
     middle_m = tuple(np.asarray(attributes.position, float).tolist())

@@ -1,6 +1,7 @@
 """What exports are made of: a scene, and whatever is known beside it."""
 
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -40,4 +41,5 @@ class Material:
     losses: list[dict[str, Any]] | None = None  # what a run could not use; None = not known
     truth: GroundTruth | None = None
     prior: Prior | None = None  # that the regions follow
+    log: Path | None = None  # recording with every image of the run
     crs: str = ""  # coordinate reference system of the world with its origin, such as EPSG:32632; "" = local metres

@@ -109,6 +109,7 @@ def _read_log(path: Path, robot: str, moments_wanted: int, cloud_wanted: bool) -
     return Material(
         scene=found,
         prior=_prior_in(path, found.prior_digest),
+        log=path,
         voxels=voxels,
         cloud=moments.cloud_of(path, robot) if cloud_wanted else None,
         moments=story if moments_wanted else [],

@@ -81,7 +81,7 @@ class Cloud:
     def picture(self, highest_m: float = np.inf, until_ns: float = np.inf) -> Picture:
         """What lies no higher and was seen by then, a shape for some keyframes each."""
         picture: Picture = {}
-        frames = sorted(frame for frame, part in self._parts.items() if part.stamp_ns <= until_ns)
+        frames = sorted(frame for frame, part in list(self._parts.items()) if part.stamp_ns <= until_ns)  # others add
         for group in sorted({frame // GROUP for frame in frames}):
             parts = [self._parts[frame] for frame in frames if frame // GROUP == group]
             points_m, colors = (

@@ -12,7 +12,7 @@ from prior_sg.deploy.showing.colors import UNLABELLED, Color, LabelColors
 from prior_sg.deploy.showing.map import FURNITURE_M
 from prior_sg.deploy.showing.places import SHOWN_AREA_M2
 from prior_sg.deploy.viewing.footprint import Footprint, Grounds
-from prior_sg.deploy.viewing.shapes import Arrows, Lines, Mesh, Name, Picture, Points
+from prior_sg.deploy.viewing.shapes import Arrows, Lines, Mesh, Name, Picture, Points, dashed
 from prior_sg.schemas.names import shown
 from prior_sg.schemas.objects import SceneObject
 from prior_sg.schemas.regions import NO_REGION, Region
@@ -27,6 +27,7 @@ FAINTER = 0.45  # edges than their places
 ABOVE_FLOOR_M = 0.14  # of regions, so that floor points do not shine through
 FLOOR_OPACITY, PREDICTED_OPACITY, DIMMED_OPACITY = 0.5, 0.16, 0.1
 DASH_M = 0.18
+PATH_DASH_M, ROBOT_NAME_ABOVE_M = 0.12, 0.45
 SHORT_ARROW_M, LONG_ARROW_M = 0.25, 0.8
 CORNERS = np.array([(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)])
 EDGES_OF_BOX = [(a, b) for a in range(8) for b in range(a) if abs(CORNERS[a] - CORNERS[b]).sum() == 1]
@@ -43,6 +44,7 @@ class Theme:
     path: Color
     opening: Color = (230, 120, 20)
     light: Color = (255, 196, 0)  # of what a search found
+    way: Color = (255, 45, 120)  # to what somebody asked for
 
 
 DARK = Theme(True, (22, 25, 31), (236, 239, 244), (196, 204, 216), (246, 248, 250))
@@ -219,12 +221,17 @@ def _openings(theme: Theme, scene: Scene) -> Picture:
 
 
 def _path(theme: Theme, scene: Scene) -> Picture:
-    """From one keyframe's camera to the next, in blocks."""
+    """Where the robot has been, dashed and named, so that nobody takes it for a way to go: in blocks of keyframes."""
+    if not len(scene.trajectory):
+        return {}
     steps = np.stack((scene.trajectory[:-1], scene.trajectory[1:]), axis=1)
     color = np.array(theme.path, np.uint8)
-    return {
-        f"/trajectory/{block}": Lines(steps[rows], color, 2.5) for block, rows in blocks(np.arange(len(steps)), BLOCK)
+    picture: Picture = {
+        f"/trajectory/{block}": Lines(dashed(steps[rows], PATH_DASH_M), color, 1.8)
+        for block, rows in blocks(np.arange(len(steps)), BLOCK)
     }
+    x, y, z = scene.trajectory[-1].tolist()
+    return picture | {"/trajectory/robot": Name("robot", (x, y, z + ROBOT_NAME_ABOVE_M), 0.75)}
 
 
 def mixed(color: Color, other: Color, share: float) -> Color:

@@ -108,7 +108,7 @@ def _rows_of_regions(scene: Scene) -> dict[int, np.ndarray]:
     """Rows of each region's places."""
     order = np.argsort(scene.place_regions, kind="stable")
     regions, starts = np.unique(scene.place_regions[order], return_index=True)
-    parts = np.split(order, starts[1:])
+    parts = np.split(order, starts[1:]) if len(starts) else []
     return {int(region): rows for region, rows in zip(regions, parts, strict=True) if region != NO_REGION}
 
 
@@ -154,10 +154,17 @@ def _field(positions_m: np.ndarray, radii_m: np.ndarray, grid: _Grid) -> _Field:
     reach = int(np.ceil(radii.max())) + 1
     corner = np.maximum(np.floor(at.min(axis=0)).astype(int) - reach - MARGIN_CELLS, 0)
     size = np.ceil(at.max(axis=0)).astype(int) + reach + MARGIN_CELLS - corner
-    heights = np.full(size, FAR, np.float32)
-    raise_field = _by_place if len(at) < (2 * reach + 1) ** 2 else _by_step
-    raise_field(heights, at - corner, radii, reach)
+    heights = height_field((int(size[0]), int(size[1])), at - corner, radii)
     return _Field((int(corner[0]), int(corner[1])), heights * np.float32(grid.cell_m))
+
+
+def height_field(shape: tuple[int, int], at: np.ndarray, radii: np.ndarray) -> np.ndarray:
+    """The largest `radius - distance` of some discs (disc, 2), (disc,) over cells; all in cells, FAR beyond them."""
+    reach = int(np.ceil(radii.max())) + 1
+    heights = np.full(shape, FAR, np.float32)
+    raise_field = _by_place if len(at) < (2 * reach + 1) ** 2 else _by_step
+    raise_field(heights, at, radii, reach)
+    return heights
 
 
 def _by_place(heights: np.ndarray, at: np.ndarray, radii: np.ndarray, reach: int) -> None:

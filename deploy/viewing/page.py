@@ -11,22 +11,26 @@ import numpy as np
 import viser
 
 from prior_sg.deploy.showing.prior import graph_svg
-from prior_sg.deploy.viewing import search, words
+from prior_sg.deploy.viewing import search, ways, words
 from prior_sg.deploy.viewing.drawing import DARK, LIGHT, Painter
 from prior_sg.deploy.viewing.footprint import floor_m
-from prior_sg.deploy.viewing.panel import CUT_M, Asked, Panel
+from prior_sg.deploy.viewing.panel import CLOSE_WAY, CUT_M, FROM_ROBOT, Asked, Panel
 from prior_sg.deploy.viewing.picking import Picked, pick, typical_place
 from prior_sg.deploy.viewing.search import NOTHING_KNOWN
 from prior_sg.deploy.viewing.sources import Likeness, Source
 from prior_sg.deploy.viewing.stage import SafeServer, Stage
+from prior_sg.deploy.viewing.ways import FROM_THE_ROBOT, Trip, Way
+from prior_sg.schemas.queries import Spot
 from prior_sg.schemas.regions import NO_REGION
 from prior_sg.schemas.scene import Scene
 from prior_sg.services.errors import PriorSgError
+from prior_sg.services.scene_store.core.queries.index import Index
 
 SHARE = 4.0  # drawing takes at most one part in so many of the time
 PLAY_S, FRAME_S = 20.0, 0.1  # a whole history, and one step of it
 HEALTH_S, POLL_S, TYPING_S = 5.0, 0.5, 0.5
 MOST_CATCH_UP_S = 5.0
+START_CHOSEN = "ways start here: now search, or click where to, and ask for the way"
 
 
 @dataclass(frozen=True)
@@ -47,6 +51,8 @@ class Wanted:
     moment: int | None = None  # None = the newest
     text: str = ""  # searched for
     picked: Picked | None = None
+    goal: Spot | None = None  # the way there is shown
+    start: Spot = FROM_THE_ROBOT
     cut_m: float = CUT_M
     playing: bool = False
     told: dict[str, str] = field(default_factory=dict)  # notes by part of the panel
@@ -60,7 +66,8 @@ class Page:
         self._painter = Painter(DARK if options.dark else LIGHT)
         self._wanted = Wanted()
         self._wake, self._closed = threading.Event(), threading.Event()
-        self._scene: Scene | None = None
+        self._index: Index | None = None  # of the scene that is shown
+        self._hits: list[search.Hit] = []
         self._meant: dict[tuple[str, str], Likeness] = {}  # by text and prior
         self._asking = threading.Lock()
         self.sent_bytes = 0
@@ -103,6 +110,11 @@ class Page:
             layer=self.stage.switch,
             cut=lambda height: self._want(cut_m=height),
             frame=self.stage.frame,
+            answer=self._go_to_answer,
+            picked=self._go_to_picked,
+            start=self._start_at_picked,
+            robot=lambda: self._want(start=FROM_THE_ROBOT),
+            arrive=lambda: self._want(goal=None, start=FROM_THE_ROBOT),
             forget=lambda: self._want(picked=None),
         )
 
@@ -111,15 +123,28 @@ class Page:
             setattr(self._wanted, name, value)
         self._wake.set()
 
+    def _go_to_answer(self, row: int) -> None:
+        if row < len(self._hits):
+            self._want(goal=Spot(what=self._hits[row].what, id=self._hits[row].id))
+
+    def _go_to_picked(self) -> None:
+        if self._wanted.picked is not None:
+            self._want(goal=self._wanted.picked.spot)
+
+    def _start_at_picked(self) -> None:
+        if self._wanted.picked is not None:
+            self._want(start=self._wanted.picked.spot)
+
     def _search(self, text: str) -> None:
         """Words are compared at once; what they mean is asked when nobody has typed for a moment."""
-        self._want(text=text)
+        self._want(text=text, goal=None)
         self._later(self._find_meaning, text)
 
     def _find_meaning(self, text: str) -> None:
-        scene = self._scene
-        if self._closed.wait(TYPING_S) or scene is None or text != self._wanted.text or not text.strip():
+        index = self._index
+        if self._closed.wait(TYPING_S) or index is None or text != self._wanted.text or not text.strip():
             return
+        scene = index.scene
         key = (text, scene.prior_digest)
         with self._asking:
             if key in self._meant or text != self._wanted.text:
@@ -156,17 +181,21 @@ class Page:
         """Bring the page up to date; about how many bytes that sent."""
         wanted, stamps = self._wanted, self._source.stamps()
         scene = self._source.scene(wanted.moment)
-        self._scene = scene
+        index = self._index = Index(scene) if self._index is None or self._index.scene is not scene else self._index
         until_ns = scene.stamp_ns if wanted.moment is not None else np.inf
-        found = search.find(scene, wanted.text, self._meant.get((wanted.text, scene.prior_digest), NOTHING_KNOWN))
+        found = search.find(index, wanted.text, self._meant.get((wanted.text, scene.prior_digest), NOTHING_KNOWN))
         picked = NO_REGION if wanted.picked is None else wanted.picked.region
         picture = self._painter.draw(scene, replace(found.lit, picked=picked))
         ground_m = floor_m(scene, np.arange(len(scene.place_ids)))
+        way = None if wanted.goal is None else ways.way(index, Trip(wanted.goal, wanted.start))
+        if way is not None:
+            picture |= ways.picture(way, self._painter.theme.way, self._painter.theme.ink)
         picture |= self._source.cloud.picture(ground_m + wanted.cut_m, until_ns)
         sent = self.stage.show(picture).nbytes
         self.stage.look(self._source.camera(until_ns))
         self._frame(scene, ground_m)
         self._write(scene, found, len(stamps))
+        self._tell_way(way)
         self.sent_bytes += sent
         return sent
 
@@ -182,7 +211,9 @@ class Page:
         panel, wanted = self.panel, self._wanted
         panel.write("headline", words.headline(scene, self._source.title))
         panel.write("legend", words.legend(scene, self._painter.label_colors(scene)))
-        panel.write("answers", words.answers(found.rows) + (words.note(found.said) if found.said else ""))
+        self._hits = found.hits
+        said = words.answers(found.hits) + (words.note(found.said) if found.said else "")
+        panel.write("answers", said, tuple(str(row + 1) for row in range(len(found.hits))))
         panel.write("selected", self._selected(scene, wanted.picked))
         newest = max(count - 1, 0)
         moment = newest if wanted.moment is None else min(wanted.moment, newest)
@@ -191,6 +222,11 @@ class Page:
         prior = self._source.prior(scene.prior_digest)
         if prior is not None:
             panel.write("prior", words.card(graph_svg(prior)))
+
+    def _tell_way(self, way: Way | None) -> None:
+        chosen = not self._wanted.start.here
+        story = words.way_story(way) if way is not None else words.note(START_CHOSEN) if chosen else ""
+        self.panel.write("way", story, (CLOSE_WAY, FROM_ROBOT) if chosen else (CLOSE_WAY,))
 
     def _selected(self, scene: Scene, picked: Picked | None) -> str:
         """The story of what was clicked, as far as it is there at this moment."""
@@ -204,9 +240,9 @@ class Page:
         return (words.region_story(scene, region) if region else words.note("not there at this time")) + why
 
     def _clicked(self, event: viser.SceneClickEvent) -> None:
-        scene = self._scene
-        if scene is None:
+        if self._index is None:
             return
+        scene = self._index.scene
         origin, direction = np.array(event.ray_origin), np.array(event.ray_direction)
         picked = pick(scene, self._painter.ground(scene), origin, direction, self.stage.is_on("places"))
         self._wanted.told.pop("why", None)

@@ -7,6 +7,7 @@ from typing import Any
 
 import viser
 
+from prior_sg.deploy.viewing.search import MOST_ANSWERS
 from prior_sg.deploy.viewing.stage import LAYERS
 from prior_sg.deploy.viewing.words import note
 
@@ -25,7 +26,17 @@ class Asked:
     layer: Callable[[str, bool], None]
     cut: Callable[[float], None]
     frame: Callable[[viser.ClientHandle], None]
+    answer: Callable[[int], None]  # the way to one of the answers, by its row
+    picked: Callable[[], None]  # the way to what was clicked
+    start: Callable[[], None]  # ways begin at what was clicked
+    robot: Callable[[], None]  # ways begin at the robot again
+    arrive: Callable[[], None]  # no way any longer
     forget: Callable[[], None]
+
+
+WAY_THERE, START_HERE, CLOSE = "Way there", "Start here", "Close"
+FROM_ROBOT, CLOSE_WAY = "From the robot", "Close way"
+WAY_TO = "Way to"
 
 
 @dataclass
@@ -36,6 +47,7 @@ class Panel:
     asked: Asked
     live: bool
     _html: dict[str, Any] = field(default_factory=dict)
+    _buttons: dict[str, tuple[Any, tuple[str, ...]]] = field(default_factory=dict)  # below a text, and all there may be
     _moment_count: int = 0
     _setting: bool = False  # values that the page itself sets ask for nothing
 
@@ -44,9 +56,10 @@ class Panel:
         gui = self.server.gui
         gui.set_panel_label("Prior-SG")
         self._html["headline"] = gui.add_html("")
-        self._html["selected"] = gui.add_html("", visible=False)
-        self._close = gui.add_button("Close explanation", icon=viser.Icon.X, visible=False, color="gray")
-        self._close.on_click(lambda _: self.asked.forget())
+        self._add("way", "", {CLOSE_WAY: self.asked.arrive, FROM_ROBOT: self.asked.robot})
+        self._add(
+            "selected", "", {WAY_THERE: self.asked.picked, START_HERE: self.asked.start, CLOSE: self.asked.forget}
+        )
         tabs = gui.add_tab_group()
         with tabs.add_tab("Map", viser.Icon.MAP_2):
             self._build_map()
@@ -58,11 +71,19 @@ class Panel:
             with tabs.add_tab("Health", viser.Icon.HEARTBEAT):
                 self._html["health"] = gui.add_html(note("asking"))
 
+    def _add(self, where: str, label: str, does: dict[str, Callable[[], None]]) -> None:
+        """A text that is there at times, with its buttons."""
+        self._html[where] = self.server.gui.add_html("", visible=False)
+        buttons = self.server.gui.add_button_group(label, tuple(does), visible=False)
+        buttons.on_click(lambda event: does[event.target.value]())
+        self._buttons[where] = buttons, tuple(does)
+
     def _build_map(self) -> None:
         gui = self.server.gui
         self._search = gui.add_text("Find", "", hint="Regions and objects, for example: bed")
         self._search.on_update(lambda _: self.asked.search(self._search.value))
-        self._html["answers"] = gui.add_html("", visible=False)
+        rows = range(MOST_ANSWERS)
+        self._add("answers", WAY_TO, {str(row + 1): partial(self.asked.answer, row) for row in rows})
         if self.live:
             with gui.add_form(None) as form:
                 self._task = gui.add_text("Task", "", hint="What the robot is to do, in plain words")
@@ -100,8 +121,9 @@ class Panel:
         if event.client is not None:
             self.asked.frame(event.client)
 
-    def write(self, where: str, html: str) -> None:
-        """Change one text; an empty one takes no room."""
+    def write(self, where: str, html: str, offered: tuple[str, ...] | None = None) -> None:
+        """Change one text; an empty one takes no room, nor do its buttons, of which all are there unless some are
+        `offered`."""
         if where not in self._html:
             return
         handle = self._html[where]
@@ -109,8 +131,15 @@ class Panel:
             handle.content = html
         if handle.visible != bool(html):
             handle.visible = bool(html)
-        if where == "selected" and self._close.visible != bool(html):
-            self._close.visible = bool(html)
+        if where in self._buttons:
+            buttons, all_of_them = self._buttons[where]
+            self._offer(buttons, (all_of_them if offered is None else offered) if html else ())
+
+    def _offer(self, buttons: Any, options: tuple[str, ...]) -> None:
+        if options and buttons.options != options:
+            buttons.options = options
+        if buttons.visible != bool(options):
+            buttons.visible = bool(options)
 
     def text(self, where: str) -> str:
         """What is written there, as HTML."""

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from prior_sg.deploy.viewing.footprint import PAD_M, Footprint
+from prior_sg.schemas.queries import Spot
 from prior_sg.schemas.regions import NO_REGION
 from prior_sg.schemas.scene import Scene
 
@@ -18,6 +19,11 @@ class Picked:
     place: int
     region: int  # NO_REGION = none
     itself: bool
+
+    @property
+    def spot(self) -> Spot:
+        """As an end of a way."""
+        return Spot(what="place", id=self.place) if self.itself else Spot(what="region", id=self.region)
 
 
 def pick(

@@ -1,10 +1,11 @@
 """What a search lights up (pure)."""
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 from prior_sg.deploy.viewing.drawing import Lit
 from prior_sg.deploy.viewing.sources import Likeness
-from prior_sg.schemas.queries import AnswersTo, Ranking
+from prior_sg.schemas.queries import AnswersTo, Ranking, What
 from prior_sg.schemas.scene import Scene
 from prior_sg.services.scene_store.core.queries.answering import answer
 from prior_sg.services.scene_store.core.queries.index import Index
@@ -15,19 +16,28 @@ LIKELY = 0.5  # a score from which an answer is rather right than wrong
 AS_GOOD = 0.6  # of the best answer's score: what answers so well is lit, too
 
 
+class Hit(NamedTuple):
+    """One answer; without a score while its name is being typed."""
+
+    what: What
+    id: int
+    label: str
+    score: float | None
+
+
 @dataclass(frozen=True)
 class Found:
-    """Answers, best first: kind, name and score; and what of the map stands out."""
+    """Answers, best first; and what of the map stands out."""
 
-    rows: list[tuple[str, str, float | None]]
+    hits: list[Hit]
     lit: Lit
     said: str  # a sentence; empty when there is nothing to say
 
 
-def ranked(scene: Scene, text: str, likeness: Likeness) -> Ranking:
+def ranked(index: Index, text: str, likeness: Likeness) -> Ranking:
     """What answers a text by what its labels mean; where nothing is known of that, by their words."""
     asked = AnswersTo(text=text, regions=likeness.regions, objects=likeness.objects, limit=3 * MOST_ANSWERS)
-    found = answer(Index(scene), asked)
+    found = answer(index, asked)
     if not isinstance(found, Ranking):
         raise TypeError(f"AnswersTo is answered by {type(found).__name__}")
     return found
@@ -45,34 +55,30 @@ def found_in(ranking: Ranking, scene: Scene, text: str) -> Found:
         objects=frozenset(thing.id for thing in bright if thing.what == "object"),
     )
     said = ranking.note or ("" if best >= LIKELY else "nothing answers this for sure; these come nearest")
-    return Found([(thing.what, thing.label, thing.score) for thing in things[:MOST_ANSWERS]], lit, said)
+    return Found([Hit(thing.what, thing.id, thing.label, thing.score) for thing in things[:MOST_ANSWERS]], lit, said)
 
 
 def begun(scene: Scene, text: str) -> Found:
     """Regions and objects with a word that begins so, the most probable first."""
     start = text.strip().casefold()
     named = [
-        *((one.probability, "region", one.label, one.id) for one in scene.regions if _begins(one.label, start)),
-        *(
-            (one.probability * one.known, "object", one.label, one.id)
-            for one in scene.objects
-            if _begins(one.label, start)
-        ),
+        *((one.probability, Hit("region", one.id, one.label, None)) for one in scene.regions),
+        *((one.probability * one.known, Hit("object", one.id, one.label, None)) for one in scene.objects),
     ]
-    best = sorted(named, key=lambda one: -one[0])[:MOST_ANSWERS]
+    fitting = [(sure, hit) for sure, hit in named if _begins(hit.label, start)]
+    best = [hit for _, hit in sorted(fitting, key=lambda one: -one[0])[:MOST_ANSWERS]]
     lit = Lit(
-        regions=frozenset(number for _, kind, _, number in best if kind == "region"),
-        objects=frozenset(number for _, kind, _, number in best if kind == "object"),
+        regions=frozenset(hit.id for hit in best if hit.what == "region"),
+        objects=frozenset(hit.id for hit in best if hit.what == "object"),
     )
-    said = "" if best else f"nothing here answers {text.strip()!r}"
-    return Found([(kind, name, score) for score, kind, name, _ in best], lit, said)
+    return Found(best, lit, "" if best else f"nothing here answers {text.strip()!r}")
 
 
-def find(scene: Scene, text: str, likeness: Likeness = NOTHING_KNOWN) -> Found:
+def find(index: Index, text: str, likeness: Likeness = NOTHING_KNOWN) -> Found:
     """What of a scene answers a text; nothing where it is empty. It says what was missing to know better."""
     if not text.strip():
         return Found([], Lit(), "")
-    found = found_in(ranked(scene, text, likeness), scene, text)
+    found = found_in(ranked(index, text, likeness), index.scene, text)
     return replace(found, said=": ".join(part for part in (found.said, likeness.missing) if part))
 
 

@@ -99,3 +99,13 @@ def nbytes(shape: Shape) -> int:
     """Size of a shape's arrays and text."""
     values = [getattr(shape, field.name) for field in fields(shape)]
     return sum(value.nbytes if isinstance(value, np.ndarray) else len(str(value)) for value in values)
+
+
+def dashed(lines_m: np.ndarray, dash_m: float) -> np.ndarray:
+    """Dashes (dash, 2, 3) of about twice that distance from one to the next, along segments (segment, 2, 3)."""
+    along = lines_m[:, 1] - lines_m[:, 0]
+    counts = np.maximum(np.ceil(np.linalg.norm(along, axis=1) / (2 * dash_m)).astype(int), 1)
+    rows = np.repeat(np.arange(len(lines_m)), counts)
+    nth = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)
+    shares = np.stack(((nth + 0.25) / counts[rows], (nth + 0.75) / counts[rows]), axis=1)
+    return (lines_m[rows, :1] + shares[:, :, None] * along[rows, None]).astype(np.float32)

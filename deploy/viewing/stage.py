@@ -36,7 +36,8 @@ LAYERS = (
     Layer("edges", "Edges", True),
     Layer("objects", "Objects", True),
     Layer("unnamed", "Unnamed objects", False),
-    Layer("trajectory", "Trajectory", True),
+    Layer("way", "Way there", True),
+    Layer("trajectory", "Robot's way", True),
     Layer("camera", "Camera", True),
     Layer("frontiers", "Openings", False),
     Layer("answers", "Answers", True),
@@ -123,7 +124,7 @@ class Stage:
                     shape.points_m,
                     shape.colors,
                     point_size=shape.size_m,
-                    point_shape="circle" if name.startswith(("/places", "/answers")) else "square",
+                    point_shape="circle" if name.startswith(("/places", "/answers", "/way")) else "square",
                     point_shading="flat",
                     precision="float32",
                 )

@@ -10,12 +10,16 @@ from prior_sg.deploy.api.client import Health
 from prior_sg.deploy.inspecting.explain import gains
 from prior_sg.deploy.showing.colors import Color
 from prior_sg.deploy.viewing.drawing import edges_left_out
+from prior_sg.deploy.viewing.search import Hit
+from prior_sg.deploy.viewing.ways import Stop, Way
 from prior_sg.schemas.names import shown
+from prior_sg.schemas.queries import Thing
 from prior_sg.schemas.regions import NO_REGION, PosteriorReply, Region
 from prior_sg.schemas.scene import Scene
 from prior_sg.schemas.status import ServiceStatus
 
 CANDIDATES, MOST_ROWS = 3, 40
+NEAR_M = 0.3  # a way that ends so close to what was asked for ends there
 FAINT, SMALL = "opacity:.62", "opacity:.62;font-size:11.5px"
 NUMBER = "flex:none;text-align:right;font-variant-numeric:tabular-nums"
 TRACK = "background:rgba(128,138,150,.22)"
@@ -201,16 +205,47 @@ def _process_row(name: str, well: bool, told: str) -> str:
     )
 
 
-def answers(found: Iterable[tuple[str, str, float | None]]) -> str:
-    """Results of a search, best first: kind, name and score."""
+def answers(found: Iterable[Hit]) -> str:
+    """Results of a search, best first: number, name, kind and score."""
     rows = "".join(
-        f'<div style="display:flex;gap:8px;padding:2px 0"><span style="flex:1">'
-        f'<b style="font-weight:600">{text_of(name)}</b>'
-        f' <span style="{FAINT}">{text_of(kind)}</span></span>'
-        f'<span style="font-variant-numeric:tabular-nums">{"" if score is None else _percent(score)}</span></div>'
-        for kind, name, score in found
+        f'<div style="display:flex;gap:8px;padding:2px 0"><span style="{FAINT}">{number}</span><span style="flex:1">'
+        f'<b style="font-weight:600">{text_of(hit.label)}</b>'
+        f' <span style="{FAINT}">{text_of(hit.what)}</span></span>'
+        f'<span style="{NUMBER}">{"" if hit.score is None else _percent(hit.score)}</span></div>'
+        for number, hit in enumerate(found, 1)
     )
     return f'<div style="{_BOX}">{rows}</div>' if rows else ""
+
+
+def way_story(way: Way) -> str:
+    """A way in words: where to, how long and how wide, what it passes, and what of it nobody has checked."""
+    route, goal = way.route, way.route.goal
+    found = "Way" if route.found else "No way"
+    title = _title(f"{found} to {goal.label or 'there'}", f"{goal.what} {goal.id}") if goal else _title(found, "")
+    start = "where the robot is" if way.from_robot else _told_thing(route.start)
+    if not route.found:
+        return title + note(route.reason)
+    lines = [
+        f"<b>{route.length_m:.1f} m</b> from {start}",
+        f"at least {route.clearance_m:.2f} m to whatever is beside it",
+        *([_passed(way.stops)] if way.stops else []),
+        *(
+            f"not known to be free: {gap_m:.1f} m {where}"
+            for gap_m, where in ((route.start_gap_m, "at its start"), (route.goal_gap_m, "at its end"))
+            if gap_m > NEAR_M
+        ),
+    ]
+    return f'{title}<div style="{_BOX}">{"<br>".join(lines)}</div>'
+
+
+def _passed(stops: Sequence[Stop]) -> str:
+    """What a way leads through, with the numbers that stand on the map."""
+    first, *then = (text_of(stop.label) for stop in stops)
+    return f"{first} → " + " → ".join(f"{n} {label}" for n, label in enumerate(then, 1)) if then else f"within {first}"
+
+
+def _told_thing(thing: Thing | None) -> str:
+    return "the point chosen" if thing is None else text_of(f"{thing.label or thing.what} ({thing.what} {thing.id})")
 
 
 def card(svg: str) -> str:

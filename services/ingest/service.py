@@ -13,12 +13,15 @@ from prior_sg.schemas.topics import ARCHIVE, BACKFILL, CAMERA_STATE, ENCODE, ING
 from prior_sg.services.ingest.core import selection
 from prior_sg.services.ingest.core.config import Config
 from prior_sg.services.ingest.core.continuity import AHEAD_NS, Held
-from prior_sg.services.ingest.core.frames import BadFrame, Correction, EndOfSource, RawFrame
+from prior_sg.services.ingest.core.frames import BadFrame, Closure, Correction, EndOfSource, RawFrame, Unused
+from prior_sg.services.ingest.core.options import is_live
 from prior_sg.services.ingest.sources import Source, SourceError, open_source
+from prior_sg.services.ingest.sources.base import Event
 from prior_sg.services.runtime.service import Identity, Output, Service
 
 log = logging.getLogger(__name__)
 PROGRESS_S = 1.0
+SEARCH_S = 1.0  # between two searches for a robot
 
 
 class Port(Protocol):
@@ -46,10 +49,16 @@ def step(state: selection.State, message: Message, cfg: Config) -> Iterator[Outp
         case BadFrame():
             log.warning("frame unreadable", extra={"frame": message.frame_id, "reason": message.reason})
             yield from selection.lose(state, message)
+        case Unused():
+            log.warning("not used", extra={"what": message.what, "count": message.count, "reason": message.example})
+            yield from selection.pass_over(state, message)
         case JobDone():
             yield from selection.encoded(state, message)
         case Correction():
             yield from selection.announce(state, message)
+        case Closure():
+            log.info("the poses have jumped", extra={"keyframes": len(state.trail)})
+            yield from selection.close_loop(state, message)
         case Backfill():
             yield from selection.backfill(state, message)
         case PoseUpdate():
@@ -84,20 +93,47 @@ async def drive(port: Port, cfg: Config) -> None:
     if not cfg.source:
         log.info("no source is configured: set ingest.source to a dataset folder or an MCAP log")
         return
-    source = await asyncio.to_thread(_open, cfg)
+    source = await _opened(port, cfg)
+    if source is None:
+        return
     log.info("reading", extra={"source": cfg.source, "layout": source.layout, "frames": source.total})
     for note in source.notes:
         log.info("source", extra={"note": note})
+    stopping = asyncio.ensure_future(port.stopping.wait())
+    stopping.add_done_callback(lambda _: source.close())  # a live source may be waiting for its next frame
+    try:
+        if await _fed(port, source, cfg):
+            await port.consume(EndOfSource())
+    finally:
+        stopping.cancel()
+
+
+async def _opened(port: Port, cfg: Config) -> Source | None:
+    """The source; a robot that is not there is waited for, until the host wishes to stop. Raises SourceError."""
+    while not port.stopping.is_set():
+        try:
+            return await asyncio.to_thread(_open, cfg)
+        except SourceError as error:
+            if not is_live(cfg.source):
+                raise
+            log.warning("no robot yet", extra={"reason": str(error)})
+            await _stopped_while(port, asyncio.sleep(SEARCH_S))
+    return None
+
+
+async def _fed(port: Port, source: Source, cfg: Config) -> bool:
+    """Feed all that comes; False when the host wishes to stop before the end."""
     events = source.events()
     pace = Pace(cfg.speed)
     while (event := await asyncio.to_thread(next, events, None)) is not None:
-        if cfg.speed > 0 and await _stopped_while(port, pace.until_due(event)):
-            return
-        slows_down = cfg.speed <= 0 or cfg.when_behind == "wait"
-        if slows_down and await _stopped_while(port, port.room(cfg.window)):
-            return
+        if source.live is None:
+            if cfg.speed > 0 and await _stopped_while(port, pace.until_due(event)):
+                return False
+            slows_down = cfg.speed <= 0 or cfg.when_behind == "wait"
+            if slows_down and await _stopped_while(port, port.room(cfg.window)):
+                return False
         await port.consume(event)
-    await port.consume(EndOfSource())
+    return not port.stopping.is_set()
 
 
 class Pace:
@@ -109,7 +145,7 @@ class Pace:
         self._origin: tuple[float, int] | None = None  # loop time in seconds, stamp in nanoseconds
         self._newest_ns = 0
 
-    async def until_due(self, frame: RawFrame | BadFrame | Correction) -> None:
+    async def until_due(self, frame: Event) -> None:
         """Return when the frame is due; all else, and frames that come late, are due at once."""
         if not isinstance(frame, RawFrame):
             return
@@ -121,9 +157,14 @@ class Pace:
         await asyncio.sleep(max(0.0, due_s - now_s))
 
 
+def _keeps_pace(cfg: Config) -> bool:
+    """Whether frames come whether or not the workers follow; a robot waits for nobody."""
+    return is_live(cfg.source) or (cfg.when_behind == "skip" and cfg.speed > 0)
+
+
 def _open(cfg: Config) -> Source:
     source = open_source(cfg.source, options=cfg)
-    if source.total == 0:
+    if source.total == 0 and source.live is None:
         raise SourceError(f"{cfg.source} holds no frames")
     return source
 
@@ -154,6 +195,6 @@ SERVICE = Service(
     answers={ARCHIVE: selection.archived},
     drive=drive,
     losses=selection.losses,
-    job_limit=lambda cfg: cfg.window if cfg.when_behind == "skip" and cfg.speed > 0 else 0,
+    job_limit=lambda cfg: cfg.window if _keeps_pace(cfg) else 0,
     tick_s=PROGRESS_S,
 )

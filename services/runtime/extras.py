@@ -27,14 +27,20 @@ MODULES = {  # by extra; what the build file lists there, by the names that code
     "mcp": ("mcp",),
     "view": ("viser",),
     "rerun": ("rerun",),
+    "foxglove": ("foxglove",),
     "ros": ("rosbags",),
+    "record3d": ("lzfse",),
+    "hydra": ("zmq", "spark_dsg"),
 }
 CONTAINS = {
     "view": ("map",),
     "encode": ("map",),
     "clip": ("encode", "map"),
     "export": ("clip", "encode", "map"),
+    "foxglove": ("map",),
     "ros": ("map",),
+    "record3d": ("map",),
+    "hydra": ("map",),
 }
 
 

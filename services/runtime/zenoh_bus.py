@@ -1,4 +1,4 @@
-"""The bus over Zenoh: the only file that imports zenoh.
+"""The bus over Zenoh: beside the session with ROS 2, the only file that imports zenoh.
 
 Every process is a client of a router on its own host (peers do not relay). `every` uses advanced publishers with a
 cache, history for late readers and recovery of missed samples; what these cannot recover is caught by the revisions of
@@ -89,11 +89,13 @@ def client_config(endpoint: str, bundle: Bundle | None = None) -> zenoh.Config:
 
 
 def router_settings(endpoint: str, beyond: Beyond | None = None) -> dict[str, Any]:
-    """Zenoh's settings of a router: for the processes of its host on loopback, and `beyond` for those with keys."""
+    """Zenoh's settings of a router: for the processes of its host on loopback, and `beyond` for those with keys. On
+    loopback alone it gossips: nodes of ROS, which are peers, find each other by that.
+    """
     settings: dict[str, Any] = {
         "mode": "router",
         "listen": {"endpoints": [endpoint, *(beyond.listen if beyond else ())]},
-        "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
+        "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": beyond is None}},
         "timestamping": {"enabled": True},
         "transport": _transport(beyond.bundle if beyond else None),
     }
@@ -131,7 +133,7 @@ def open_router(endpoint: str, beyond: Beyond | None = None) -> Callable[[], Non
         kind = EndpointTakenError if number == errno.EADDRINUSE else BusError
         where = " and ".join((endpoint, *(beyond.listen if beyond else ())))
         raise kind(cannot_listen(where, number, without_places(said))) from error
-    return lambda: _close_within(session, CLOSE_TIMEOUT_S)
+    return lambda: close_within(session, CLOSE_TIMEOUT_S)
 
 
 def open_free_router(wanted: str) -> tuple[str, Callable[[], None]]:
@@ -145,14 +147,15 @@ def open_free_router(wanted: str) -> tuple[str, Callable[[], None]]:
     return endpoint, open_router(endpoint)
 
 
-def _close_within(session: zenoh.Session, timeout_s: float) -> None:
+def close_within(session: zenoh.Session, timeout_s: float) -> None:
     """Close, but not for longer than the timeout: closing over a broken link can take very long."""
-    closer = threading.Thread(target=lambda: _quietly(session.close), daemon=True)
+    closer = threading.Thread(target=lambda: quietly(session.close), daemon=True)
     closer.start()
     closer.join(timeout_s)
 
 
-def _quietly(action: Callable[[], Any]) -> None:
+def quietly(action: Callable[[], Any]) -> None:
+    """Run what may fail because the other side, or the session, has gone."""
     with contextlib.suppress(zenoh.ZError):
         action()
 
@@ -169,12 +172,12 @@ class ZenohRequest:
     def reply(self, payload: bytes) -> None:
         """Answer; a caller that has gone away is no error."""
         with self._query:
-            _quietly(lambda: self._query.reply(self.key, payload, encoding=_encoding(self._reply)))
+            quietly(lambda: self._query.reply(self.key, payload, encoding=_encoding(self._reply)))
 
     def refuse(self, reason: str) -> None:
         """Decline."""
         with self._query:
-            _quietly(lambda: self._query.reply_err(reason.encode()))
+            quietly(lambda: self._query.reply_err(reason.encode()))
 
 
 class ZenohBus:
@@ -263,7 +266,7 @@ class ZenohBus:
         def end() -> None:
             for entity in entities:
                 self._entities.remove(entity)
-                _quietly(entity.undeclare)
+                quietly(entity.undeclare)
 
         return end
 
@@ -310,7 +313,7 @@ class ZenohBus:
 
     def close(self) -> None:
         """Leave the bus, within a bound."""
-        _close_within(self._session, CLOSE_TIMEOUT_S)
+        close_within(self._session, CLOSE_TIMEOUT_S)
 
 
 def _encoding(kind: type[Message] | None) -> zenoh.Encoding:

@@ -132,7 +132,7 @@ OBJECT = objects.SceneObject(
     max_m=(1.5, 2.5, 1.0),
     frames=3,
 )
-SPOT = queries.Spot(point_m=(1.0, 2.0, 3.0), what="region", id=4, label="hall")
+SPOT = queries.Spot(point_m=(1.0, 2.0, 3.0), what="region", id=4, label="hall", here=True)
 QUESTIONS = [
     queries.ById(what="region", id=4),
     queries.ByLabel(label="oven", what="object", limit=5),

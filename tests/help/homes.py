@@ -50,6 +50,12 @@ def home(**changes: object) -> Scene:
     return msgspec.structs.replace(scene, **changes)
 
 
+def joined_home(**changes: object) -> Scene:
+    """One can go along y = 1 from the kitchen through to the bedroom, but nowhere else."""
+    edges, clearances_m = np.array([(10, 12), (12, 14), (14, 16), (16, 18)]), np.array([0.5, 0.5, 0.3, 0.5], np.float32)
+    return home(edges=edges, clearances_m=clearances_m, **changes)
+
+
 def region(number: int, label: str, probability: float, position_m: tuple, **more: object) -> Region:
     return Region(
         id=number, label=label, place_count=4, probability=probability, position_m=position_m, area_m2=9.0, **more

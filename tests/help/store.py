@@ -1,20 +1,24 @@
 """A running system on a local bus: a store that answers of scenes it is given, and all that a task needs."""
 
 import threading
+import time
 
 import msgspec
 import numpy as np
 
 from prior_sg.schemas.codec import decode, encode
 from prior_sg.schemas.frames import PoseUpdate
+from prior_sg.schemas.objects import ObjectDelta
 from prior_sg.schemas.priors import PriorList, Task
 from prior_sg.schemas.queries import SceneQuery
-from prior_sg.schemas.regions import RegionDelta
+from prior_sg.schemas.regions import PosteriorReply, RegionDelta
 from prior_sg.schemas.scene import SceneRequest, SceneRevision
 from prior_sg.schemas.status import Consumed
 from prior_sg.schemas.topics import (
     JOURNAL,
+    OBJECT_DELTA,
     POSE_UPDATE,
+    POSTERIOR,
     PRIOR,
     PRIORS,
     REGION_DELTA,
@@ -33,10 +37,13 @@ from tests.help.world import prior
 
 
 class StandIn:
-    """`relabel` makes of a scene and a task the scene that follows it; `forgotten` revisions are not kept."""
+    """`relabel` makes of a scene and a task the scene that follows it, which the store has `behind_s` after the regions
+    are told; `forgotten` revisions are not kept; `mute` says which of "prior", "regions", "names", "poses" stay out.
+    """
 
-    def __init__(self, scene, relabel=lambda scene, task, digest: scene):
+    def __init__(self, scene, relabel=lambda scene, task, digest: scene, *, mute=(), behind_s=0.0):
         self.hub, self.robot, self.relabel = Hub(), scene.robot, relabel
+        self.mute, self.behind_s = mute, behind_s
         self.scenes, self.tasks, self.poses = [msgspec.structs.replace(scene, revision=0)], [], []
         self.forgotten = set()
         self.bus = BusClient(LocalBus(self.hub))
@@ -44,6 +51,7 @@ class StandIn:
         serve(SCENE.key.format(robot="*"), self.show)
         serve(SCENE_QUERY.key.format(robot="*"), self.answer)
         serve(PRIORS.key, lambda request: request.reply(encode(PriorList(priors=[], reason="no library"))))
+        serve(POSTERIOR.key.format(robot=self.robot), self.explain)
         self.bus.bus.announce(alive_key("place_graph", "p-1"))
         self.bus.listen(TASK, self.robot, self.take)
         self.bus.listen(POSE_UPDATE, self.robot, self.correct)
@@ -54,6 +62,10 @@ class StandIn:
     def show(self, request):
         robot = decode(SceneRequest, request.payload).robot
         request.reply(encode(self.scenes[-1] if robot == self.robot else empty(robot)))
+
+    def explain(self, request):
+        place = decode(POSTERIOR.request, request.payload).place_id
+        request.reply(encode(PosteriorReply(robot=self.robot, place_id=place, found=place == 1, label="kitchen")))
 
     def answer(self, request):
         query = decode(SceneQuery, request.payload)
@@ -75,18 +87,30 @@ class StandIn:
     def take(self, sample):
         task = decode(Task, sample.payload)
         self.tasks.append(task)
+        if "prior" in self.mute:
+            return
         made = prior(["kitchen", "hall"], environment=task.environment, task=task.task, vocabulary=task.regions)
         self.bus.publish(PRIOR, made)
         threading.Timer(0.05, self.label, (task, made.digest())).start()
 
     def label(self, task, digest):
+        """Regions first, then the names of objects; the store is behind both."""
         scene = self.relabel(self.scenes[-1], task.task, digest)
-        if scene is not None:
-            self.bus.publish(REGION_DELTA, delta(self.robot, task.task, digest))
+        if scene is None or "regions" in self.mute:
+            return
+        self.bus.publish(REGION_DELTA, delta(self.robot, task.task, digest))
+        time.sleep(self.behind_s)
+        unnamed = [msgspec.structs.replace(item, label="") for item in scene.objects]
+        self.store(msgspec.structs.replace(scene, objects=unnamed))
+        if "names" not in self.mute:
+            self.bus.publish(OBJECT_DELTA, names(self.robot, scene.objects, digest))
+            time.sleep(self.behind_s)
             self.store(scene)
 
     def correct(self, sample):
         self.poses.append(decode(PoseUpdate, sample.payload))
+        if "poses" in self.mute:
+            return
         entry = Consumed(
             robot=self.robot,
             service="place_graph",
@@ -97,6 +121,14 @@ class StandIn:
             sequence=sample.sequence,
         )
         self.bus.publish(JOURNAL, entry)
+
+
+def names(robot, objects, digest):
+    """What the segmenter tells of objects that a prior names."""
+    none = np.zeros(0, np.int64)
+    return ObjectDelta(
+        robot=robot, epoch=1, revision=0, stamp_ns=1, prior_digest=digest, objects=objects, removed_ids=none
+    )
 
 
 def delta(robot, task, digest):

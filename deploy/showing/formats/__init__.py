@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 
 HERE = "prior_sg.deploy.showing"
 MOMENTS = 60  # of a run, at most, in formats that tell how the scene came about
+MOST_MOMENTS = 240  # where a timeline plays them
 
 
 class ExportError(UserError):
@@ -54,6 +55,15 @@ _ALL = (
     Format("gltf", "scene.glb", "formats.gltf:write_gltf", "Blender, any viewer of 3D models", cloud=True),
     Format("geojson", "scene.geojson", "formats.geojson:write_geojson", "QGIS and maps, with the world's offset"),
     Format("rrd", "scene.rrd", "formats.recording:write_rrd", "Rerun, with a timeline", "rerun", MOMENTS, cloud=True),
+    Format(
+        "foxglove",
+        "foxglove.mcap",
+        "formats.foxglove:write_foxglove",
+        "Foxglove: images, map and figures over time, and a layout",
+        "foxglove",
+        MOST_MOMENTS,
+        cloud=True,
+    ),
     Format("csv", "tables", "formats.tables:write_csv", "spreadsheets: a folder of tables"),
     Format("html", "scene.html", "formats.page:write_html", "one page to look at and to pass on", moments=MOMENTS),
     Format("text", "scene.txt", "formats.plain:write_text", "language models: in few words, the most useful first"),

@@ -12,9 +12,10 @@ class Config(ReadOptions, frozen=True, kw_only=True):
     keyframes overlap by more than half at 60 to 75 degrees of view.
     """
 
-    source: str = ""  # a folder of a layout in docs/sources.md, or an MCAP log; empty = no source
+    source: str = ""  # a folder of a layout in docs/sources.md, an MCAP log, or ros2:/; empty = no source
     speed: float = 0.0  # times real time, by stamps; 0 = as fast as the pipeline drains
-    when_behind: Literal["wait", "skip"] = "wait"  # wait for slow workers, or keep pace and encode only the newest
+    when_behind: Literal["wait", "skip"] = "wait"  # wait for slow workers, or keep pace and encode only the newest, as
+    # a live source always does
     # Keyframes under way before the source waits, or older ones are skipped; below the publisher's cache.
     window: int = 8
     every_frame: bool = False  # make every frame a keyframe

@@ -23,6 +23,7 @@ class RawFrame(Message, frozen=True, kw_only=True):
     total: int  # frames in the source, 0 = unknown (live)
     mask: bytes = b""
     origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    pose_only: bool = False  # of a live source, which decodes images only where a keyframe is due
 
     def check(self) -> None:
         check_pose(self.world_from_camera)
@@ -50,6 +51,25 @@ class Correction(Message, frozen=True, kw_only=True):
 
     def check(self) -> None:
         check_pose(self.world_from_camera)
+
+
+class Unused(Message, frozen=True, kw_only=True):
+    """Messages of a live source that could not be used, of one kind, since the last word on them."""
+
+    what: str  # such as "depth images"
+    reason: str  # what they have in common
+    count: int
+    example: str  # the first one's reason, in full
+
+
+class Closure(Message, frozen=True, kw_only=True):
+    """A live source's poses have jumped: its SLAM has closed a loop or found its place in the map again."""
+
+    stamp_ns: int
+    after_from_before: Pose  # what the jump did to the pose of the camera, in the world
+
+    def check(self) -> None:
+        check_pose(self.after_from_before)
 
 
 class EndOfSource(Message, frozen=True, kw_only=True):

@@ -21,36 +21,42 @@ def depth_image(points_camera: np.ndarray, camera: Intrinsics) -> np.ndarray:
     points = np.where(np.isfinite(points_camera), points_camera, 0.0).reshape(-1, 3).astype(np.float64)
     pixels, depths_m = project(points, camera)
     inverse_image = np.zeros((camera.height_px, camera.width_px))
-    _draw(
-        pixels[:, 0].reshape(rows, columns),
-        pixels[:, 1].reshape(rows, columns),
-        depths_m.reshape(rows, columns),
-        inverse_image,
-        NEAR_M,
-        MAX_STEP,
-    )
+    u, v = np.ascontiguousarray(pixels.T)
+    _draw(rows, columns, u, v, depths_m, inverse_image, NEAR_M, MAX_STEP)
     return np.divide(1.0, inverse_image, out=np.zeros_like(inverse_image), where=inverse_image > 0)
 
 
 @compiled()
-def _draw(u, v, z, image, near_m, max_step):  # noqa: ANN001, ANN202, PLR0917
-    """Two triangles for each four neighbours of the scan."""
-    rows, columns = z.shape
-    for i in range(rows - 1):
-        for j in range(columns):
-            k = (j + 1) % columns
-            _triangle(u, v, z, i, j, i, k, i + 1, j, image, near_m, max_step)
-            _triangle(u, v, z, i + 1, k, i, k, i + 1, j, image, near_m, max_step)
+def draw_triangles(corners, u, v, z, image, near_m, max_step):  # noqa: ANN001, ANN201, PLR0917
+    """Raise the image's inverse depth to that of triangles: (n, 3) indices of corners, at pixels u, v in depths z."""
+    for a, b, c in corners:
+        _triangle(u, v, z, a, b, c, image, near_m, max_step)
 
 
 @compiled()
-def _triangle(u, v, z, i0, j0, i1, j1, i2, j2, image, near_m, max_step):  # noqa: ANN001, ANN202, PLR0917
+def _draw(rows, columns, u, v, z, image, near_m, max_step):  # noqa: ANN001, ANN202, PLR0917
+    """Two triangles for each four neighbours of the scan, whose rows follow each other."""
+    for i in range(rows - 1):
+        for j in range(columns):
+            k = (j + 1) % columns
+            above, beside, below, across = (
+                i * columns + j,
+                i * columns + k,
+                (i + 1) * columns + j,
+                (i + 1) * columns + k,
+            )
+            _triangle(u, v, z, above, beside, below, image, near_m, max_step)
+            _triangle(u, v, z, across, beside, below, image, near_m, max_step)
+
+
+@compiled()
+def _triangle(u, v, z, a, b, c, image, near_m, max_step):  # noqa: ANN001, ANN202, PLR0917
     """Raise the image's inverse depth to that of a triangle, on the pixels whose centres it holds."""
-    z0, z1, z2 = z[i0, j0], z[i1, j1], z[i2, j2]
+    z0, z1, z2 = z[a], z[b], z[c]
     nearest, farthest = min(z0, z1, z2), max(z0, z1, z2)
     if nearest < near_m or farthest - nearest > max_step * nearest:
         return
-    u0, v0, u1, v1, u2, v2 = u[i0, j0], v[i0, j0], u[i1, j1], v[i1, j1], u[i2, j2], v[i2, j2]
+    u0, v0, u1, v1, u2, v2 = u[a], v[a], u[b], v[b], u[c], v[c]
     area = (u1 - u0) * (v2 - v0) - (u2 - u0) * (v1 - v0)
     if area == 0:
         return

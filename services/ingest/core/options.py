@@ -16,6 +16,7 @@ StampUnit = Literal["s", "ms", "us", "ns"]
 StampClock = Literal["header", "received"]
 LensModel = Literal["pinhole", "opencv", "fisheye"]
 COEFFICIENTS: dict[str, tuple[int, ...]] = {"pinhole": (0,), "opencv": (4, 5, 8), "fisheye": (4,)}
+LIVE = "ros2:"
 ORIGIN_KEPT, ORIGIN_AUTO = "keep", "auto"
 
 
@@ -46,9 +47,13 @@ class ReadOptions(msgspec.Struct, frozen=True, kw_only=True):
     depth_topic: str = ""
     info_topic: str = ""  # the colour camera's info
     pose_topic: str = ""  # odometry, poses or transforms; empty = tf where it moves the camera, else one of them
+    graph_topic: str = ""  # of a live robot: its optimised poses (nav_msgs/Path) of pose_frame; empty = jumps of tf
     fixed_frame: str = ""  # of tf: the world; empty = map, world, odom or the root
     pose_frame: str = ""  # the frame whose poses pose_topic has; empty = as its messages say, else the camera's
+    depth_model: str = ""  # an ONNX file that sees depth in two pictures; empty = OpenCV's semi-global matching
     sync_tolerance_s: float = 0.02  # most between stamps of colour, depth and pose that belong together
+    ros_domain: int = 0  # of a live robot: its ROS_DOMAIN_ID
+    end_after_s: float = 30.0  # a live source has ended after so long without a frame; 0 = never
     clock: StampClock = "header"  # stamps of a ROS recording: of the messages' headers, or of their arrival
 
     def __post_init__(self) -> None:
@@ -60,6 +65,8 @@ class ReadOptions(msgspec.Struct, frozen=True, kw_only=True):
             raise ValueError(f"rate_hz must be a number of frames per second, got {self.rate_hz}")
         if not (math.isfinite(self.sync_tolerance_s) and self.sync_tolerance_s > 0):
             raise ValueError(f"sync_tolerance_s must be a positive number of seconds, got {self.sync_tolerance_s}")
+        if not (math.isfinite(self.end_after_s) and self.end_after_s >= 0):
+            raise ValueError(f"end_after_s must be a number of seconds, got {self.end_after_s}")
         if not 0 <= self.depth_min_m < (self.depth_max_m or math.inf):
             raise ValueError("depth_min_m must be at least 0 and below depth_max_m")
         if self.intrinsics and not (
@@ -72,6 +79,11 @@ class ReadOptions(msgspec.Struct, frozen=True, kw_only=True):
     def frame_ns(self, published_hz: float) -> float:
         """Nanoseconds between frames of a layout without stamps."""
         return 1e9 / (self.rate_hz or published_hz)
+
+
+def is_live(source: str) -> bool:
+    """Whether a source is a running robot rather than a file."""
+    return source.startswith(LIVE)
 
 
 def check_lens(model: str, coefficients: Sequence[float]) -> None:

@@ -1,6 +1,7 @@
 """Files of pixels: decoded as they are stored, whatever an orientation tag says, and encoded again (pure)."""
 
 import io
+import tokenize
 
 import cv2
 import numpy as np
@@ -10,6 +11,9 @@ from prior_sg.services.headers import ImageError, image_size, is_sized, trimmed
 NPY_MAGIC, EXR_MAGIC = b"\x93NUMPY", b"\x76\x2f\x31\x01"
 BITS = {"uint8": 8, "int8": 8, "bool": 8}
 DEPTH_MAX = 65535
+NPY_FAULTS = (  # what numpy raises for damaged headers
+    ValueError, TypeError, EOFError, OSError, SyntaxError, OverflowError, MemoryError, tokenize.TokenError,
+)  # fmt: skip
 JPEG_QUALITY = 95
 
 
@@ -51,7 +55,7 @@ def array_of(data: bytes) -> np.ndarray:
     """Numbers of a saved array of any shape that holds some. Raises ImageError."""
     try:
         array = np.lib.format.read_array(io.BytesIO(data), allow_pickle=False)
-    except (ValueError, EOFError, OSError) as error:
+    except NPY_FAULTS as error:
         raise ImageError("it is no saved array of numbers, or it is cut off: write it again with numpy.save") from error
     if 0 in array.shape or array.dtype.kind not in "fiub":
         raise ImageError(f"its array has the shape {array.shape} and the type {array.dtype}")

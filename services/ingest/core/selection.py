@@ -8,7 +8,7 @@ encoders (ENCODE), and into an archive from which late readers may ask for them 
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import islice
 
 import msgspec
@@ -28,9 +28,10 @@ from prior_sg.schemas.status import JobDone, Loss
 from prior_sg.schemas.topics import CAMERA_STATE, ENCODE, INGEST_STATE, KEYFRAME, POSE_UPDATE, Topic
 from prior_sg.services.geometry import inverse, rotation_angle_rad
 from prior_sg.services.ingest.core.archive import KeyframeArchive
+from prior_sg.services.ingest.core.closures import spread
 from prior_sg.services.ingest.core.config import Config
 from prior_sg.services.ingest.core.continuity import BELIEVED_AFTER, POSES_JUMP, Continuity, Held, Refusal, reachable
-from prior_sg.services.ingest.core.frames import BadFrame, Correction, RawFrame, View
+from prior_sg.services.ingest.core.frames import BadFrame, Closure, Correction, RawFrame, Unused, View
 from prior_sg.services.losses import Losses
 
 Written = tuple[Topic, Message]
@@ -55,6 +56,7 @@ class State:
     corrections: int = 0  # pose updates published
     encoding: set[int] = field(default_factory=set)  # numbers of keyframes whose job is not done
     ended: bool = False
+    trail: list[View] = field(default_factory=list)  # keyframes since the poses last jumped
     continuity: Continuity = field(default_factory=Continuity)
     losses: Losses = field(default_factory=Losses)
     archive: KeyframeArchive = field(default_factory=KeyframeArchive)
@@ -103,6 +105,12 @@ def lose(state: State, bad: BadFrame) -> Iterator[Written]:
     yield from _lose(state, bad.total)
 
 
+def pass_over(state: State, unused: Unused) -> Iterator[Written]:
+    """Count messages that a live source could not use."""
+    state.losses.add(unused.what, unused.example, reason=unused.reason, count=unused.count)
+    yield progress(state)
+
+
 def accept(state: State, frame: RawFrame, cfg: Config) -> Iterator[Written]:
     """Report the camera, and make the frame a keyframe when it is due."""
     state.read, state.total = state.read + 1, frame.total
@@ -111,18 +119,20 @@ def accept(state: State, frame: RawFrame, cfg: Config) -> Iterator[Written]:
         CAMERA_STATE,
         CameraState(robot=state.robot, stamp_ns=frame.stamp_ns, world_from_camera=frame.world_from_camera),
     )
-    if due(state.keyframe, frame, cfg):
+    if not frame.pose_only and due(state.keyframe, frame, cfg):
         state.keyframe = state.last
+        state.trail.append(state.last)
         keyframe = _keyframe(state, frame)
         state.archive.put(keyframe, cfg.archive_mb * 1e6)
         state.keyframes += 1
-        state.encoding.add(keyframe.frame_id)
         yield KEYFRAME, keyframe
-        yield ENCODE, keyframe
+        if keyframe.color:  # a lidar alone sees nothing that could be encoded
+            state.encoding.add(keyframe.frame_id)
+            yield ENCODE, keyframe
     yield progress(state)
 
 
-def due(keyframe: View | None, frame: RawFrame, cfg: Config) -> bool:
+def due(keyframe: View | None, frame: RawFrame | View, cfg: Config) -> bool:
     """Whether the camera has moved, turned or waited enough since the last keyframe."""
     if keyframe is None or cfg.every_frame:
         return True
@@ -149,23 +159,28 @@ def encoded(state: State, done: JobDone) -> Iterator[Written]:
 def backfill(state: State, wish: Backfill) -> Iterator[Written]:
     """Encode archived keyframes again, in one space: those that the asking reader lacks. They give way to new ones."""
     for keyframe in state.archive.lacked(wish):
+        if not keyframe.color:
+            continue
         yield ENCODE, msgspec.structs.replace(keyframe, space=wish.space)
 
 
 def announce(state: State, correction: Correction) -> Iterator[Written]:
     """Publish corrected poses of the source; the archive follows when the update comes back, as anybody's does."""
-    yield (
-        POSE_UPDATE,
-        PoseUpdate(
-            robot=state.robot,
-            epoch=state.epoch,
-            revision=state.corrections,
-            stamp_ns=correction.stamp_ns,
-            frame_ids=correction.frame_ids + state.continuity.number_offset,
-            world_from_camera=correction.world_from_camera,
-        ),
-    )
-    state.corrections += 1
+    ids = correction.frame_ids + state.continuity.number_offset
+    yield from _update(state, correction.stamp_ns, ids, correction.world_from_camera)
+
+
+def close_loop(state: State, closure: Closure) -> Iterator[Written]:
+    """Publish what a jump of a live source's poses says of the keyframes before it."""
+    if state.last is None or not state.trail:
+        return
+    moved = np.array(closure.after_from_before)
+    poses = spread(state.trail, state.last.world_from_camera[:3, 3], moved)
+    trail, state.trail = state.trail, []
+    state.last = replace(state.last, world_from_camera=moved @ state.last.world_from_camera)
+    state.keyframe = replace(trail[-1], world_from_camera=poses[-1])
+    ids = np.array([view.frame_id for view in trail], np.int64)
+    yield from _update(state, closure.stamp_ns, ids, np.stack(poses))
 
 
 def correct(state: State, update: PoseUpdate) -> None:
@@ -212,6 +227,22 @@ def archived(state: State, request: ArchiveRequest, cfg: Config) -> ArchiveReply
             islice(state.archive.between(request.first_frame_id, request.end_frame_id), max(0, request.limit))
         ),
     )
+
+
+def _update(state: State, stamp_ns: int, frame_ids: np.ndarray, world_from_camera: np.ndarray) -> Iterator[Written]:
+    """The next pose update: numbers (n,) of the stream, poses (n, 4, 4)."""
+    yield (
+        POSE_UPDATE,
+        PoseUpdate(
+            robot=state.robot,
+            epoch=state.epoch,
+            revision=state.corrections,
+            stamp_ns=stamp_ns,
+            frame_ids=frame_ids,
+            world_from_camera=world_from_camera,
+        ),
+    )
+    state.corrections += 1
 
 
 def _jump(state: State, last: View, frame: RawFrame, cfg: Config) -> Refusal | None:

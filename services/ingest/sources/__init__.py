@@ -6,7 +6,7 @@ from pathlib import Path
 
 import msgspec
 
-from prior_sg.services.ingest.core.options import ReadOptions
+from prior_sg.services.ingest.core.options import ReadOptions, is_live
 from prior_sg.services.ingest.sources import (
     coda,
     dataset,
@@ -16,18 +16,38 @@ from prior_sg.services.ingest.sources import (
     recording,
     replica,
     ros,
+    ros_live,
     scannet,
     seven_scenes,
     tartanground,
     tum,
 )
 from prior_sg.services.ingest.sources.base import Source, SourceError
+from prior_sg.services.ingest.sources.clouds import folder as clouds_folder
+from prior_sg.services.ingest.sources.exports import euroc, record3d, rtabmap, stray_scanner
 from prior_sg.services.ingest.sources.hints import hint
 from prior_sg.services.ingest.sources.normalise import finish
 
 __all__ = ["LAYOUT_NAMES", "ReadOptions", "Source", "SourceError", "open_source"]
 
-LAYOUTS = (dataset, seven_scenes, tum, icl_nuim, replica, scannet, hm3d, tartanground, coda, generic, ros)
+LAYOUTS = (
+    dataset,
+    seven_scenes,
+    tum,
+    icl_nuim,
+    replica,
+    scannet,
+    hm3d,
+    tartanground,
+    coda,
+    clouds_folder,
+    stray_scanner,
+    record3d,
+    rtabmap,
+    euroc,
+    generic,
+    ros,
+)
 LAYOUT_NAMES = (*(layout.NAME for layout in LAYOUTS), recording.NAME)
 
 
@@ -44,10 +64,12 @@ def open_source(
     points up in the source's world, empty for what its layout says; `floor_m` is the height of its floor in that
     direction. Poses come out in a world with z up and the floor at zero; ground truth stays in the world as it comes
     out when neither is given. `robot` picks one robot of a log, empty for the first; these three go before `options`.
-    Raises SourceError.
+    `ros2:/` is a running robot. Raises SourceError.
     """
     path = Path(path)
     options = _with(options or ReadOptions(), world_up, floor_m, robot)
+    if is_live(str(path)):
+        return ros_live.load(path, options)
     if not path.exists():
         known = "a dataset folder, a 7-Scenes folder, a ROS bag or an MCAP log"
         raise SourceError(f"the source {path} does not exist: give {known}")

@@ -10,8 +10,13 @@ from typing import Any
 import numpy as np
 
 from prior_sg.schemas.frames import Intrinsics
+<<<<<<< HEAD
 from prior_sg.services.headers import ImageError
 from prior_sg.services.ingest.core.frames import BadFrame, Correction, RawFrame
+=======
+from prior_sg.services.ingest.core.frames import BadFrame, Closure, Correction, RawFrame, Unused
+from prior_sg.services.headers import ImageError
+>>>>>>> main
 from prior_sg.services.ingest.core.pixels import eight_bit, measured, stored
 from prior_sg.services.ingest.core.poses import Convention
 from prior_sg.services.ingest.sources.tables import SourceError, read_json
@@ -28,6 +33,7 @@ class FrameError(ValueError):
     """One frame cannot be used; the text is the reason."""
 
 
+Event = RawFrame | BadFrame | Correction | Unused | Closure
 Wanted = Callable[[int, np.ndarray], bool]  # whether the images of a frame are, by its index and world_from_camera
 
 
@@ -48,14 +54,20 @@ class Source:
     convention: Convention | None = None  # how written poses were read; None = in a way no option changes
     depth_unit_m: float = MILLIMETRE  # metres per unit of depth as the files hold it
     world_from_source: np.ndarray | None = None  # 4 x 4, levelling and recentring; None = nothing was done
+    live: "Callable[[], Iterator[Event]] | None" = None  # of a running robot: what comes from now on, images only of
+    # frames that may become keyframes
+    close: Callable[[], None] = lambda: None  # ends what runs; safe from any thread
     thinned: "Callable[[Wanted], Iterator[RawFrame | BadFrame]] | None" = None  # the same frames, but images, which
     # cost time, only of the wanted ones; the others' files are looked at and their images left empty
 
     def __iter__(self) -> Iterator[RawFrame | BadFrame]:
         return self.frames()
 
-    def events(self) -> Iterator[RawFrame | BadFrame | Correction]:
+    def events(self) -> "Iterator[Event]":
         """Frames, with each correction before the first frame of a later stamp, or at the end."""
+        if self.live is not None:
+            yield from self.live()
+            return
         corrections = self.corrections()
         waiting = next(corrections, None)
         for frame in self.frames():
@@ -82,7 +94,7 @@ class Camera:
 class Images:
     """The pictures of one frame as their files hold them; depth may be an array of metres (h, w) already."""
 
-    color: bytes
+    color: bytes | None  # None = a sensor that sees no colour
     depth: bytes | np.ndarray
     mask: bytes = b""
 

@@ -116,8 +116,10 @@ class Normaliser:
         pose = rigid(pose) if pose.ndim == 2 else pose
         return pose if self.world_from_source is None else self.world_from_source @ pose
 
-    def color_image(self, data: bytes) -> bytes:
-        """The file as it is where it fits, else a JPEG of a JPEG and a PNG of all else. Raises UNUSABLE."""
+    def color_image(self, data: bytes | None) -> bytes:
+        """The file where it fits, else a JPEG of a JPEG and a PNG of all else; empty for none. Raises UNUSABLE."""
+        if data is None:
+            return b""
         try:
             width_px, height_px, bits = measured(data)
         except ImageError as error:
@@ -350,7 +352,9 @@ def _commonest(counts: Counter, camera_size: tuple[int, int]) -> tuple[int, int]
     return max(counts, key=lambda size: (counts[size], size == camera_size), default=camera_size)
 
 
-def _size(data: bytes | np.ndarray) -> tuple[int, int] | None:
+def _size(data: bytes | np.ndarray | None) -> tuple[int, int] | None:
+    if data is None:
+        return None
     if isinstance(data, np.ndarray):
         return data.shape[1], data.shape[0]
     try:

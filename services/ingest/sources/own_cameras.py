@@ -11,7 +11,15 @@ from prior_sg.services.ingest.core.pixels import stored
 from prior_sg.services.ingest.sources.pose_lists import PoseList
 from prior_sg.services.ingest.sources.tables import SourceError, read_json, text_of
 
-CAMERAS = ("intrinsics", "intrinsic", "camera_intrinsics", "camera-intrinsics", "camera", "camera_info")
+CAMERAS = (
+    "intrinsics",
+    "intrinsic",
+    "camera_intrinsics",
+    "camera_intrinsic",
+    "camera-intrinsics",
+    "camera",
+    "camera_info",
+)
 PATTERNS = (*(f"{name}.*" for name in CAMERAS), "K.txt")
 NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 
@@ -21,7 +29,7 @@ def described(path: Path, listed: PoseList | None) -> tuple[Path | None, dict[st
     files = [file for pattern in PATTERNS for file in sorted(path.glob(pattern)) if file.is_file()]
     if files:
         try:
-            return files[0], _fields(files[0])
+            return files[0], fields_of(files[0])
         except (OSError, TypeError, ValueError, AttributeError) as error:
             raise SourceError(f"{files[0]} is not a camera: {error}") from error
     if listed is not None and listed.camera:
@@ -43,7 +51,7 @@ def unit_of(fields: dict[str, Any]) -> float | None:
     return 1 / value if value >= 1 else value
 
 
-def _fields(path: Path) -> dict[str, Any]:
+def fields_of(path: Path) -> dict[str, Any]:
     """Named numbers of a camera's file. Raises SourceError."""
     if path.suffix.lower() == ".npy":
         return _of_matrix(np.ravel(stored(path.read_bytes())).tolist(), path)

@@ -2,9 +2,11 @@
 
 poses.npy poses.txt    (or pose, traj, trajectory, camera_poses, groundtruth) an array (n, 4, 4), or rows of 16 or 12
                        numbers as KITTI has them, of tx ty tz and a quaternion, or of a stamp or number and these seven
-*.log                  Redwood, Open3D: a line of three whole numbers, then four rows of four
+*.log                  Redwood, Open3D (also in scene/): a line of three whole numbers, then four rows of four
+trajectory.json        Open3D's PinholeCameraTrajectory (also camera_trajectory.json): camera_from_world, by columns
 transforms.json        nerfstudio, instant-ngp: file_path and transform_matrix of each frame, OpenGL camera axes
-images.txt             COLMAP, beside cameras.txt, here or in sparse/ or sparse/0/: camera_from_world, quaternions wxyz
+images.txt             COLMAP, beside cameras.txt, here or in sparse/ or sparse/0/: camera_from_world, quaternions wxyz;
+                       or images.bin beside cameras.bin
 
 Rows without a number or name belong to the images in their order, so that there must be as many.
 """
@@ -22,15 +24,18 @@ import numpy as np
 from prior_sg.services.headers import ImageError
 from prior_sg.services.ingest.core.pixels import array_of
 from prior_sg.services.ingest.core.poses import Convention
+from prior_sg.services.ingest.sources import colmap_binary
 from prior_sg.services.ingest.sources.tables import SourceError, lines_of, read_json, words_of
 
 LISTS = ("poses", "pose", "traj", "trajectory", "camera_poses", "groundtruth")
 ENDINGS = (".npy", ".txt", ".csv", ".log")
 TRANSFORMS, COLMAP_IMAGES, COLMAP_CAMERAS = "transforms.json", "images.txt", "cameras.txt"
+COLMAP_KINDS = (".txt", ".bin")
+OPEN3D = ("camera_trajectory.json", "trajectory.json")
 COLMAP_FOLDERS = (".", "sparse/0", "sparse", "colmap/sparse/0", "colmap")
 UNDERSTOOD = (
     "a folder pose/ with a file of 4 x 4 numbers for each frame, poses.npy or poses.txt (rows of 16, 12, 8 or 7 "
-    f"numbers), a Redwood .log, {TRANSFORMS}, or {COLMAP_IMAGES} with {COLMAP_CAMERAS}"
+    f"numbers), a Redwood .log, {TRANSFORMS}, trajectory.json of Open3D, or {COLMAP_IMAGES} with {COLMAP_CAMERAS}"
 )
 COLMAP_PARAMETERS = {
     "SIMPLE_PINHOLE": ("f", "cx", "cy"),
@@ -80,21 +85,27 @@ def find(path: Path) -> Path | None:
     """The one file of poses in a folder, if there is one."""
     if (path / TRANSFORMS).is_file():
         return path / TRANSFORMS
-    for folder in COLMAP_FOLDERS:
-        if (path / folder / COLMAP_IMAGES).is_file() and (path / folder / COLMAP_CAMERAS).is_file():
-            return path / folder / COLMAP_IMAGES
+    for images in (
+        (path / folder / COLMAP_IMAGES).with_suffix(kind) for folder in COLMAP_FOLDERS for kind in COLMAP_KINDS
+    ):
+        if images.is_file() and images.with_stem("cameras").is_file():
+            return images
     files = {file.name.lower(): file for file in sorted(path.iterdir()) if file.is_file()}
     named = (files.get(name + ending) for name in LISTS for ending in ENDINGS)
     logs = (file for name, file in files.items() if name.endswith(".log") and _is_redwood(file))
-    return next((file for file in (*named, *logs) if file is not None), None)
+    scene = (file for file in sorted((path / "scene").glob("trajectory.log")) if _is_redwood(file))
+    open3d = (path / name for name in OPEN3D if (path / name).is_file())
+    return next((file for file in (*named, *logs, *open3d, *scene) if file is not None), None)
 
 
 def read(path: Path) -> PoseList:
     """The poses of a file. Raises SourceError."""
     if path.name == TRANSFORMS:
         return _transforms(path)
-    if path.name == COLMAP_IMAGES:
+    if path.stem == Path(COLMAP_IMAGES).stem and path.suffix in COLMAP_KINDS:
         return _colmap(path)
+    if path.name in OPEN3D:
+        return _open3d(path)
     if path.suffix.lower() == ".npy":
         return _array(path)
     lines = lines_of(path)
@@ -227,10 +238,12 @@ def _with_focal_length(camera: dict[str, Any]) -> dict[str, Any]:
 
 
 def _colmap(path: Path) -> PoseList:
-    """Every other line of images.txt, and the camera of most images."""
-    cameras = {words[0]: words[1:] for words in (line.split() for line in lines_of(path.parent / COLMAP_CAMERAS))}
-    images = [line.split(maxsplit=9) for line in lines_of(path)]
-    images = [words for words in images if len(words) == 10 and words[8] in cameras and not _is_number(words[9])]
+    """Poses by the names of images, and the camera of most of them."""
+    if path.suffix == ".bin":
+        cameras, images = colmap_binary.cameras_of(path.with_stem("cameras")), colmap_binary.images_of(path)
+        images = [words for words in images if words[8] in cameras]
+    else:
+        cameras, images = _colmap_words(path)
     try:
         rows = [np.array([*words[5:8], *words[1:5]], float) for words in images]
         used = [words[8] for words in images]
@@ -253,6 +266,27 @@ def _colmap(path: Path) -> PoseList:
         convention=Convention("camera_from_world", "opencv", "wxyz"),
         camera={**named, **lens, "width": int(width), "height": int(height)},
     )
+
+
+def _colmap_words(path: Path) -> tuple[dict[str, list[str]], list[list[str]]]:
+    """Lines of cameras.txt by number, and every other line of images.txt."""
+    cameras = {words[0]: words[1:] for words in (line.split() for line in lines_of(path.parent / COLMAP_CAMERAS))}
+    images = [line.split(maxsplit=9) for line in lines_of(path)]
+    return cameras, [w for w in images if len(w) == 10 and w[8] in cameras and not _is_number(w[9])]
+
+
+def _open3d(path: Path) -> PoseList:
+    """Poses of a PinholeCameraTrajectory, in the order of the images, and its first camera."""
+    try:
+        parameters = read_json(path)["parameters"]
+        rows = [np.array(one["extrinsic"], float).reshape(4, 4).T for one in parameters]
+        said = parameters[0]["intrinsic"]
+        matrix = np.array(said["intrinsic_matrix"], float).reshape(3, 3).T
+        camera = {"width": int(said["width"]), "height": int(said["height"])}
+        camera |= {"fx": matrix[0, 0], "fy": matrix[1, 1], "cx": matrix[0, 2], "cy": matrix[1, 2]}
+    except (KeyError, IndexError, TypeError, ValueError) as error:
+        raise SourceError(f"{path} is no PinholeCameraTrajectory of Open3D: {type(error).__name__} {error}") from error
+    return PoseList(path, rows, convention=Convention("camera_from_world"), camera=camera)
 
 
 def _is_number(word: str) -> bool:

@@ -3,6 +3,7 @@
 sensor_msgs/Image, CompressedImage    colour (raw, JPEG, PNG) and depth (16UC1 in millimetres, 32FC1 in metres, raw or
                                       compressedDepth with PNG)
 sensor_msgs/CameraInfo                the cameras; of images named …rect… the projection matrix counts
+sensor_msgs/PointCloud2               depth of a lidar, where there is none of a camera (clouds/ros.py)
 tf2_msgs/TFMessage                    /tf and /tf_static; or nav_msgs/Odometry, geometry_msgs/TransformStamped,
                                       PoseStamped, PoseWithCovarianceStamped
 
@@ -15,7 +16,6 @@ is drawn into the colour camera through the transform between the two, and colou
 transform it is taken as registered where both cameras are the same. Region truth: regions.json in a rosbag2 folder.
 """
 
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -24,29 +24,25 @@ import numpy as np
 from prior_sg.services.ingest.core.options import ReadOptions
 from prior_sg.services.ingest.core.pairing import associate
 from prior_sg.services.ingest.core.poses import Convention, PoseError
-from prior_sg.services.ingest.core.ros.topics import (
-    NAMED,
-    Chosen,
-    Topic,
-    chosen,
-    pose_topics,
-)
+from prior_sg.services.ingest.core.ros.posing import Way, way_of
+from prior_sg.services.ingest.core.ros.topics import NAMED, Chosen, chosen, cloud_chosen, pose_topics
 from prior_sg.services.ingest.core.ros.transforms import Track
 from prior_sg.services.ingest.sources.base import (
     MILLIMETRE,
     Entry,
     Found,
+    Images,
     SourceError,
     truth_beside,
 )
+from prior_sg.services.ingest.sources.clouds import ros as clouds_ros
 from prior_sg.services.ingest.sources.ros_bag import Bag, is_recording
-from prior_sg.services.ingest.sources.ros_pictures import pictures
+from prior_sg.services.ingest.sources.ros_pictures import Pictures, pictures
 from prior_sg.services.ingest.sources.ros_recorded import Recorded
 
 NAME = "ros"
 LOOKS = "a recording of ROS (a rosbag2 folder with metadata.yaml, .db3, .mcap or .bag)"
 MOST = 0.9  # share of the images of the slower stream that normally find a partner
-Posed = Callable[[int], np.ndarray]  # fixed_from_camera at a stamp; raises PoseError
 
 
 def fits(path: Path) -> bool:
@@ -61,12 +57,15 @@ def load(path: Path, options: ReadOptions) -> Found:
     bag = Bag(path)
     topics = bag.topics()
     try:
+        if (clouds := cloud_chosen(topics, options)) is not None:
+            return clouds_ros.load(NAME, bag, topics, clouds, options)
         choice, posing = chosen(topics, options), pose_topics(topics, options)
     except ValueError as error:
         raise SourceError(f"{path}: {error}") from error
     recorded = Recorded(bag, options, topics, choice, posing)
-    camera, images, how = pictures(recorded)
-    posed, said = _poses(recorded)
+    camera, images, how = pictures(recorded.rig())
+    way = _way(recorded)
+    track = Track(recorded.poses.get(way.topic, ()))
     convention = Convention().changed(options)
     pairs, left_out = _pairs(recorded)
     entries = []
@@ -74,7 +73,12 @@ def load(path: Path, options: ReadOptions) -> Found:
         stamp_ns = recorded.colors.stamps_ns[color]
         shown_ns = round(number * options.frame_ns(1)) if options.rate_hz else stamp_ns
         entries.append(
-            Entry(number, shown_ns, partial(_pose, posed, convention, stamp_ns), partial(images, color, depth))
+            Entry(
+                number,
+                shown_ns,
+                partial(_pose, recorded, way, track, convention, stamp_ns),
+                partial(_images, recorded, images, color, depth),
+            )
         )
     return Found(
         NAME,
@@ -85,7 +89,7 @@ def load(path: Path, options: ReadOptions) -> Found:
         ground_truth=truth_beside(path) if path.is_dir() else None,
         convention=convention,
         why=(f"it is a recording of ROS {1 if bag.is_ros1 else 2}",),
-        notes=tuple(filter(None, (f"{choice.said()}, {said}", _others(choice), how, *left_out))),
+        notes=tuple(filter(None, (f"{choice.said()}, {way.said}", _others(choice), how, *left_out))),
     )
 
 
@@ -121,48 +125,17 @@ def _others(choice: Chosen) -> str:
     return f"further images are not read: {', '.join(choice.others[:NAMED])} (--color-topic, --depth-topic)"
 
 
-def _pose(posed: Posed, convention: Convention, stamp_ns: int) -> np.ndarray:
-    return convention.of_matrix(posed(stamp_ns))
+def _pose(recorded: Recorded, way: Way, track: Track, convention: Convention, stamp_ns: int) -> np.ndarray:
+    return convention.of_matrix(way.at(recorded.tree, track, stamp_ns, recorded.within_ns))
 
 
-def _poses(recorded: Recorded) -> tuple[Posed, str]:
-    """How the camera's pose is found, and a phrase on it. Raises SourceError."""
-    camera, tree, options = recorded.choice.color.frame, recorded.tree, recorded.options
+def _images(recorded: Recorded, pictures: Pictures, color: int, depth: int) -> Images:
+    return pictures(*recorded.messages(color, depth))
+
+
+def _way(recorded: Recorded) -> Way:
+    """How the camera's pose is found. Raises SourceError."""
     try:
-        if not recorded.told:
-            fixed = options.fixed_frame or tree.fixed_frame(camera)
-            if options.fixed_frame and not tree.connects(options.fixed_frame, camera):
-                raise PoseError(f"tf does not connect {camera} with {fixed}, which is asked for")
-            if fixed:
-                within_ns = recorded.within_ns
-                return (lambda stamp_ns: tree.at(fixed, camera, stamp_ns, within_ns)), f"poses of {camera} in {fixed}"
-        if not recorded.posing:
-            where = tree.ancestors(camera)[-1]
-            raise PoseError(
-                f"nothing says how the camera moves: in tf its frame {camera!r} stays where it is in {where!r}, and "
-                "there is no topic of odometry or poses"
-            )
-        return _of_topic(recorded, recorded.posing[0], camera)
+        return way_of(recorded.choice.color.frame, recorded.tree, recorded.options, recorded.posing, recorded.poses)
     except PoseError as error:
         raise SourceError(f"{recorded.bag.path}: {error}") from error
-
-
-def _of_topic(recorded: Recorded, topic: Topic, camera: str) -> tuple[Posed, str]:
-    """Poses of a topic, carried on to the camera's frame. Raises PoseError."""
-    samples, tree, within_ns = recorded.poses[topic.name], recorded.tree, recorded.within_ns
-    track = Track(samples)
-    if not len(track.stamps_ns):
-        raise PoseError(f"{topic.name} has no poses that can be read")
-    bodies = {sample.child for sample in samples}
-    if len(bodies) > 1:
-        raise PoseError(f"{topic.name} has poses of several frames: {', '.join(sorted(bodies)[:NAMED])}")
-    body = recorded.options.pose_frame or bodies.pop() or camera
-    if not tree.connects(body, camera):
-        raise PoseError(
-            f"{topic.name} has poses of {body!r}, and tf does not connect it with the camera's {camera!r}; "
-            f"give --pose-frame {camera} when they are the camera's own"
-        )
-    said = f"poses of {topic.name} ({topic.type.rpartition('/')[2]} of {body or 'the camera'})"
-    if body == camera:
-        return (lambda stamp_ns: track.at(stamp_ns, within_ns)), said
-    return (lambda stamp_ns: track.at(stamp_ns, within_ns) @ tree.at(body, camera, stamp_ns, within_ns)), said

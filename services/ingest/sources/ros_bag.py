@@ -1,6 +1,5 @@
 """Recordings of ROS, opened with rosbags: what they hold, and single messages of them."""
 
-import struct
 import weakref
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -11,7 +10,7 @@ from typing import Any
 from prior_sg.services.ingest.core.ros import topics as ros_topics
 from prior_sg.services.ingest.core.ros.images import encoding_of, shown_by
 from prior_sg.services.ingest.core.ros.topics import Topic
-from prior_sg.services.ingest.core.ros.transforms import frame_name
+from prior_sg.services.ingest.core.ros.transforms import frame_name, written_stamp_ns
 from prior_sg.services.ingest.sources.base import FrameError
 from prior_sg.services.ingest.sources.tables import SourceError
 from prior_sg.services.runtime import extras
@@ -121,20 +120,17 @@ class Bag:
     def stamp_ns(self, data: bytes) -> int:
         """The stamp of a message that begins with a header. Raises FrameError."""
         try:
-            if self.is_ros1:
-                seconds, rest = struct.unpack_from("<II", data, 4)
-            else:
-                seconds, rest = struct.unpack_from("<iI" if data[1] & 1 else ">iI", data, 4)
-        except (struct.error, IndexError) as error:
-            raise FrameError("a message has no header") from error
-        return seconds * 1_000_000_000 + rest
+            return written_stamp_ns(data, self.is_ros1)
+        except ValueError as error:
+            raise FrameError(str(error)) from error
 
     def _topic(self, name: str) -> Topic:
         connections = self._connections[name]
         count = sum(connection.msgcount for connection in connections)
         kind, duration_s = connections[0].msgtype, self._reader.duration / 1e9
         topic = Topic(name, kind, count, count / duration_s if count > 1 and duration_s > 0 else 0.0)
-        if kind not in (ros_topics.IMAGE, ros_topics.COMPRESSED, ros_topics.CAMERA_INFO) or not count:
+        looked_at = (ros_topics.IMAGE, ros_topics.COMPRESSED, ros_topics.CAMERA_INFO, ros_topics.POINT_CLOUD)
+        if kind not in looked_at or not count:
             return topic
         return self._looked_at(topic)
 
@@ -146,7 +142,7 @@ class Bag:
             except FrameError:
                 continue
             frame = frame_name(message.header.frame_id)
-            if topic.type == ros_topics.CAMERA_INFO:
+            if topic.type in (ros_topics.CAMERA_INFO, ros_topics.POINT_CLOUD):
                 return Topic(topic.name, topic.type, topic.count, topic.rate_hz, frame=frame)
             said = encoding_of(message), frame, shown_by(message)
             return Topic(topic.name, topic.type, topic.count, topic.rate_hz, *said)

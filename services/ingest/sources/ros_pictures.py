@@ -1,5 +1,6 @@
 """Cameras and images of a recording of ROS; depth of another camera is drawn into that of colour."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,9 +15,8 @@ from prior_sg.services.ingest.core.poses import PoseError
 from prior_sg.services.ingest.core.ros.cameras import camera_fields
 from prior_sg.services.ingest.core.ros.images import color_file, depth_image, metres
 from prior_sg.services.ingest.core.ros.registration import rays, registered
-from prior_sg.services.ingest.core.ros.topics import (
-    Topic,
-)
+from prior_sg.services.ingest.core.ros.topics import Chosen, Topic
+from prior_sg.services.ingest.core.ros.transforms import TransformTree
 from prior_sg.services.ingest.sources.base import (
     MILLIMETRE,
     Camera,
@@ -27,29 +27,29 @@ from prior_sg.services.ingest.sources.base import (
     color_pixels,
 )
 from prior_sg.services.ingest.sources.cameras import straight_maps
-from prior_sg.services.ingest.sources.ros_recorded import Recorded
 
 NEARLY = 1e-3  # difference of focal lengths that is none
 
 
 @dataclass(frozen=True)
+class Rig:
+    """Topics and cameras of a robot, recorded or live."""
+
+    path: Path  # for the reader of an error
+    choice: Chosen
+    options: ReadOptions
+    infos: Mapping[str, Any]  # camera infos by topic
+    tree: TransformTree
+    stamp_ns: int  # at which depth's frame is joined to colour's
+    within_ns: int
+
+
 class Pictures:
-    """Reads the images of a frame."""
+    """Reads the two image messages of a frame."""
 
-    recorded: Recorded
-
-    def __call__(self, color: int, depth: int) -> Images:
+    def __call__(self, color: Any, depth: Any) -> Images:
         """Raises FrameError and ImageError."""
-        color_message, depth_message = self.messages(color, depth)
-        return Images(color_file(color_message), depth_image(depth_message))
-
-    def messages(self, color: int, depth: int) -> tuple[Any, Any]:
-        """The two messages of a frame. Raises FrameError."""
-        of = self.recorded
-        return (
-            of.bag.message(of.choice.color.name, of.colors, color),
-            of.bag.message(of.choice.depth.name, of.depths, depth),
-        )
+        return Images(color_file(color), depth_image(depth))
 
 
 @dataclass(frozen=True)
@@ -62,53 +62,47 @@ class Registering(Pictures):
     maps: tuple[np.ndarray, np.ndarray] | None  # where the pixels of straight colour lie in bent
     unit_m: float
 
-    def __call__(self, color: int, depth: int) -> Images:
+    def __call__(self, color: Any, depth: Any) -> Images:
         """Raises FrameError and ImageError."""
-        color_message, depth_message = self.messages(color, depth)
-        depth_m = metres(depth_image(depth_message), self.unit_m)
+        depth_m = metres(depth_image(depth), self.unit_m)
         if depth_m.shape != self.rays.shape[:2]:
             raise FrameError(f"the depth image has another size than its camera info, {self.rays.shape[1::-1]}")
         seen = registered(depth_m, self.rays, self.color_from_depth, self.color_camera.intrinsics)
-        file = color_file(color_message)
+        file = color_file(color)
         if self.maps is not None:
             bent = color_pixels(file)
             file = encoded(cv2.remap(bent, *self.maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), ".png")
         return Images(file, seen)
 
 
-def pictures(recorded: Recorded) -> tuple[Camera, Pictures, str]:
+def pictures(rig: Rig) -> tuple[Camera, Pictures, str]:
     """The camera, what reads its images, and a note on how depth becomes colour's. Raises SourceError."""
-    choice, options = recorded.choice, recorded.options
-    color, depth = _camera(recorded, choice.color, choice.color_info), None
+    choice, options = rig.choice, rig.options
+    color, depth = _camera(rig, choice.color, choice.color_info), None
     if choice.depth_info is not None and choice.depth_info != choice.color_info:
-        depth = _camera(recorded, choice.depth, choice.depth_info)
-    known = color or depth or _told_camera(recorded.bag.path, options)
+        depth = _camera(rig, choice.depth, choice.depth_info)
+    known = color or depth or _told_camera(rig.path, options)
     if choice.color.frame == choice.depth.frame:
-        return (depth if depth and not _same_size(known, depth) else known), Pictures(recorded), ""
+        return (depth if depth and not _same_size(known, depth) else known), Pictures(), ""
     frames = f"depth of {choice.depth.frame!r} and colour of {choice.color.frame!r}"
     try:
-        joined = recorded.tree.connects(choice.color.frame, choice.depth.frame)
-        stamps_ns = recorded.colors.stamps_ns or [0]
+        joined = rig.tree.connects(choice.color.frame, choice.depth.frame)
         color_from_depth = np.eye(4)
         if joined:
-            color_from_depth = recorded.tree.at(
-                choice.color.frame, choice.depth.frame, stamps_ns[len(stamps_ns) // 2], recorded.within_ns
-            )
+            color_from_depth = rig.tree.at(choice.color.frame, choice.depth.frame, rig.stamp_ns, rig.within_ns)
     except PoseError as error:
-        raise SourceError(f"{recorded.bag.path}: {error}") from error
+        raise SourceError(f"{rig.path}: {error}") from error
     if (not joined and _same(color, depth)) or (joined and _is_none(color_from_depth) and _same(color, depth)):
-        return known, Pictures(recorded), f"{frames} are taken as registered: their cameras are the same"
+        return known, Pictures(), f"{frames} are taken as registered: their cameras are the same"
     if not joined or color is None or depth is None:
         lacks = "tf does not connect them" if not joined else "both need a camera info"
         raise SourceError(
-            f"{recorded.bag.path}: {frames} are not registered, and {lacks}; record it, or name a registered "
-            "--depth-topic"
+            f"{rig.path}: {frames} are not registered, and {lacks}; record it, or name a registered --depth-topic"
         )
     moves_m, turns_deg = np.linalg.norm(color_from_depth[:3, 3]), np.degrees(rotation_angle_rad(color_from_depth))
     how = f"{frames}: depth is drawn into the colour camera ({moves_m:.3f} m and {turns_deg:.1f} degrees apart)"
     pinhole = Camera(color.intrinsics)
     reader = Registering(
-        recorded,
         pinhole,
         color_from_depth,
         rays(depth.intrinsics, depth.model, depth.distortion),
@@ -118,13 +112,18 @@ def pictures(recorded: Recorded) -> tuple[Camera, Pictures, str]:
     return pinhole, reader, how
 
 
-def _camera(recorded: Recorded, image: Topic, info: Topic | None) -> Camera | None:
+def color_camera(rig: Rig) -> Camera:
+    """The camera of colour, as its info or the options say. Raises SourceError."""
+    return _camera(rig, rig.choice.color, rig.choice.color_info) or _told_camera(rig.path, rig.options)
+
+
+def _camera(rig: Rig, image: Topic, info: Topic | None) -> Camera | None:
     """The camera that an info says; None where there is none. Raises SourceError."""
-    if info is None or info.name not in recorded.infos:
+    if info is None or info.name not in rig.infos:
         return None
-    where = Path(f"{recorded.bag.path} ({info.name})")
+    where = Path(f"{rig.path} ({info.name})")
     try:
-        return camera_of(where, camera_fields(recorded.infos[info.name], image.is_rectified))
+        return camera_of(where, camera_fields(rig.infos[info.name], image.is_rectified))
     except (ValueError, AttributeError) as error:
         raise SourceError(f"{where} is not a camera: {error}; give --intrinsics FX,FY,CX,CY,WIDTH,HEIGHT") from error
 

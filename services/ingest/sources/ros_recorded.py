@@ -16,6 +16,7 @@ from prior_sg.services.ingest.sources.base import (
     FrameError,
 )
 from prior_sg.services.ingest.sources.ros_bag import Bag, Index
+from prior_sg.services.ingest.sources.ros_pictures import Rig
 
 
 class Recorded:
@@ -28,7 +29,6 @@ class Recorded:
         self.within_ns = round(options.sync_tolerance_s * 1e9)
         self.colors, self.depths = Index(), Index()
         self.posing = [topic for topic in posing if topic.type not in TF_TYPES]
-        self.told = bool(options.pose_topic) and bool(self.posing)
         self.poses: dict[str, list[Stamped]] = {topic.name: [] for topic in self.posing}
         self.infos: dict[str, Any] = {}
         self._tf = {topic.name: topic.taken_for == FIXED_TRANSFORMS for topic in topics if topic.type in TF_TYPES}
@@ -44,6 +44,19 @@ class Recorded:
                 self._unread[name] = self._unread.get(name, 0) + 1
         self.tree = TransformTree(self._transforms[False], self._transforms[True])
         self.colors, self.depths = _sorted(self.colors), _sorted(self.depths)
+
+    def messages(self, color: int, depth: int) -> tuple[Any, Any]:
+        """The two images of a frame, by their places. Raises FrameError."""
+        return (
+            self.bag.message(self.choice.color.name, self.colors, color),
+            self.bag.message(self.choice.depth.name, self.depths, depth),
+        )
+
+    def rig(self) -> Rig:
+        """What its pictures need."""
+        stamps_ns = self.colors.stamps_ns or [0]
+        middle_ns = stamps_ns[len(stamps_ns) // 2]
+        return Rig(self.bag.path, self.choice, self.options, self.infos, self.tree, middle_ns, self.within_ns)
 
     def lost(self) -> list[str]:
         """Notes on messages that could not be read."""

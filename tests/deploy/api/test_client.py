@@ -1,131 +1,81 @@
 """A program's end of a running system, on the local bus with the services played here."""
 
 import threading
-import time
 
 import numpy as np
 import pytest
 
 import prior_sg
-from prior_sg.deploy.api.client import Client
+from prior_sg.deploy.api.client import MOST_PRIORS, Client
 from prior_sg.schemas.codec import decode, encode
-from prior_sg.schemas.frames import PoseUpdate
-from prior_sg.schemas.priors import PriorList, Task
-from prior_sg.schemas.regions import PosteriorReply, RegionDelta
+from prior_sg.schemas.priors import PriorList, PriorRequest
 from prior_sg.schemas.scene import SceneRevision
-from prior_sg.schemas.status import Consumed
-from prior_sg.schemas.topics import (
-    JOURNAL,
-    POSE_UPDATE,
-    POSTERIOR,
-    PRIOR,
-    PRIORS,
-    REGION_DELTA,
-    SCENE,
-    SCENE_REVISION,
-    TASK,
-    alive_key,
-)
+from prior_sg.schemas.topics import PRIORS, REGION_DELTA, SCENE_REVISION
 from prior_sg.services.runtime.bus import Hub, LocalBus
-from prior_sg.services.runtime.client import BusClient
 from tests.deploy.api.test_scene import message
+from tests.help.store import StandIn, delta
 from tests.help.world import prior
 
 ROBOT = "ada"
 
 
-class System:
-    """Answers a task with a prior and regions; `mute` names what it leaves out."""
-
-    def __init__(self, hub, mute=()):
-        self.hub, self.mute = hub, mute
-        self.bus = BusClient(LocalBus(hub))
-        self.scene, self.tasks, self.poses = message(), [], []
-        self.bus.bus.serve(SCENE.key.format(robot=ROBOT), lambda request: request.reply(encode(self.scene)))
-        self.bus.bus.serve(PRIORS.key, lambda request: request.reply(encode(PriorList(priors=[], reason="why not"))))
-        self.bus.bus.serve(POSTERIOR.key.format(robot=ROBOT), self.explain)
-        self.bus.bus.announce(alive_key("place_graph", "p-1"))
-        self.bus.listen(TASK, ROBOT, self.take)
-        self.bus.listen(POSE_UPDATE, ROBOT, self.correct)
-
-    def explain(self, request):
-        place = decode(POSTERIOR.request, request.payload).place_id
-        request.reply(encode(PosteriorReply(robot=ROBOT, place_id=place, found=place == 1, label="kitchen")))
-
-    def take(self, sample):
-        task = decode(Task, sample.payload)
-        self.tasks.append(task)
-        if "prior" not in self.mute:
-            made = prior(["kitchen", "hall"], environment=task.environment, task=task.task, vocabulary=task.regions)
-            self.bus.publish(PRIOR, made)
-            if "regions" not in self.mute:
-                threading.Timer(0.1, self.label, (task, made.digest())).start()
-
-    def label(self, task, digest):
-        self.bus.publish(REGION_DELTA, delta(task.task, digest))
-        time.sleep(0.2)  # the store is behind the segmenter
-        self.scene = message(task=task.task, prior_digest=digest)
-
-    def correct(self, sample):
-        self.poses.append(decode(PoseUpdate, sample.payload))
-        if "poses" not in self.mute:
-            entry = Consumed(
-                robot=ROBOT,
-                service="place_graph",
-                instance="p",
-                order=0,
-                topic="POSE_UPDATE",
-                writer=sample.writer,
-                sequence=sample.sequence,
-            )
-            self.bus.publish(JOURNAL, entry)
+def follow(scene, task, digest):
+    return message(task=task, prior_digest=digest)
 
 
-def delta(task, digest, revision=0):
-    none = np.zeros(0, np.int64)
-    return RegionDelta(
-        robot=ROBOT,
-        epoch=1,
-        revision=revision,
-        stamp_ns=1,
-        prior_digest=digest,
-        environment="home",
-        task=task,
-        space="s",
-        labels=[],
-        regions=[],
-        removed_ids=none,
-        place_ids=none,
-        place_regions=none,
-        posteriors=np.zeros((0, 0), np.float16),
-        unknown=np.zeros(0, np.float16),
-        removed_place_ids=none,
-        energy=0.0,
-    )
-
-
-def joined(mute=()):
-    hub = Hub()
-    return System(hub, mute), Client(robot=ROBOT, bus=LocalBus(hub))
+def joined(mute=(), scene=message()):
+    system = StandIn(scene, follow, mute=mute, behind_s=0.2)
+    return system, Client(robot=ROBOT, bus=system.open_bus())
 
 
 def test_a_task_returns_the_scene_that_the_store_has_of_it():
     system, client = joined()
     with client:
-        system.bus.publish(REGION_DELTA, delta("sweep", "of an earlier time"))
+        system.bus.publish(REGION_DELTA, delta(ROBOT, "sweep", "of an earlier time"))
         scene = client.task("sweep", regions=["kitchen", "hall"])
     assert scene.task == "sweep" and [task.environment for task in system.tasks] == ["home"]
     assert system.tasks[0].regions == ["kitchen", "hall"]
-    assert scene.message.prior_digest == system.scene.prior_digest
+    assert scene.message.prior_digest == system.scenes[-1].prior_digest
+
+
+def test_the_scene_of_a_task_has_the_names_of_its_objects(monkeypatch):
+    with joined()[1] as client:
+        assert [item.label for item in client.task("sweep").message.objects] == [
+            item.label for item in message().objects
+        ]
+    monkeypatch.setattr("prior_sg.deploy.api.client.NAMES_WAIT_S", 0.3)
+    with joined(mute=["names"])[1] as client:
+        assert {item.label for item in client.task("sweep").message.objects} == {""}
+
+
+def test_a_task_in_force_is_answered_at_once():
+    system, client = joined()
+    with client:
+        first, second = client.switch("sweep"), client.switch("sweep")
+    assert second.scene.revision == first.scene.revision and second.prior == first.prior
+    assert len(system.tasks) == 2
+
+
+def test_a_client_keeps_few_priors():
+    hub = Hub()
+    known = {one.digest(): one for one in (prior(["kitchen"], task=f"task {number}") for number in range(20))}
+
+    def serve(request):
+        digest = decode(PriorRequest, request.payload).digest
+        request.reply(encode(PriorList(priors=[known[digest]])))
+
+    LocalBus(hub).serve(PRIORS.key, serve)
+    with Client(robot=ROBOT, bus=LocalBus(hub)) as client:
+        assert [client.prior_of(digest) for digest in known] == list(known.values())
+        assert len(client._priors) == MOST_PRIORS
 
 
 def test_why_a_task_fails_is_told():
-    with joined(mute=["prior"])[1] as client, pytest.raises(prior_sg.NoPriorError, match="why not"):
+    with joined(mute=["prior"])[1] as client, pytest.raises(prior_sg.NoPriorError, match="no library"):
         client.task("sweep", timeout_s=2.0)
     with joined(mute=["regions"])[1] as client, pytest.raises(prior_sg.TaskError, match="no regions for the new task"):
         client.task("sweep", timeout_s=0.3)
-    system, client = joined()
-    system.scene = message(environment="")
+    _, client = joined(scene=message(environment=""))
     with client, pytest.raises(prior_sg.TaskError, match="ada has no environment yet"):
         client.task("sweep")
 
@@ -178,7 +128,7 @@ def test_changes_arrive_until_the_client_is_closed():
     system, client = joined()
     stored, all_ = client.changes(), client.changes(deltas=True)
     system.bus.publish(SCENE_REVISION, revision(1))
-    system.bus.publish(REGION_DELTA, delta("sweep", "d"))
+    system.bus.publish(REGION_DELTA, delta(ROBOT, "sweep", "d"))
     seen = []
     follower = threading.Thread(target=lambda: seen.extend(stored))
     follower.start()

@@ -4,6 +4,7 @@ import asyncio
 import socket
 import time
 
+import httpx
 import pytest
 
 from prior_sg.deploy.errors import UserError
@@ -176,3 +177,21 @@ def test_tokens_that_are_none(tmp_path, content):
         entrance("127.0.0.1", tmp_path / "token")
     with pytest.raises(UserError, match="cannot read the token"):
         entrance("127.0.0.1", tmp_path / "none")
+
+
+@pytest.mark.parametrize("sent", [b"", b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nX-Slow: "])
+def test_who_asks_for_nothing_is_sent_away(sent, monkeypatch):
+    monkeypatch.setattr(server, "LONGEST_IDLE_S", 0.3)
+    monkeypatch.setattr(server, "IDLE_CHECK_S", 0.05)
+
+    async def slow(scope, receive, send):
+        await asyncio.sleep(0.6)  # who waits for an answer is not idle
+        await send({"type": "http.response.start", "status": 204, "headers": []})
+        await send({"type": "http.response.body", "body": b""})
+
+    with served(slow) as address:
+        host, port = address.removeprefix("http://").split(":")
+        with socket.create_connection((host, int(port)), timeout=10) as connection:
+            connection.sendall(sent)
+            assert connection.recv(100) == b""
+        assert httpx.get(address).status_code == 204

@@ -20,7 +20,9 @@ from prior_sg.deploy.serving.http import http_app
 from prior_sg.deploy.serving.system import System
 from prior_sg.deploy.showing.export import scene_json
 from prior_sg.schemas.codec import decode
+from prior_sg.schemas.frames import IngestState
 from prior_sg.schemas.scene import Scene
+from prior_sg.schemas.topics import INGEST_STATE
 from tests.help.served import served
 from tests.help.store import StandIn
 
@@ -182,6 +184,7 @@ def test_a_task_is_switched():
         taken = client.put(f"{V1}/task", json={"task": "  paint  walls ", "wait_s": 5})
         assert taken.status_code == 200 and "room to paint walls" in taken.json()["labels"]
         assert client.get(f"{V1}/task").json()["answer"]["task"] == store.tasks[0].task == "paint walls"
+        assert taken.json()["may_be"] == ["kitchen", "hall"] and taken.json()["note"] == ""
         late = client.put(f"{V1}/task", json={"task": "impossible", "wait_s": 0.2})
         assert late.status_code == 202 and late.json()["prior_digest"] and "no regions" in late.json()["note"]
         for faulty in (
@@ -193,6 +196,38 @@ def test_a_task_is_switched():
             {"task": "a", "wait_s": 1e9},
         ):
             assert client.put(f"{V1}/task", json=faulty).status_code == 400, faulty  # fmt: skip
+
+
+def test_while_the_source_is_read_a_task_says_that_the_map_grows():
+    with opened() as (store, app, _), client_of(app) as client:
+        assert client.get(f"{V1}/source").status_code == 404
+        read = IngestState(
+            robot=store.robot,
+            stamp_ns=1,
+            frames_read=30,
+            frames_total=86,
+            keyframes=30,
+            encoded=20,
+            rejected=0,
+            finished=False,
+        )
+        store.bus.publish(INGEST_STATE, read)
+        assert client.get(f"{V1}/source").json() == {
+            "robot": store.robot,
+            "frames_read": 30,
+            "frames_total": 86,
+            "encoded": 20,
+            "finished": False,
+        }
+        assert "30 of 86 frames" in client.put(f"{V1}/task", json={"task": "sweep"}).json()["note"]
+        store.bus.publish(INGEST_STATE, replace(read, finished=True))
+        assert client.put(f"{V1}/task", json={"task": "mop"}).json()["note"] == ""
+
+
+def test_a_body_that_is_missing_is_told():
+    with opened() as (_, app, _), client_of(app) as client:
+        assert "the body is missing" in client.put(f"{V1}/task").json()["detail"]
+        assert client.put(f"{V1}/task", json=[]).json()["detail"].startswith("the body: Expected `object`")
 
 
 def test_poses_are_corrected():

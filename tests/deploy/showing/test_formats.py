@@ -162,7 +162,7 @@ def test_json_is_read_back(make, tmp_path):
 
 
 def test_one_registry_says_what_there_is(capsys):
-    assert {entry.extra for entry in FORMATS.values()} <= {"", "dsg", "graph", "rerun", "map"}
+    assert {entry.extra for entry in FORMATS.values()} <= {"", "dsg", "foxglove", "graph", "rerun", "map"}
     assert all(callable(entry.write) and entry.summary for entry in FORMATS.values())
     with pytest.raises(SystemExit):
         main(["export", "--help"])

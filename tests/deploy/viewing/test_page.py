@@ -11,8 +11,9 @@ import pytest
 from prior_sg.deploy.cli.main import main
 from prior_sg.deploy.viewing.held import Held
 from prior_sg.deploy.viewing.page import Options, Page
+from prior_sg.deploy.viewing.picking import Picked
 from prior_sg.deploy.viewing.stage import pose_for
-from tests.help.homes import home
+from tests.help.homes import home, joined_home
 
 CHROMIUM = shutil.which("chromium") or ""
 SOFTWARE = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-background-networking")
@@ -20,7 +21,7 @@ SOFTWARE = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftsha
 
 @pytest.fixture
 def shown() -> Iterator[tuple[Held, Page]]:
-    source = Held(home(), "test")
+    source = Held(joined_home(), "test")
     page = Page(source, Options(port=18190, interval_s=0.02))
     yield source, page
     page.close()
@@ -50,12 +51,36 @@ def test_the_page_opens_without_errors_finds_things_and_keeps_colours(shown: tup
         tab.locator('input.mantine-TextInput-input[value=""]').first.fill("stove")
         tab.get_by_text("stove", exact=True).wait_for()
         until(lambda: "/answers/objects" in page.stage.picture)
+        tab.get_by_role("button", name="1", exact=True).click()
+        tab.get_by_text("Way to stove").wait_for()
+        assert "/way/line" in page.stage.picture
+        tab.locator("input.mantine-TextInput-input:visible").first.fill("bed")
+        until(lambda: not any(name.startswith("/way") for name in page.stage.picture))
         before = colors(page)
         source.put(grown())
         tab.get_by_text("3 regions", exact=False).wait_for()
         assert {name: color for name, color in colors(page).items() if name in before} == before
         browser.close()
     assert errors == []
+
+
+def test_ways_to_and_from_what_was_clicked(shown: tuple[Held, Page]) -> None:
+    page = shown[1]
+    asked = page.panel.asked
+    until(lambda: "kitchen" in page.panel.text("legend"))
+    page._want(picked=Picked(place=12, region=3, itself=True))
+    asked.start()
+    until(lambda: "ways start here" in page.panel.text("way"))
+    page._want(picked=Picked(place=11, region=3, itself=True))
+    asked.picked()
+    until(lambda: "No way to kitchen" in page.panel.text("way"))
+    page._want(picked=Picked(place=10, region=3, itself=True))
+    asked.picked()
+    until(lambda: "from kitchen (place 12)" in page.panel.text("way"))
+    asked.robot()
+    until(lambda: "where the robot is" in page.panel.text("way") and "/way/line" in page.stage.picture)
+    asked.arrive()
+    until(lambda: page.panel.text("way") == "")
 
 
 def colors(page: Page) -> dict[str, tuple[int, int, int]]:

@@ -12,6 +12,7 @@ from prior_sg.deploy.viewing.search import find
 from prior_sg.deploy.viewing.shapes import Mesh, difference
 from prior_sg.deploy.viewing.sources import Likeness
 from prior_sg.deploy.viewing.words import headline
+from prior_sg.services.scene_store.core.queries.index import Index
 from tests.help.homes import home, keyframe, region
 
 
@@ -119,23 +120,23 @@ def test_unknown_places_are_grey() -> None:
 
 def test_answers_are_lit_and_the_rest_is_dimmed() -> None:
     scene, painter = home(), Painter()
-    found = find(scene, "stove")
-    assert found.rows[0][:2] == ("object", "stove") and found.lit.objects == {1}
+    found = find(Index(scene), "stove")
+    assert found.hits[0][:3] == ("object", 1, "stove") and found.lit.objects == {1}
     lit = painter.draw(scene, found.lit)
     assert "/answers/objects" in lit and "/answers/names/1" in lit
     assert lit["/regions/7/floor"].opacity < painter.draw(scene)["/regions/7/floor"].opacity / 2
-    assert find(scene, "bedr").lit == Lit(regions=frozenset({7}))
-    assert find(scene, "").lit == Lit()
-    assert "nothing" in find(scene, "submarine").said
+    assert find(Index(scene), "bedr").lit == Lit(regions=frozenset({7}))
+    assert find(Index(scene), "").lit == Lit()
+    assert "nothing" in find(Index(scene), "submarine").said
 
 
 def test_what_a_text_means_comes_before_its_words_and_doubts_are_said() -> None:
     scene = home()
-    meant = find(scene, "somewhere to sleep", Likeness({"bedroom": 0.9, "kitchen": 0.05}, {"bed": 0.8}))
-    assert meant.rows[0][:2] == ("region", "bedroom") and meant.lit.regions == {7} and meant.said == ""
-    doubted = find(scene, "somewhere to sleep", Likeness({"bedroom": 0.3, "kitchen": 0.2}, {}))
+    meant = find(Index(scene), "somewhere to sleep", Likeness({"bedroom": 0.9, "kitchen": 0.05}, {"bed": 0.8}))
+    assert meant.hits[0][:3] == ("region", 7, "bedroom") and meant.lit.regions == {7} and meant.said == ""
+    doubted = find(Index(scene), "somewhere to sleep", Likeness({"bedroom": 0.3, "kitchen": 0.2}, {}))
     assert "for sure" in doubted.said
-    assert "no worker" in find(scene, "stove", Likeness({}, {}, "no worker embeds it")).said
+    assert "no worker" in find(Index(scene), "stove", Likeness({}, {}, "no worker embeds it")).said
 
 
 @pytest.mark.parametrize(
@@ -197,3 +198,11 @@ def test_of_very_many_edges_some_are_drawn_and_the_page_says_so(monkeypatch: pyt
     fewer = home(edges=np.array([(10, 11), (10, 12), (11, 12)]))
     assert len(Painter().draw(fewer)["/edges/0"].points_m) == 1  # the one whose ids have an even sum
     assert "one of 2 edges is drawn" in headline(scene, "test")
+
+
+def test_where_the_robot_has_been_is_dashed_and_named() -> None:
+    drawn = Painter().draw(home())
+    dashes = drawn["/trajectory/0"].points_m
+    lengths_m = np.linalg.norm(dashes[:, 1] - dashes[:, 0], axis=1)
+    assert lengths_m.max() < 0.13 and lengths_m.sum() == pytest.approx(5.508 / 2, abs=0.01)
+    assert drawn["/trajectory/robot"].text == "robot" and drawn["/trajectory/robot"].position_m[0] == 6.0

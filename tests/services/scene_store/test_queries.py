@@ -221,7 +221,7 @@ def test_a_scrap_of_free_space_near_an_end_does_not_hide_the_way():
 @pytest.mark.parametrize(
     ("end", "reason"),
     [
-        (q.Spot(what="region", id=999), "the goal is region 999, and there is none"),
+        (q.Spot(what="region", id=999), "the goal: there is no region 999; the scene has regions"),
         (q.Spot(id=3), "say whether"),
         (q.Spot(), "names nothing"),
         (q.Spot(label="romo kind 3"), "the nearest labels are: room kind"),

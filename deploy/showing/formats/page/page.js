@@ -192,8 +192,10 @@ function objects(ratio) {
 function path(ratio) {
   const points = data.path.slice(0, scene.step.path);
   if (!points.length) return;
-  line(points, ink.halo, 5 * ratio);
-  line(points, ink.path, 2.2 * ratio);
+  pen.setLineDash([6 * ratio, 6 * ratio]);  // where the robot has been: no route
+  line(points, ink.halo, 4.5 * ratio);
+  line(points, ink.path, 1.8 * ratio);
+  pen.setLineDash([]);
   const [x, y] = pixel(...points[points.length - 1]);
   pen.beginPath(); pen.arc(x, y, 5 * ratio, 0, 7); pen.fillStyle = ink.path; pen.fill();
 }
@@ -227,6 +229,10 @@ function names(ratio) {
   };
   for (const region of [...scene.regions].sort((a, b) => b.area - a.area))
     write(shortened(region.label, 28), percent(region.probability), ...pixel(region.x, region.y), 15, 650);
+  if (shown.path && scene.step.path) {
+    const [x, y] = pixel(...data.path[scene.step.path - 1]);
+    write("robot", "", x, y + 19 * ratio, 12.5, 600);
+  }
   if (shown.objects) for (const item of scene.objects) if (item.label)
     write(shortened(item.label, 22), "", ...pixel((item.box[0] + item.box[2]) / 2, (item.box[1] + item.box[3]) / 2), 11.5, 450);
 }
@@ -424,7 +430,7 @@ function load(address) {
 }
 function controls() {
   for (const layer of Object.keys(shown)) {
-    const button = element("button", layer, "", byId("layers"));
+    const button = element("button", layer === "path" ? "robot's way" : layer, "", byId("layers"));
     button.type = "button";
     button.setAttribute("aria-pressed", String(shown[layer]));
     button.addEventListener("click", () => { shown[layer] = !shown[layer]; button.setAttribute("aria-pressed", String(shown[layer])); draw(); });

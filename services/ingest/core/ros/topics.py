@@ -1,13 +1,13 @@
 """Which topics of a recording are the colour, the depth, the camera and the poses (pure)."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from prior_sg.services.ingest.core.options import ReadOptions
 from prior_sg.services.ingest.core.ros.images import COLOR, DEPTH, GREY
 
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
-CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
+CAMERA_INFO, POINT_CLOUD = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/PointCloud2"
 TF_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 POSE_TYPES = (  # those that say of what their pose is go first
     "nav_msgs/msg/Odometry",
@@ -15,10 +15,13 @@ POSE_TYPES = (  # those that say of what their pose is go first
     "geometry_msgs/msg/PoseWithCovarianceStamped",
     "geometry_msgs/msg/PoseStamped",
 )
-READ_TYPES = (IMAGE, COMPRESSED, CAMERA_INFO, *TF_TYPES, *POSE_TYPES)
+PATH = "nav_msgs/msg/Path"
+READ_TYPES = (IMAGE, COMPRESSED, CAMERA_INFO, PATH, *TF_TYPES, *POSE_TYPES)
 STATIC = "tf_static"
 TRANSPORTS = ("/compressed", "/compressedDepth")  # what image_transport adds to a topic's name
 CAMERA, TRANSFORMS, FIXED_TRANSFORMS, POSES = "camera", "transforms", "fixed transforms", "poses"
+CLOUD = "cloud of points"
+GRAPH = "pose graph"  # only where it is told: a path may be one that is planned
 NAMED = 6
 
 
@@ -39,8 +42,9 @@ class Topic:
         """What it can serve as; empty = nothing."""
         if self.type in TF_TYPES:
             return FIXED_TRANSFORMS if self.name.endswith(STATIC) else TRANSFORMS
-        if self.type == CAMERA_INFO:
-            return CAMERA
+        kinds = {CAMERA_INFO: CAMERA, POINT_CLOUD: CLOUD, PATH: GRAPH}
+        if self.type in kinds:
+            return kinds[self.type]
         return POSES if self.type in POSE_TYPES else self.shows
 
     @property
@@ -87,12 +91,43 @@ def chosen(topics: Sequence[Topic], options: ReadOptions) -> Chosen:
     return Chosen(color, depth, told or _info_of(color, infos), _info_of(depth, infos, alone=False), others)
 
 
+def cloud_chosen(topics: Sequence[Topic], options: ReadOptions) -> Chosen | None:
+    """The cloud that gives depth: the told one, else, where there are no depth images, that with most messages.
+
+    Its `color` is the cloud itself where there are no pictures. Raises ValueError with one sentence.
+    """
+    clouds = [topic for topic in topics if topic.type == POINT_CLOUD and topic.count]
+    named = [cloud for cloud in clouds if cloud.name.lstrip("/") == options.depth_topic.lstrip("/")]
+    if not named and (options.depth_topic or any(topic.shows == DEPTH and topic.count for topic in topics)):
+        return None
+    if not (named or clouds):
+        return None
+    cloud = named[0] if named else max(clouds, key=lambda topic: (topic.count, _falling(topic)))
+    pictures = [topic for topic in topics if topic.shows in (COLOR, GREY) and topic.count]
+    if not (pictures or options.color_topic):
+        return Chosen(cloud, cloud, None, None, ())
+    candidates = _candidates(topics, options.color_topic, (COLOR, GREY), "color")
+    color = max(candidates, key=lambda topic: _fitness(topic, cloud))
+    infos = [topic for topic in topics if topic.type == CAMERA_INFO and topic.count]
+    told = _told(topics, options.info_topic, (CAMERA,), "info") if options.info_topic else None
+    others = tuple(sorted({topic.image_name for topic in pictures} - {color.image_name}))
+    return Chosen(color, cloud, told or _info_of(color, infos), None, others)
+
+
 def pose_topics(topics: Sequence[Topic], options: ReadOptions) -> list[Topic]:
     """Topics of poses, the told one alone, else by how much their type says. Raises ValueError."""
     if options.pose_topic:
         return [_told(topics, options.pose_topic, (POSES, TRANSFORMS), "pose")]
     found = [topic for topic in topics if topic.taken_for == POSES and topic.count]
     return sorted(found, key=lambda topic: (POSE_TYPES.index(topic.type), -topic.count, topic.name))
+
+
+def graph_topic(topics: Sequence[Topic], options: ReadOptions) -> Topic | None:
+    """The topic of optimised poses, where one is told; nobody need have published on it. Raises ValueError."""
+    if not options.graph_topic:
+        return None
+    announced = [replace(topic, count=1) if topic.type == PATH else topic for topic in topics]
+    return _told(announced, options.graph_topic, (GRAPH,), "graph")
 
 
 def _candidates(topics: Sequence[Topic], told: str, shows: Sequence[str], option: str) -> list[Topic]:

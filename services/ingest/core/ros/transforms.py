@@ -4,6 +4,7 @@ A transform `parent_from_child` places a frame in its parent; stamps are nanosec
 """
 
 import math
+import struct
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -15,6 +16,7 @@ from prior_sg.services.geometry import inverse, pose_from_quaternion
 from prior_sg.services.ingest.core.poses import PoseError
 
 LONGEST_GAP_NS = 1_000_000_000  # between two stamps over which is interpolated
+FARTHEST_M = 1e8  # a position beyond, or none, is of a damaged message
 LONGEST_QUATERNION = 1e6  # one beyond, or below its inverse, is no rotation but a damaged message
 NEARLY_PARALLEL = 1 - 1e-9  # cosine of half an angle beyond which an arc is a line
 FIXED_FRAMES = ("map", "world", "odom")  # by preference
@@ -33,6 +35,18 @@ def stamp_ns_of(header: Any) -> int:
     return int(seconds) * 1_000_000_000 + int(rest)
 
 
+def written_stamp_ns(data: bytes, ros1: bool = False) -> int:
+    """The stamp of a message, as bytes, that begins with a header. Raises ValueError with one sentence."""
+    try:
+        if ros1:
+            seconds, rest = struct.unpack_from("<II", data, 4)
+        else:
+            seconds, rest = struct.unpack_from("<iI" if data[1] & 1 else ">iI", data, 4)
+    except (struct.error, IndexError) as error:
+        raise ValueError("a message has no header") from error
+    return int(seconds) * 1_000_000_000 + int(rest)
+
+
 @dataclass(frozen=True)
 class Stamped:
     """A transform as a message says it."""
@@ -44,9 +58,14 @@ class Stamped:
     quaternion_xyzw: tuple[float, float, float, float]
 
     def is_motion(self) -> bool:
-        """Whether the numbers are finite and the quaternion is one of a rotation, if not normalised."""
+        """Whether the position is on earth and the quaternion is one of a rotation, if not normalised."""
         length = math.hypot(*self.quaternion_xyzw)
-        return bool(np.isfinite(self.position_m).all()) and 1 / LONGEST_QUATERNION < length < LONGEST_QUATERNION
+        return math.hypot(*self.position_m) < FARTHEST_M and 1 / LONGEST_QUATERNION < length < LONGEST_QUATERNION
+
+    def matrix(self) -> np.ndarray:
+        """parent_from_child (4, 4) of a motion."""
+        turn = np.array(self.quaternion_xyzw)
+        return pose_from_quaternion(np.array(self.position_m), turn / np.linalg.norm(turn))
 
 
 def transforms_of(message: Any) -> Iterator[Stamped]:
@@ -72,8 +91,11 @@ def transforms_of(message: Any) -> Iterator[Stamped]:
 class Track:
     """One transform over time, interpolated between its stamps."""
 
-    def __init__(self, samples: Sequence[Stamped], fixed: bool = False) -> None:
-        """`fixed`: it holds at all times; so does one that never changes. Of equal stamps the last counts."""
+    def __init__(self, samples: Sequence[Stamped], fixed: bool = False, moves: bool = False) -> None:
+        """`fixed`: it holds at all times; so does one that never changes, unless it is said that it `moves`.
+
+        Of equal stamps the last counts.
+        """
         by_stamp = {sample.stamp_ns: sample for sample in samples if sample.is_motion()}
         ordered = [by_stamp[stamp] for stamp in sorted(by_stamp)]
         self.stamps_ns = np.array([sample.stamp_ns for sample in ordered], np.int64)
@@ -81,7 +103,7 @@ class Track:
         turns = np.array([sample.quaternion_xyzw for sample in ordered], np.float64).reshape(-1, 4)
         self.quaternions_xyzw = turns / np.linalg.norm(turns, axis=1, keepdims=True)
         still = len(ordered) > 1 and bool((np.ptp(np.hstack((self.positions_m, turns)), axis=0) == 0).all())
-        self.fixed = bool(ordered) and (fixed or still)
+        self.fixed = bool(ordered) and (fixed or (still and not moves))
 
     def at(self, stamp_ns: int, within_ns: int) -> np.ndarray:
         """parent_from_child (4, 4); before the first and after the last stamp at most `within_ns` away.
@@ -132,10 +154,17 @@ class TransformTree:
                 parents = edges[sample.child]
                 if always or not any(fixed_one for _, fixed_one in parents.values()):
                     parents.setdefault(sample.parent, ([], always))[0].append(sample)
-        self._edges = {
+        self._edges: dict[str, dict[str, Track]] = {
             child: {parent: Track(samples, always) for parent, (samples, always) in parents.items()}
             for child, parents in edges.items()
         }
+
+    @classmethod
+    def of_tracks(cls, tracks: dict[str, dict[str, Track]]) -> "TransformTree":
+        """The tree whose transforms are these, by child and parent."""
+        tree = cls()
+        tree._edges = tracks
+        return tree
 
     def ancestors(self, frame: str) -> list[str]:
         """The frame, its parent, and so on to the root. Raises PoseError for a loop and for two parents."""

@@ -14,11 +14,10 @@ from prior_sg.schemas.queries import (
     NeighboursOf,
     PlaceDetails,
     RegionBeliefs,
-    What,
     Words,
 )
 from prior_sg.services.scene_store.core.queries.index import Index
-from prior_sg.services.scene_store.core.queries.labels import PLURAL
+from prior_sg.services.scene_store.core.queries.labels import not_there
 from prior_sg.services.scene_store.core.queries.things import thing
 
 LEAST_BELIEF = 0.01
@@ -75,13 +74,6 @@ def words(index: Index) -> Words:
         regions=dict(sorted(Counter(region.label for region in scene.regions).items())),
         objects=dict(sorted(Counter(item.label for item in scene.objects if item.label).items())),
     )
-
-
-def not_there(index: Index, what: What, number: int) -> str:
-    """That there is no such id, in one sentence."""
-    ids = index.ids(what)
-    held = f"{len(ids)} {PLURAL[what]} with ids from {ids[0]} to {ids[-1]}" if len(ids) else f"no {PLURAL[what]}"
-    return f"there is no {what} {number}; the scene has {held}"
 
 
 def _place(index: Index, row: int) -> PlaceDetails:

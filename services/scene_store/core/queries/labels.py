@@ -9,7 +9,8 @@ from prior_sg.schemas.queries import ByLabel, ObjectsInRegions, Things, What
 from prior_sg.services.scene_store.core.queries.index import Index
 from prior_sg.services.scene_store.core.queries.things import thing, things
 
-MOST_HINTS = 3
+MOST_HINTS, MOST_IDS = 3, 30
+AFTER_A_TASK = "regions and names follow a task, and none was given"
 ALIKE = 0.5  # of `difflib`, from which a label is worth naming
 REGIONS_AND_OBJECTS: tuple[What, ...] = ("region", "object")
 PLURAL = {"place": "places", "region": "regions", "object": "objects"}
@@ -55,11 +56,23 @@ def nothing_called(index: Index, what: What | None, label: str) -> Things | None
     hints = nearest_labels(label, known)
     named = " or ".join(kinds(what)) if what != "place" else "region"
     if not known:
-        reason = f"no {named} has a label yet"
+        reason = f"no {named} has a label yet" + ("" if index.scene.task else f": {AFTER_A_TASK}")
     else:
         shown = ", ".join(hints or known[: 2 * MOST_HINTS])
         reason = f"no {named} is labelled {label!r}; {'the nearest labels are' if hints else 'there are'}: {shown}"
     return Things(nearest_labels=hints, reason=reason)
+
+
+def not_there(index: Index, what: What, number: int) -> str:
+    """That there is no such id, and which there are, in one sentence."""
+    ids = index.ids(what).tolist()
+    if not ids:
+        held = f"no {PLURAL[what]}" + ("" if what == "place" or index.scene.task else f" yet: {AFTER_A_TASK}")
+    elif len(ids) <= MOST_IDS:
+        held = f"{PLURAL[what]} {', '.join(map(str, ids))}"
+    else:
+        held = f"{len(ids)} {PLURAL[what]} with ids from {ids[0]} to {ids[-1]}"
+    return f"there is no {what} {number}; the scene has {held}"
 
 
 def nearest_labels(label: str, known: list[str]) -> list[str]:

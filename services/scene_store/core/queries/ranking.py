@@ -17,6 +17,7 @@ import numpy as np
 from prior_sg.schemas.names import same
 from prior_sg.schemas.queries import AnswersTo, Ranking, What
 from prior_sg.services.scene_store.core.queries.index import Index
+from prior_sg.services.scene_store.core.queries.labels import nothing_called
 from prior_sg.services.scene_store.core.queries.things import thing
 
 LETTERS = re.compile(r"\w+")
@@ -46,9 +47,16 @@ def ranking(index: Index, question: AnswersTo) -> Ranking:
         note = NOTE
     found = [one for one in _scored(index, regions, objects) if question.what in (None, one.what) and one.score > 0]
     best = heapq.nsmallest(question.limit, found, key=lambda one: (-one.score, ORDER.index(one.what), one.row))
-    reason = "" if best else f"nothing in the scene answers {question.text!r}"
+    reason = "" if best else _no_answer(index, question)
     listed = [thing(index, one.what, one.row, score=calibrated(one.score)) for one in best]
     return Ranking(things=listed, note=note, reason=reason)
+
+
+def _no_answer(index: Index, question: AnswersTo) -> str:
+    """Why nothing answers, in one sentence."""
+    unnamed = not index.scene.regions and not index.labels("object")
+    unknown = nothing_called(index, question.what, question.text) if unnamed else None
+    return unknown.reason if unknown else f"nothing in the scene answers {question.text!r}"
 
 
 def calibrated(product: float) -> float:

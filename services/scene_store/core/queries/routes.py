@@ -7,9 +7,9 @@ import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra, minimum_spanning_tree
 
-from prior_sg.schemas.queries import Route, RouteBetween, Spot, Thing, What
+from prior_sg.schemas.queries import Point, Route, RouteBetween, Spot, Thing, What
 from prior_sg.services.scene_store.core.queries.index import Index, Ways
-from prior_sg.services.scene_store.core.queries.labels import REGIONS_AND_OBJECTS, kinds, nothing_called
+from prior_sg.services.scene_store.core.queries.labels import REGIONS_AND_OBJECTS, kinds, not_there, nothing_called
 from prior_sg.services.scene_store.core.queries.spatial import distances_of
 from prior_sg.services.scene_store.core.queries.things import thing
 
@@ -96,8 +96,9 @@ def _shortest(index: Index, ways: Ways, starts: list[int], goals: list[int]) -> 
 
 def _ends(index: Index, spot: Spot, ways: Ways, side: str, clearance_m: float) -> list[End]:
     """Places that stand for an end, the nearest to it first. Raises NoSuchSpot."""
-    if spot.point_m is not None:
-        reach_m = distances_of(index, "place", spot.point_m)
+    point_m = _here(index, side) if spot.here else spot.point_m
+    if point_m is not None:
+        reach_m = distances_of(index, "place", point_m)
         found = _around(reach_m, np.arange(len(reach_m)), ways, None, index.scene.radii_m)
     else:
         found = [end for what, row in _meant(index, spot, side) for end in _of_thing(index, what, row, ways)]
@@ -107,6 +108,14 @@ def _ends(index: Index, spot: Spot, ways: Ways, side: str, clearance_m: float) -
     return sorted(found, key=lambda end: end.gap_m)
 
 
+def _here(index: Index, side: str) -> Point:
+    """Where the camera was last. Raises NoSuchSpot."""
+    if not len(index.scene.trajectory):
+        raise NoSuchSpot(f"the {side} is where the camera was last, and nothing is known of that yet")
+    x, y, z = index.scene.trajectory[-1].tolist()
+    return x, y, z
+
+
 def _meant(index: Index, spot: Spot, side: str) -> list[tuple[What, int]]:
     """Kind and row of what an end names. Raises NoSuchSpot."""
     if spot.id is not None:
@@ -114,10 +123,10 @@ def _meant(index: Index, spot: Spot, side: str) -> list[tuple[What, int]]:
             raise NoSuchSpot(f"the {side} is a number: say whether it is a place, a region or an object")
         row = index.row(spot.what, spot.id)
         if row is None:
-            raise NoSuchSpot(f"the {side} is {spot.what} {spot.id}, and there is none")
+            raise NoSuchSpot(f"the {side}: {not_there(index, spot.what, spot.id)}")
         return [(spot.what, row)]
     if not spot.label:
-        raise NoSuchSpot(f"the {side} names nothing: give a point, an id or a label")
+        raise NoSuchSpot(f"the {side} names nothing: give a point, an id, a label or `here`")
     for what in REGIONS_AND_OBJECTS if spot.what is None else kinds(spot.what):
         if len(rows := index.labelled(what, spot.label)):
             return [(what, row) for row in rows.tolist()]

@@ -2,16 +2,18 @@
 
 from typing import get_args
 
-from prior_sg.deploy.serving.errors import FaultyRequestError
 from prior_sg.schemas.queries import Spot, What
 
-ENDS = "a label; or `place:ID`, `region:ID`, `object:ID`; or a point `X,Y,Z`"
+HERE = "here"
+ENDS = "a label; or `here`, where the camera was last; or `place:ID`, `region:ID`, `object:ID`; or a point `X,Y,Z`"
 MOST_DIGITS = 18
 FARTHEST_M = 1e9
 
 
 def spot_in(text: str) -> Spot:
-    """An end of a route. Raises FaultyRequestError."""
+    """An end of a route. Raises ValueError."""
+    if text == HERE:
+        return Spot(here=True)
     kind, _, number = text.partition(":")
     if kind in get_args(What) and number.isascii() and number.isdigit() and len(number) <= MOST_DIGITS:
         return Spot(what=kind, id=int(number))  # type: ignore[arg-type]
@@ -20,7 +22,7 @@ def spot_in(text: str) -> Spot:
         x, y, z = point
         return Spot(point_m=(x, y, z))
     if not text.strip() or point:
-        raise FaultyRequestError(f"an end of a route is {ENDS}")
+        raise ValueError(f"an end of a route is {ENDS}")
     return Spot(label=text)
 
 

@@ -1,0 +1,1 @@
+"""Hydra as the lower half of the pipeline: its scene graph in, names of its rooms out."""

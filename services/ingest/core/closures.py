@@ -1,0 +1,37 @@
+"""A jump of the world under a robot, spread over the keyframes that drifted before it (pure).
+
+A SLAM that closes a loop moves the robot at once, but the error had grown along the way. Without its pose graph the
+best that can be said is that it grew evenly with the way travelled since the last jump.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from prior_sg.services.ingest.core.frames import View
+
+
+def spread(trail: Sequence[View], camera_m: np.ndarray, after_from_before: np.ndarray) -> list[np.ndarray]:
+    """Corrected world_from_camera (4, 4) of keyframes since the last jump, oldest first.
+
+    `camera_m` (3,) is where the camera is now, before the jump: what is there moves by all of it, the first keyframe
+    by nothing.
+    """
+    places_m = np.array([view.world_from_camera[:3, 3] for view in trail] + [camera_m])
+    travelled_m = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(places_m, axis=0), axis=1))))
+    shares = travelled_m[:-1] / travelled_m[-1] if travelled_m[-1] > 0 else np.ones(len(trail))
+    return [
+        _part(share, camera_m, after_from_before) @ view.world_from_camera
+        for share, view in zip(shares, trail, strict=True)
+    ]
+
+
+def _part(share: float, around_m: np.ndarray, motion: np.ndarray) -> np.ndarray:
+    """A share of a motion (4, 4): turned about a point, and moved, by that share."""
+    turn = Rotation.from_matrix(motion[:3, :3]).as_rotvec()
+    shift_m = motion[:3, :3] @ around_m + motion[:3, 3] - around_m
+    part = np.eye(4)
+    part[:3, :3] = Rotation.from_rotvec(share * turn).as_matrix()
+    part[:3, 3] = around_m - part[:3, :3] @ around_m + share * shift_m
+    return part

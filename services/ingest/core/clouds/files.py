@@ -1,0 +1,104 @@
+"""Clouds of points in files: .npy, .pcd, .ply, and .bin as KITTI has it (pure)."""
+
+import io
+import re
+
+import numpy as np
+
+from prior_sg.services.ingest.core.clouds.sweep import CloudError
+from prior_sg.services.ingest.core.pixels import NPY_FAULTS
+
+ENDINGS = (".npy", ".pcd", ".ply", ".bin")
+PCD_TYPES = {"F": "f", "I": "i", "U": "u"}
+PLY_TYPES = {
+    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
+    "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
+    "double": "f8", "float64": "f8",
+}  # fmt: skip
+PLY_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
+KITTI_COLUMNS = ("x", "y", "z", "intensity")
+MOST_POINTS = 1 << 25
+HEADER_BYTES = 1 << 16
+
+
+def columns_of(data: bytes, ending: str) -> dict[str, np.ndarray]:
+    """Named numbers of the points of a file, by its ending. Raises CloudError."""
+    read = {".npy": _npy, ".pcd": _pcd, ".ply": _ply, ".bin": _kitti}[ending.lower()]
+    try:
+        return read(data)
+    except CloudError:
+        raise
+    except (*NPY_FAULTS, KeyError, IndexError, StopIteration) as error:
+        raise CloudError(f"it is damaged: {str(error)[:100]}") from error
+
+
+def _npy(data: bytes) -> dict[str, np.ndarray]:
+    """A structured array by its names, or rows (…, 3) or more of x y z."""
+    array = np.lib.format.read_array(io.BytesIO(data), allow_pickle=False)
+    if array.dtype.names:
+        return _named(array)
+    if array.ndim < 2 or not 3 <= array.shape[-1] <= 16 or array.dtype.kind not in "fiu":
+        raise CloudError(f"its array has the shape {array.shape} and the type {array.dtype} instead of (n, 3) numbers")
+    return {name: array[..., i] for i, name in enumerate("xyz")}
+
+
+def _kitti(data: bytes) -> dict[str, np.ndarray]:
+    rows = np.frombuffer(data, "<f4").reshape(-1, len(KITTI_COLUMNS))
+    return {name: rows[:, i] for i, name in enumerate(KITTI_COLUMNS)}
+
+
+def _pcd(data: bytes) -> dict[str, np.ndarray]:
+    head = re.search(rb"^DATA[ \t]+(\w+)[ \t]*\r?\n", data[:HEADER_BYTES], re.MULTILINE)
+    if head is None:
+        raise CloudError("it has no header of a PCD file")
+    lines = data[: head.start()].decode("ascii", errors="replace").splitlines()
+    said = {words[0]: words[1:] for words in map(str.split, lines) if words and not words[0].startswith("#")}
+    counts = [int(count) for count in said.get("COUNT", ["1"] * len(said["FIELDS"]))]
+    kinds = [f"<{PCD_TYPES[kind]}{size}" for kind, size in zip(said["TYPE"], said["SIZE"], strict=True)]
+    names = [f"{name}.{i}" if name == "_" else name for i, name in enumerate(said["FIELDS"])]
+    fields = [
+        (name, kind) if count == 1 else (name, kind, (count,))
+        for name, kind, count in zip(names, kinds, counts, strict=True)
+    ]
+    points = int(said["POINTS"][0]) if "POINTS" in said else int(said["WIDTH"][0]) * int(said["HEIGHT"][0])
+    form, body = head[1].decode(), data[head.end() :]
+    if form == "binary":
+        return _named(_rows(body, np.dtype(fields), points))
+    if form == "ascii":
+        return _table(body, fields, points)
+    raise CloudError(f"its data is {form}: save it as binary (pcl_convert_pcd_ascii_binary IN.pcd OUT.pcd 1)")
+
+
+def _ply(data: bytes) -> dict[str, np.ndarray]:
+    head = re.match(rb"ply\r?\n.*?^end_header\r?\n", data[:HEADER_BYTES], re.MULTILINE | re.DOTALL)
+    if head is None:
+        raise CloudError("it has no header of a PLY file")
+    lines = [line.split() for line in head[0].decode("ascii", errors="replace").splitlines()]
+    form = next(words[1] for words in lines if words[:1] == ["format"])
+    starts = [i for i, words in enumerate(lines) if words[:1] == ["element"]]
+    if not starts or lines[starts[0]][1] != "vertex":
+        raise CloudError("its first element is not vertex")
+    own = lines[starts[0] + 1 : starts[1] if len(starts) > 1 else None]
+    order = PLY_ORDERS.get(form, "<")
+    fields = [(words[-1], order + PLY_TYPES[words[1]]) for words in own if words[:1] == ["property"]]
+    points, body = int(lines[starts[0]][2]), data[head.end() :]
+    return _named(_rows(body, np.dtype(fields), points)) if form in PLY_ORDERS else _table(body, fields, points)
+
+
+def _rows(body: bytes, row: np.dtype, points: int) -> np.ndarray:
+    if not 0 < points <= MOST_POINTS or len(body) < points * row.itemsize:
+        raise CloudError(f"its {len(body)} bytes are too few for {points} points of {row.itemsize} bytes")
+    return np.frombuffer(body, row, points)
+
+
+def _table(body: bytes, fields: list, points: int) -> dict[str, np.ndarray]:
+    """Points of a text, a line each."""
+    lines = body.decode("ascii", errors="replace").splitlines()[:points]
+    rows = np.array([line.split() for line in lines if line.strip()], np.float64)
+    if len(rows) != points or rows.shape[1] < len(fields):
+        raise CloudError(f"it has {len(rows)} lines instead of {points}, or too few numbers in them")
+    return {field[0]: rows[:, i] for i, field in enumerate(fields)}
+
+
+def _named(rows: np.ndarray) -> dict[str, np.ndarray]:
+    return {name: rows[name] for name in rows.dtype.names or () if rows[name].dtype.kind in "fiu"}

@@ -1,0 +1,1 @@
+"""What apps and programs for mapping export, each as its publisher writes it."""
