@@ -17,6 +17,7 @@ from prior_sg.services.errors import PriorSgError
 from prior_sg.services.runtime import extras
 
 if TYPE_CHECKING:
+    from prior_sg.deploy.running.roll import Roll
     from prior_sg.deploy.running.supervisor import Supervisor
 
 
@@ -37,15 +38,12 @@ def add_commands(commands: Commands) -> None:
     up.add_argument(
         "--api", nargs="?", type=port_in, const=API_PORT, default=None, metavar="PORT", help="also serve HTTP there"
     )
-<<<<<<< HEAD
     up.add_argument(
         "--restart-hung",
         action="store_true",
         help="kill and start again what exists and is not heard; default: say so, for it may be stopped on purpose",
     )
-=======
     add_ros(up)
->>>>>>> main
     add_run_options(up)
     add_source_options(up)
 
@@ -126,24 +124,6 @@ def _stay_up(arguments: argparse.Namespace, names: list[str]) -> int:
     client = open_client(arguments.connect)
     roll = Roll(client.bus)
     try:
-<<<<<<< HEAD
-        for name in sorted(names, key=lambda name: name == "ingest"):
-            supervisor.start(name, arguments.workers if BY_NAME[name].job is not None else 1)
-        if arguments.api is not None:
-            _open_api(supervisor, arguments.api)
-        listening = " and ".join((arguments.connect, *arguments.listen))
-        console.print(f"router {listening}; logs in {supervisor.log_folder}; Ctrl-C stops")
-        while True:
-            insist()
-            silence, hung = roll.check(supervisor.children)
-            for child in hung if arguments.restart_hung else ():
-                child.kill()
-            for event in (*silence, *supervisor.check()):
-                console.print(event)
-            time.sleep(0.2)
-    except KeyboardInterrupt:
-        console.print("stopping")
-=======
         with until_interrupted():
             for name in sorted(names, key=lambda name: name == "ingest"):
                 supervisor.start(name, arguments.workers if BY_NAME[name].job is not None else 1)
@@ -153,8 +133,7 @@ def _stay_up(arguments: argparse.Namespace, names: list[str]) -> int:
                 supervisor.start_door("ros", "prior_sg.deploy.ros.process", bridge_arguments(arguments))
             listening = " and ".join((arguments.connect, *arguments.listen))
             console.print(f"router {listening}; logs in {supervisor.log_folder}; Ctrl-C stops")
-            wait(lambda: _tell(supervisor))
->>>>>>> main
+            wait(lambda: _tell(supervisor, roll, arguments.restart_hung))
         return 0
     finally:
         supervisor.stop()
@@ -162,8 +141,12 @@ def _stay_up(arguments: argparse.Namespace, names: list[str]) -> int:
         stop_router()
 
 
-def _tell(supervisor: "Supervisor") -> None:
-    for event in supervisor.check():
+def _tell(supervisor: "Supervisor", roll: "Roll", restart_hung: bool) -> None:
+    """What has happened to the processes; those that hang are ended, to be started again, where that is wished."""
+    silence, hung = roll.check(supervisor.children)
+    for child in hung if restart_hung else ():
+        child.kill()
+    for event in (*silence, *supervisor.check()):
         console.print(event)
 
 

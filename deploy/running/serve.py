@@ -61,14 +61,6 @@ async def serve(arguments: argparse.Namespace, instance: str) -> None:
 
     service = BY_NAME[arguments.service]
     cfg = resolved_config(service, arguments.config, arguments.set)
-<<<<<<< HEAD
-    bus = await asyncio.to_thread(ZenohBus, arguments.connect)
-    stopping = asyncio.Event()
-    loop = asyncio.get_running_loop()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        loop.add_signal_handler(number, stopping.set)
-    watcher = asyncio.create_task(_stop_with_parent(stopping, arguments.parent))
-=======
     robot = arguments.robot if service.scope == "robot" else "*"
     await stay(service, cfg, Identity(robot, instance, time.time_ns()), arguments.connect, arguments.parent)
 
@@ -76,14 +68,13 @@ async def serve(arguments: argparse.Namespace, instance: str) -> None:
 async def stay(service: Service, cfg: Any, identity: Identity, connect: str, parent: int = 0) -> None:
     """Run a service on the bus of a router until a signal, or until the parent, if there is one, is gone."""
     bus = await asyncio.to_thread(ZenohBus, connect)
-    host = Host(service, bus, cfg, identity)
+    stopping = asyncio.Event()
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):
-        loop.add_signal_handler(number, host.stop)
-    watcher = asyncio.create_task(_stop_with_parent(host, parent))
->>>>>>> main
+        loop.add_signal_handler(number, stopping.set)
+    watcher = asyncio.create_task(_stop_with_parent(stopping, parent))
     try:
-        host = await _unless(stopping, _in_charge(service, bus, cfg, arguments.robot, instance))
+        host = await _unless(stopping, _in_charge(service, bus, cfg, identity))
         if host is not None:
             await _stopped_by(stopping, host)
     finally:
@@ -91,17 +82,18 @@ async def stay(service: Service, cfg: Any, identity: Identity, connect: str, par
         bus.close()  # also when the service never got so far as to leave by itself
 
 
-async def _in_charge(service: Service, bus: ZenohBus, cfg: Any, robot: str, instance: str) -> Host:
-    """The host of a service, once it may write."""
+async def _in_charge(service: Service, bus: ZenohBus, cfg: Any, identity: Identity) -> Host:
+    """The host of a service, once it may write: what writes the same deltas has one lease, whatever it is called."""
     from prior_sg.services.registry import LEASED, SERVICES
 
-    robot = robot if service.scope == "robot" else "*"
+    robot, instance = identity.robot, identity.instance
     fence = await asyncio.to_thread(Fence, bus, robot, LEASED)
     if service.scope != "robot":
-        return Host(service, bus, cfg, Identity(robot, instance, time.time_ns()), fence=fence)
+        return Host(service, bus, cfg, identity, fence=fence)
     topics = [topic for topic in service.writes if topic.name in LEASED]
     keepers = [other.name for other in SERVICES if EPOCH in other.answers and other is not service]
-    lease = Lease(bus, robot, service.name, instance, topics=topics, keepers=keepers)
+    role = LEASED[topics[0].name] if topics else service.name
+    lease = Lease(bus, robot, role, instance, topics=topics, keepers=keepers)
     return Host(service, bus, cfg, Identity(robot, instance, await lease.take()), lease=lease, fence=fence)
 
 
