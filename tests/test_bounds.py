@@ -18,10 +18,12 @@ ENDLESS = re.compile(r"\bdeque\(\)|SimpleQueue\(\)|\bQueue\(\)|lru_cache\(maxsiz
 MAY_GROW = {  # what is emptied by its owner, or holds one entry for each type, topic or part of the program
     "schemas/codec.py",
     "services/feature_pyramid/encoders/onnx_session.py",
+    "services/ingest/core/ros/assembly.py",
     "services/ingest/sources/recording.py",
     "services/runtime/record.py",
     "services/runtime/jobs/board.py",
     "services/runtime/jobs/dispatcher.py",
+    "services/runtime/ros/types.py",
     "services/runtime/runner.py",
 }
 
