@@ -37,6 +37,10 @@ DTYPES = (
     "bool",
 )
 MAX_DIMENSIONS = 8
+LAST_NUMBER = 2**62  # so that the next one, and sums of two, fit 64 bits
+Number = Annotated[int, msgspec.Meta(ge=0, le=LAST_NUMBER)]  # of a frame, an epoch or a revision; how many
+NumberOrNone = Annotated[int, msgspec.Meta(ge=-1, le=LAST_NUMBER)]  # the same; -1 = none yet
+Stamp = Annotated[int, msgspec.Meta(ge=-LAST_NUMBER, le=LAST_NUMBER)]  # nanoseconds of some clock
 
 
 class DecodeError(ValueError):

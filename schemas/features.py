@@ -4,7 +4,7 @@ from typing import Annotated
 
 import numpy as np
 
-from prior_sg.schemas.codec import Message, Shape
+from prior_sg.schemas.codec import Message, Number, Shape, Stamp
 from prior_sg.schemas.frames import Intrinsics, Pose, check_pose
 
 DEFAULT_SPACE = "conse/efficientnet-lite2/minilm-l6-v2"  # embedding space of encoders and readers told of no other
@@ -14,8 +14,8 @@ class Pyramid(Message, frozen=True, kw_only=True):
     """The encoded crops of one keyframe, with all that integration needs: camera, pose and a coarse depth surface."""
 
     robot: str
-    frame_id: int
-    stamp_ns: int
+    frame_id: Number
+    stamp_ns: Stamp
     space: str  # embedding space, for example conse/efficientnet-lite0/minilm-l6-v2
     worker: str
     intrinsics: Intrinsics
@@ -26,7 +26,7 @@ class Pyramid(Message, frozen=True, kw_only=True):
     depths_m: Annotated[np.ndarray, Shape("float32", "crop")]  # median depth inside each crop
     embeddings: Annotated[np.ndarray, Shape("float16", "crop", "dim")]  # unit length
     surface_m: Annotated[np.ndarray, Shape("float32", "row", "column")]  # coarse depth image, 0 = no measurement
-    crops_total: int  # candidates before the A_min filter
+    crops_total: Number  # candidates before the A_min filter
 
     def check(self) -> None:
         check_pose(self.world_from_camera)

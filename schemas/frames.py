@@ -9,11 +9,13 @@ from typing import Annotated
 import msgspec
 import numpy as np
 
-from prior_sg.schemas.codec import Message, Shape
+from prior_sg.schemas.codec import Message, Number, NumberOrNone, Shape, Stamp
 from prior_sg.schemas.status import Loss
 
 Pose = Annotated[np.ndarray, Shape("float64", 4, 4)]
 ROTATION_TOLERANCE = 1e-3
+MOST_KEYFRAMES = 256  # in one answer
+MOST_PIXELS = 2**25  # 8K; decoded, colour and depth take 300 MB
 
 
 class Intrinsics(msgspec.Struct, frozen=True):
@@ -29,6 +31,8 @@ class Intrinsics(msgspec.Struct, frozen=True):
     def __post_init__(self) -> None:
         if not (0 < self.width_px <= 16384 and 0 < self.height_px <= 16384):
             raise ValueError(f"image size {self.width_px} x {self.height_px} is out of range")
+        if self.width_px * self.height_px > MOST_PIXELS:
+            raise ValueError(f"an image of {self.width_px} x {self.height_px} has more than {MOST_PIXELS} pixels")
         if not (self.fx_px > 0 and self.fy_px > 0):
             raise ValueError("focal lengths must be positive")
 
@@ -62,8 +66,8 @@ class Keyframe(Message, frozen=True, kw_only=True):
     """One posed RGB-D image, compressed as the source delivered it."""
 
     robot: str
-    frame_id: int
-    stamp_ns: int
+    frame_id: Number
+    stamp_ns: Stamp
     intrinsics: Intrinsics
     world_from_camera: Pose
     color: bytes  # a JPEG or PNG file, 8 bit RGB; empty = the sensor sees no colour
@@ -89,9 +93,9 @@ class PoseUpdate(Message, frozen=True, kw_only=True):
     """
 
     robot: str
-    epoch: int  # new at every start of the writer
-    revision: int  # rises per update of this writer, from 0
-    stamp_ns: int  # when the correction was made
+    epoch: Number  # new at every start of the writer
+    revision: Number  # rises per update of this writer, from 0
+    stamp_ns: Stamp  # when the correction was made
     frame_ids: Annotated[np.ndarray, Shape("int64", "frame")]
     world_from_camera: Annotated[np.ndarray, Shape("float64", "frame", 4, 4)]
 
@@ -107,7 +111,7 @@ class CameraState(Message, frozen=True, kw_only=True):
     """Where the camera is now, also between keyframes."""
 
     robot: str
-    stamp_ns: int
+    stamp_ns: Stamp
     world_from_camera: Pose
 
     def check(self) -> None:
@@ -118,14 +122,14 @@ class IngestState(Message, frozen=True, kw_only=True):
     """How far the source is; `finished` when every keyframe has been published and encoded."""
 
     robot: str
-    stamp_ns: int
-    frames_read: int
-    frames_total: int  # 0 = unknown (live)
-    keyframes: int
-    encoded: int
-    rejected: int  # frames refused by the source or the keyframe selection; `losses` says why
+    stamp_ns: Stamp
+    frames_read: Number
+    frames_total: Number  # 0 = unknown (live)
+    keyframes: Number
+    encoded: Number
+    rejected: Number  # frames refused by the source or the keyframe selection; `losses` says why
     finished: bool
-    skipped: int = 0  # keyframes that nobody encoded: a newer one came first, or no worker could
+    skipped: Number = 0  # keyframes that nobody encoded: a newer one came first, or no worker could
     losses: list[Loss] = []  # what of the source could not be used, most frequent first
 
 
@@ -133,14 +137,14 @@ class ArchiveRequest(Message, frozen=True, kw_only=True):
     """Keyframes with first_frame_id <= frame_id < end_frame_id, at most `limit` of them, oldest first."""
 
     robot: str
-    first_frame_id: int = 0
-    end_frame_id: int = 2**62
-    limit: int = 16
+    first_frame_id: Number = 0
+    end_frame_id: Number = 2**62
+    limit: Annotated[int, msgspec.Meta(ge=1, le=MOST_KEYFRAMES)] = 16
 
 
 class ArchiveReply(Message, frozen=True, kw_only=True):
     """Archived keyframes; `oldest_frame_id` says where the ring begins (-1 = empty)."""
 
     robot: str
-    oldest_frame_id: int
+    oldest_frame_id: NumberOrNone
     keyframes: list[Keyframe]

@@ -82,7 +82,7 @@ def fault_of_names(kind: str, names: Iterable[str], most: int) -> str:
 
 def key_part(text: str) -> str:
     """`text` as part of a key. Raises ValueError when it is none."""
-    if not text or _IN_KEYS.search(text) or any(_unprintable(c) for c in text):
+    if not text or _IN_KEYS.search(text) or any(_unprintable(c) or c in "\n\t" for c in text):
         raise ValueError(f"{_quoted(text)} cannot be part of a key")
     return text
 

@@ -5,7 +5,7 @@ from typing import Annotated
 import msgspec
 import numpy as np
 
-from prior_sg.schemas.codec import Message, Part, Shape
+from prior_sg.schemas.codec import Message, Number, NumberOrNone, Part, Shape, Stamp
 from prior_sg.schemas.frames import Intrinsics, Pose, check_pose
 
 _NO_NAMES = msgspec.field(default_factory=lambda: np.zeros(0, np.int16))
@@ -20,8 +20,8 @@ class Detections(Message, frozen=True, kw_only=True):
     """
 
     robot: str
-    frame_id: int
-    stamp_ns: int
+    frame_id: Number
+    stamp_ns: Stamp
     space: str  # embedding space
     detector: str  # its setting, for example segments
     prompted: bool  # whether the detector looks for objects by name
@@ -67,9 +67,9 @@ class ObjectDelta(Message, frozen=True, kw_only=True):
     """
 
     robot: str
-    epoch: int
-    revision: int
-    stamp_ns: int
+    epoch: Number
+    revision: NumberOrNone
+    stamp_ns: Stamp
     prior_digest: str  # of the prior whose objects the labels name, empty before the first
     snapshot: bool = False
     objects: list[SceneObject]

@@ -5,7 +5,7 @@ from typing import Annotated
 import msgspec
 import numpy as np
 
-from prior_sg.schemas.codec import Message, Shape
+from prior_sg.schemas.codec import Message, Number, NumberOrNone, Shape, Stamp
 
 _NO_IDS = msgspec.field(default_factory=lambda: np.zeros(0, np.int64))
 _NO_LENGTHS = msgspec.field(default_factory=lambda: np.zeros(0, np.float32))
@@ -21,10 +21,10 @@ class PlaceDelta(Message, frozen=True, kw_only=True):
     """
 
     robot: str
-    epoch: int  # new at every start of the writer
-    revision: int  # grows by one per delta
-    stamp_ns: int  # of the keyframe that caused it
-    frame_id: int
+    epoch: Number  # new at every start of the writer
+    revision: NumberOrNone  # grows by one per delta
+    stamp_ns: Stamp  # of the keyframe that caused it
+    frame_id: NumberOrNone
     snapshot: bool = False
     place_ids: Annotated[np.ndarray, Shape("int64", "place")]
     positions_m: Annotated[np.ndarray, Shape("float32", "place", 3)]  # world

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import msgspec
 import numpy as np
 
-from prior_sg.schemas.codec import Message, Shape, encode
+from prior_sg.schemas.codec import Message, Number, NumberOrNone, Shape, Stamp, encode
 from prior_sg.schemas.names import LONGEST_NAME, fault_of_names, fault_of_text, key_part
 
 SUM_TOLERANCE = 1e-3
@@ -21,7 +21,7 @@ class Task(Message, frozen=True, kw_only=True):
     """What a robot is to do, and where. `regions` fixes the vocabulary; empty lets the prior choose it."""
 
     robot: str
-    stamp_ns: int
+    stamp_ns: Stamp
     environment: str
     task: str
     regions: list[str] = []
@@ -228,8 +228,8 @@ class PriorEvidence(Message, frozen=True, kw_only=True):
     """What one map has shown of its prior so far: totals, not increments, so that only a map's newest one counts."""
 
     robot: str
-    epoch: int  # of the map
-    stamp_ns: int
+    epoch: NumberOrNone  # of the map
+    stamp_ns: Stamp
     prior_digest: str  # in force when it was seen
     environment: str
     task: str
@@ -264,24 +264,24 @@ class ModelRequest(Message, frozen=True, kw_only=True):
     """One turn of a conversation with a language model. `schema` (JSON) constrains the answer; empty = plain text."""
 
     conversation: str
-    turn: int
+    turn: Number
     messages: list[tuple[str, str]]  # (role, text); roles are system, user, assistant
     schema: str = ""
     schema_name: str = "answer"
-    max_tokens: int = 4096
+    max_tokens: Number = 4096
 
 
 class ModelReply(Message, frozen=True, kw_only=True):
     """What the model said, or why it said nothing."""
 
     conversation: str
-    turn: int
+    turn: Number
     text: str = ""
     failure: str = ""  # one word of the kind
     reason: str = ""  # one sentence
-    attempts: int = 1
-    tokens_in: int = 0
-    tokens_out: int = 0
+    attempts: Number = 1
+    tokens_in: Number = 0
+    tokens_out: Number = 0
 
 
 class Recall(Message, frozen=True, kw_only=True):

@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 
 import msgspec
 
-from prior_sg.schemas.codec import Message, Part
+from prior_sg.schemas.codec import Message, NumberOrNone, Part, Stamp
 from prior_sg.schemas.names import LONGEST_TEXT
 from prior_sg.schemas.objects import SceneObject
 from prior_sg.schemas.regions import NO_REGION, Region, Transition
@@ -313,6 +313,6 @@ class SceneAnswer(Message, frozen=True, kw_only=True):
     """The answers, one for each question."""
 
     robot: str
-    revision: int  # of the store, as in SceneRevision; -1 = nothing is stored yet
-    stamp_ns: int  # of the newest frame that the scene rests on
+    revision: NumberOrNone  # of the store, as in SceneRevision; -1 = nothing is stored yet
+    stamp_ns: Stamp  # of the newest frame that the scene rests on
     answers: list[Answer]

@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 import msgspec
 import numpy as np
 
-from prior_sg.schemas.codec import Message, Part, Shape
+from prior_sg.schemas.codec import Message, Number, NumberOrNone, Part, Shape, Stamp
 
 NO_REGION = -1  # in place of a region id: not labelled yet
 _NO_IDS = msgspec.field(default_factory=lambda: np.zeros(0, np.int64))
@@ -59,9 +59,9 @@ class RegionDelta(Message, frozen=True, kw_only=True):
     """
 
     robot: str
-    epoch: int
-    revision: int
-    stamp_ns: int
+    epoch: Number
+    revision: NumberOrNone
+    stamp_ns: Stamp
     prior_digest: str
     environment: str
     task: str
@@ -124,7 +124,7 @@ class PosteriorReply(Message, frozen=True, kw_only=True):
     posterior: list[float] = []
     unary: list[float] = []
     votes: list[ExpertVote] = []
-    frames: int = 0  # keyframes that saw the place
+    frames: Number = 0  # keyframes that saw the place
     trust: float = 0.0  # sum of their trust
     position_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     region: int = NO_REGION

@@ -5,7 +5,7 @@ from typing import Annotated
 import msgspec
 import numpy as np
 
-from prior_sg.schemas.codec import Message, Part, Shape
+from prior_sg.schemas.codec import Message, Number, NumberOrNone, Part, Shape, Stamp
 from prior_sg.schemas.objects import SceneObject
 from prior_sg.schemas.regions import Region
 
@@ -20,12 +20,12 @@ class SceneRevision(Message, frozen=True, kw_only=True):
     """The store has made one more delta durable."""
 
     robot: str
-    epoch: int
-    revision: int
-    stamp_ns: int
-    places: int
-    edges: int
-    regions: int
+    epoch: Number
+    revision: NumberOrNone
+    stamp_ns: Stamp
+    places: Number
+    edges: Number
+    regions: Number
 
 
 class SceneRequest(Message, frozen=True, kw_only=True):
@@ -73,7 +73,7 @@ class Scene(Message, frozen=True, kw_only=True):
     """Everything the store holds about one robot; sorted by id, so equal scenes of one revision have equal bytes."""
 
     robot: str
-    stamp_ns: int
+    stamp_ns: Stamp
     environment: str
     task: str
     prior_digest: str
@@ -101,7 +101,7 @@ class Scene(Message, frozen=True, kw_only=True):
     hull_counts: Annotated[np.ndarray, Shape("int64", "surface")] = _NO_IDS
     hulls_m: Annotated[np.ndarray, Shape("float32", "hull", 2)] = _NO_CORNERS
     origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of the world, as in Keyframe; add it to any position
-    revision: int = -1  # of the store, as in SceneRevision; -1 = nothing stored
+    revision: NumberOrNone = -1  # of the store, as in SceneRevision; -1 = nothing stored
 
     def unnumbered(self) -> "Scene":
         """The same without its revision, which counts what a store has applied: of one and the same scene it is another

@@ -4,7 +4,7 @@ from typing import ClassVar
 
 import msgspec
 
-from prior_sg.schemas.codec import Message
+from prior_sg.schemas.codec import Message, Number, NumberOrNone, Stamp
 
 
 class Consumed(Message, frozen=True, kw_only=True):
@@ -19,11 +19,11 @@ class Consumed(Message, frozen=True, kw_only=True):
     robot: str
     service: str
     instance: str
-    order: int  # 0, 1, 2, … per instance
+    order: Number  # 0, 1, 2, … per instance
     topic: str  # topic, query or message name
-    frame_id: int = -1  # of a keyframe
+    frame_id: NumberOrNone = -1  # of a keyframe
     writer: str = ""
-    sequence: int = -1
+    sequence: NumberOrNone = -1
     inline: bytes = b""
     key: str = ""
 
@@ -38,25 +38,42 @@ class Started(Message, frozen=True, kw_only=True):
     robot: str
     service: str
     instance: str
-    epoch: int
+    epoch: NumberOrNone
     config: bytes  # the resolved config as JSON
     reads: list[str] = []  # names of the topics it reads
     versions: dict[str, int] = {}  # of messages, by name, where it is not 1
 
 
+class EpochRequest(Message, frozen=True, kw_only=True):
+    """Ask `keeper`, a service that follows deltas, how far the epochs of a robot's `topic` have come."""
+
+    robot: str
+    topic: str
+    keeper: str
+
+
+class EpochKnown(Message, frozen=True, kw_only=True):
+    """The epoch that is followed, and its newest revision; -1 = none yet."""
+
+    robot: str
+    topic: str
+    epoch: NumberOrNone
+    revision: NumberOrNone
+
+
 class Tick(Message, frozen=True, kw_only=True):
     """Time, as a message."""
 
-    stamp_ns: int
+    stamp_ns: Stamp
 
 
 class JobDone(Message, frozen=True, kw_only=True):
     """A job this process dispatched has been finished by a worker."""
 
     topic: str
-    frame_id: int
+    frame_id: NumberOrNone
     worker: str
-    attempts: int  # 1 unless workers died or hung
+    attempts: Number  # 1 unless workers died or hung
     error: str = ""  # why it was given up, when it was
 
 
@@ -95,9 +112,9 @@ class ServiceStatus(Message, frozen=True, kw_only=True):
     service: str
     instance: str
     robot: str
-    pid: int
+    pid: Number
     uptime_s: float
-    backlog: int  # inputs waiting
+    backlog: Number  # inputs waiting
     busy_share: float  # share of the last seconds spent computing
     step_ms_p50: float
     step_ms_p99: float
@@ -105,3 +122,4 @@ class ServiceStatus(Message, frozen=True, kw_only=True):
     waiting_for: list[str]  # questions without an answer yet
     topics: list[TopicCount]
     losses: list[Loss] = []  # most frequent first
+    step_s: float = 0.0  # since when it has been at one input

@@ -33,11 +33,12 @@ from prior_sg.schemas.priors import (
 from prior_sg.schemas.queries import SceneAnswer, SceneQuery
 from prior_sg.schemas.regions import PosteriorReply, PosteriorRequest, RegionDelta
 from prior_sg.schemas.scene import HistoryRequest, RevisionList, Scene, SceneRequest, SceneRevision
-from prior_sg.schemas.status import Consumed, ServiceStatus, StatusRequest
+from prior_sg.schemas.status import Consumed, EpochKnown, EpochRequest, ServiceStatus, StatusRequest
 
 prepare()  # every process imports this table before it opens a bus, whose threads then find all decoders built
 
 ROOT = "psg"
+WAITING = "0"  # in place of an epoch
 Delivery = Literal["latest", "every", "job"]
 
 
@@ -142,6 +143,8 @@ TOPICS = (
     JOURNAL,
 )
 
+DELTAS = tuple(topic for topic in TOPICS if {"epoch", "revision", "snapshot"} <= {*topic.type.__struct_fields__})
+
 _TOPIC_OF = {topic.type: topic for topic in TOPICS if topic.delivery != "job"}
 
 
@@ -161,6 +164,7 @@ SCENE = Query("SCENE", SceneRequest, Scene, f"{ROOT}/{{robot}}/ask/scene")
 HISTORY = Query("HISTORY", HistoryRequest, RevisionList, f"{ROOT}/{{robot}}/ask/history")
 SCENE_QUERY = Query("SCENE_QUERY", SceneQuery, SceneAnswer, f"{ROOT}/{{robot}}/ask/query")
 TEXT = Query("TEXT", TextRequest, TextEmbeddings, f"{ROOT}/encoder/{{space}}/text")
+EPOCH = Query("EPOCH", EpochRequest, EpochKnown, f"{ROOT}/{{robot}}/ask/epoch/{{topic}}/{{keeper}}")
 PRIORS = Query("PRIORS", PriorRequest, PriorList, f"{ROOT}/fleet/ask/prior")
 
 QUERIES = (
@@ -175,6 +179,7 @@ QUERIES = (
     HISTORY,
     SCENE_QUERY,
     TEXT,
+    EPOCH,
     PRIORS,
 )
 
@@ -184,6 +189,16 @@ STATUS = Query("STATUS", StatusRequest, ServiceStatus, f"{ROOT}/status")
 def alive_key(service: str, instance: str) -> str:
     """Liveliness token of one process."""
     return f"{ROOT}/alive/{service}/{instance}"
+
+
+def lease_key(robot: str, service: str, epoch: str, instance: str) -> str:
+    """Liveliness token of a process that is in charge of a robot's service, or, with `WAITING` as epoch, would be."""
+    return f"{ROOT}/{robot}/lease/{service}/{epoch}/{instance}"
+
+
+def roll_key(service: str, instance: str, pid: str) -> str:
+    """Liveliness token of who started a process, for as long as that process exists."""
+    return f"{ROOT}/alive/roll/{service}/{instance}/{pid}"
 
 
 def status_key(service: str, instance: str) -> str:

@@ -7,8 +7,19 @@ from typing import Generic, Literal, Protocol, TypeVar
 import numpy as np
 
 from prior_sg.schemas.frames import PoseUpdate
+from prior_sg.services.refusals import InputRefused
 
 Verdict = Literal["apply", "stale", "gap"]
+MOST_DELTAS = 4096  # that wait for a missing one
+BELIEVED_REVISIONS = 2**32  # how far one revision may lie above the one before: years of an absent reader
+BELIEVED_NS = 10 * 365 * 86400 * 10**9  # how far one epoch may lie above the one before: clocks mended, long rests
+
+
+def next_epoch(now_ns: int, known: int) -> int:
+    """The epoch of a writer that starts now, where `known` is the highest seen (-1 = none): the time, which no other
+    draws, unless the clock is behind what was seen or too far ahead to be believed.
+    """
+    return now_ns if known < 0 or known < now_ns <= known + BELIEVED_NS else known + 1
 
 
 class Delta(Protocol):
@@ -35,19 +46,29 @@ class Follower(Generic[D]):
     while `needs_snapshot` is set. Deltas that arrive during a gap wait for the snapshot.
     """
 
-    def __init__(self, epoch: int = -1, revision: int = -1, waiting_limit: int = 4096) -> None:
+    def __init__(self, epoch: int = -1, revision: int = -1, waiting_limit: int = MOST_DELTAS) -> None:
         self.epoch, self.revision = epoch, revision
         self.needs_snapshot = False
         self._waiting: dict[tuple[int, int], D] = {}  # by epoch and revision
         self._waiting_limit = waiting_limit
 
     def verdict(self, delta: D) -> Verdict:
-        """What to do with a delta, given what was applied so far. Revisions of a new writer begin at 0."""
+        """What to do with a delta, given what was applied so far. Revisions of a new writer begin at 0. Raises
+        InputRefused for an epoch or a revision that no writer can have come to meanwhile.
+        """
+        self._believe(delta)
         if delta.epoch < self.epoch or (delta.epoch == self.epoch and delta.revision <= self.revision):
             return "stale"
         if delta.snapshot or (delta.epoch == self.epoch and delta.revision == self.revision + 1):
             return "apply"
         return "apply" if delta.epoch > self.epoch and delta.revision == 0 else "gap"
+
+    def _believe(self, delta: D) -> None:
+        if self.epoch >= 0 and delta.epoch > self.epoch + BELIEVED_NS:
+            raise InputRefused(f"epoch {delta.epoch} lies years above {self.epoch}, the one followed: not believed")
+        last = self.revision if delta.epoch == self.epoch else 0
+        if delta.revision > max(last, 0) + BELIEVED_REVISIONS:
+            raise InputRefused(f"revision {delta.revision} lies far above {last}, the one followed: not believed")
 
     def take(self, delta: D) -> list[D]:
         """The deltas to apply now, in order: none for a repeat or a gap, several when a gap closes."""
@@ -74,8 +95,11 @@ class PoseCorrections:
 
     def take(self, update: PoseUpdate) -> dict[int, np.ndarray] | None:
         """The poses (4, 4) by frame id that an update gives; None where it is a repeat or older than one before."""
-        if update.revision <= self.revisions.get(update.epoch, -1):
+        known = self.revisions.get(update.epoch, -1)
+        if update.revision <= known:
             return None
+        if known >= 0 and update.revision > known + BELIEVED_NS:
+            raise InputRefused(f"revision {update.revision} of poses lies far above the one before, {known}")
         self.revisions[update.epoch] = update.revision
         poses = dict(zip(update.frame_ids.tolist(), np.array(update.world_from_camera), strict=True))
         self.world_from_camera.update(poses)

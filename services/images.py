@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 
 from prior_sg.schemas.frames import Intrinsics, Keyframe
+from prior_sg.services.headers import ImageError, told_size
 
 MAX_PRINCIPAL_OFFSET = 0.45  # share of the image by which the principal point may be off its middle: crops
 
@@ -14,9 +15,8 @@ class ImageFault(ValueError):
 
 def color_of(keyframe: Keyframe) -> np.ndarray:
     """Colour (h, w, 3) uint8, RGB. Raises ImageFault."""
-    image = _decoded(keyframe.color, "colour", cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION)
-    _check_size(image, keyframe.intrinsics, "colour")
-    return image
+    mode = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION
+    return _decoded(keyframe.color, keyframe.intrinsics, "colour", mode)
 
 
 def depth_of(keyframe: Keyframe, max_principal_offset: float) -> np.ndarray:
@@ -49,25 +49,25 @@ def blank_of(keyframe: Keyframe) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _single_channel(data: bytes, camera: Intrinsics, name: str) -> np.ndarray:
-    image = _decoded(data, name, cv2.IMREAD_UNCHANGED)
+    image = _decoded(data, camera, name, cv2.IMREAD_UNCHANGED)
     if image.ndim != 2:
         raise ImageFault(f"the {name} image has {image.shape[2]} channels instead of one")
-    _check_size(image, camera, name)
     return image
 
 
-def _decoded(data: bytes, name: str, mode: int) -> np.ndarray:
+def _decoded(data: bytes, camera: Intrinsics, name: str, mode: int) -> np.ndarray:
+    """Decodes only what its header says to be of the camera's size: others may be far larger than they look."""
     try:
+        _check_size(*told_size(data), camera, name)
         image = cv2.imdecode(np.frombuffer(data, np.uint8), mode)
-    except cv2.error:  # empty, or a header that promises an absurd size
+    except (cv2.error, ImageError):
         image = None
     if image is None:
         raise ImageFault(f"the {name} image cannot be decoded")
     return image
 
 
-def _check_size(image: np.ndarray, camera: Intrinsics, name: str) -> None:
-    height_px, width_px = image.shape[:2]
+def _check_size(width_px: int, height_px: int, camera: Intrinsics, name: str) -> None:
     if (width_px, height_px) != (camera.width_px, camera.height_px):
         raise ImageFault(
             f"the {name} image has {width_px} x {height_px} pixels, "

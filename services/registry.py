@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from prior_sg.schemas.topics import POSE_UPDATE, PRIOR_REVISION, TASK, Topic
+from prior_sg.schemas.topics import DELTAS, POSE_UPDATE, PRIOR_REVISION, TASK, Topic
 from prior_sg.services.feature_pyramid.service import SERVICE as FEATURE_PYRAMID
 from prior_sg.services.ingest.service import SERVICE as INGEST
 from prior_sg.services.place_graph.service import SERVICE as PLACE_GRAPH
@@ -15,5 +15,14 @@ SERVICES: tuple[Service[Any, Any], ...] = (INGEST, PLACE_GRAPH, FEATURE_PYRAMID,
 
 # Topics that people and their programs write or read, through the command line.
 OPERATOR_WRITES: tuple[Topic, ...] = (TASK, POSE_UPDATE, PRIOR_REVISION)
+
+# Services of which each robot has one writer at a time, by the topics whose deltas their readers follow.
+LEASED: dict[str, str] = {
+    topic.name: service.name
+    for service in SERVICES
+    if service.scope == "robot"
+    for topic in service.writes
+    if topic in DELTAS
+}
 
 BY_NAME: dict[str, Service[Any, Any]] = {service.name: service for service in SERVICES}

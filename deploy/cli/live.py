@@ -17,6 +17,7 @@ from prior_sg.services.errors import PriorSgError
 from prior_sg.services.runtime import extras
 
 if TYPE_CHECKING:
+    from prior_sg.deploy.running.roll import Roll
     from prior_sg.deploy.running.supervisor import Supervisor
 
 
@@ -36,6 +37,11 @@ def add_commands(commands: Commands) -> None:
     add_router(up)
     up.add_argument(
         "--api", nargs="?", type=port_in, const=API_PORT, default=None, metavar="PORT", help="also serve HTTP there"
+    )
+    up.add_argument(
+        "--restart-hung",
+        action="store_true",
+        help="kill and start again what exists and is not heard; default: say so, for it may be stopped on purpose",
     )
     add_ros(up)
     add_run_options(up)
@@ -91,6 +97,7 @@ def cmd_up(arguments: argparse.Namespace) -> int:
 def _stay_up(arguments: argparse.Namespace, names: list[str]) -> int:
     from prior_sg.deploy.keys.routing import beyond_this_host
     from prior_sg.deploy.running.job import require_files
+    from prior_sg.deploy.running.roll import Roll
     from prior_sg.deploy.running.supervisor import Supervisor
     from prior_sg.deploy.settings import check_settings
     from prior_sg.services.ingest.core.options import is_live
@@ -114,6 +121,8 @@ def _stay_up(arguments: argparse.Namespace, names: list[str]) -> int:
         open_client(arguments.connect).bus.close()  # finds out at once whether a router is there
     stop_router = (lambda: None) if arguments.no_router else open_router(arguments.connect, beyond)
     supervisor = Supervisor(arguments.connect, arguments.robot, arguments.out / "logs", settings, arguments.config)
+    client = open_client(arguments.connect)
+    roll = Roll(client.bus)
     try:
         with until_interrupted():
             for name in sorted(names, key=lambda name: name == "ingest"):
@@ -124,15 +133,20 @@ def _stay_up(arguments: argparse.Namespace, names: list[str]) -> int:
                 supervisor.start_door("ros", "prior_sg.deploy.ros.process", bridge_arguments(arguments))
             listening = " and ".join((arguments.connect, *arguments.listen))
             console.print(f"router {listening}; logs in {supervisor.log_folder}; Ctrl-C stops")
-            wait(lambda: _tell(supervisor))
+            wait(lambda: _tell(supervisor, roll, arguments.restart_hung))
         return 0
     finally:
         supervisor.stop()
+        client.bus.close()
         stop_router()
 
 
-def _tell(supervisor: "Supervisor") -> None:
-    for event in supervisor.check():
+def _tell(supervisor: "Supervisor", roll: "Roll", restart_hung: bool) -> None:
+    """What has happened to the processes; those that hang are ended, to be started again, where that is wished."""
+    silence, hung = roll.check(supervisor.children)
+    for child in hung if restart_hung else ():
+        child.kill()
+    for event in (*silence, *supervisor.check()):
         console.print(event)
 
 

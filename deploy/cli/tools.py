@@ -15,7 +15,8 @@ from prior_sg.deploy.evaluation import tune_command as tuning
 from prior_sg.deploy.terminal import Part, line
 
 if TYPE_CHECKING:
-    from prior_sg.schemas.status import ServiceStatus, TopicCount
+    from prior_sg.deploy.inspecting.health import Found
+    from prior_sg.schemas.status import TopicCount
 
 
 def add_commands(commands: Commands) -> None:
@@ -205,29 +206,22 @@ def cmd_topics(arguments: argparse.Namespace) -> int:
 
 def cmd_health(arguments: argparse.Namespace) -> int:
     """Every process: alive, busy, what it dropped."""
-    import msgspec
-
-    from prior_sg.services.runtime.bus import BusError
+    from prior_sg.deploy.inspecting.health import look
 
     with open_client(arguments.connect) as client:
-        statuses, silent = [], []
-        for instance, service in sorted(client.alive().items()):
-            try:
-                statuses.append(client.status(service, instance))
-            except BusError as error:
-                silent.append({"service": service, "instance": instance, "error": str(error)})
+        found = look(client)
     if arguments.json:
-        print(json.dumps({"processes": msgspec.to_builtins(statuses), "silent": silent}))
+        print(json.dumps(found.plain()))
     else:
-        _print_health(statuses, silent)
-    return 1 if silent or not statuses else 0
+        _print_health(found)
+    return 0 if found.well else 1
 
 
-def _print_health(statuses: list["ServiceStatus"], silent: list[dict]) -> None:
+def _print_health(found: "Found") -> None:
     """A process: what it is doing, what went through each topic, and what it could not use."""
     from prior_sg.services.losses import line as loss_line
 
-    for status in statuses:
+    for status in found.processes:
         waits = f", waits for {', '.join(status.waiting_for)}" if status.waiting_for else ""
         figures = (
             f"  pid {status.pid}, up {status.uptime_s:.0f} s, busy {status.busy_share:.0%}, "
@@ -239,9 +233,11 @@ def _print_health(statuses: list["ServiceStatus"], silent: list[dict]) -> None:
         console.print(line("    ", *parts[1:]))
         for loss in status.losses:
             console.print(f"    {loss_line(loss)}")
-    for entry in silent:
+    for entry in found.silent:
         console.print(line((entry["error"], "red")))
-    if not statuses and not silent:
+    for remark in found.remarks:
+        console.print(line((remark.text, "red")) if remark.fault else remark.text)
+    if not found.processes and not found.silent:
         console.print("no service is running; start them with `prior-sg up`")
 
 

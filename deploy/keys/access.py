@@ -17,6 +17,8 @@ from prior_sg.schemas.topics import (
     Topic,
     alive_key,
     job_key,
+    lease_key,
+    roll_key,
     status_key,
     worker_keys,
 )
@@ -79,11 +81,15 @@ def grants_of(role: Role, name: str) -> Grants:
         ),
         announces=(
             *(alive_key(service.name, "*") for service in services),
+            *(roll_key(service.name, "*", "*") for service in services),
+            *(lease_key(robot, service.name, "*", "*") for service in services if service.scope == "robot"),
             *(worker_keys(job, "*", "**")[1] for job in worked),
         ),
         reads=(
             *(t.pattern(robot) for t in TOPICS if t not in JOBS),
             alive_key("*", "*"),
+            roll_key("*", "*", "*"),
+            lease_key(robot, "*", "*", "*"),
             *(worker_keys(job, "*", "**")[1] for job in jobs),
         ),
         asks=(
@@ -101,7 +107,7 @@ def _may_write(role: Role, topic: Topic) -> bool:
 
 def _asked_on(query: Query, robot: str) -> str:
     fields = {name: robot if name == "robot" else "**" for name in query.request.__struct_fields__}
-    return query.key.format(**fields)
+    return query.key.format(**fields).replace("**/**", "**")  # the one way in which Zenoh writes it
 
 
 def access_control(participants: Iterable[Participant], loopback: Sequence[str]) -> dict[str, Any]:

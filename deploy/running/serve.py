@@ -9,6 +9,7 @@ import signal
 import sys
 import time
 import uuid
+from collections.abc import Coroutine
 from pathlib import Path
 from typing import Any
 
@@ -17,10 +18,12 @@ from prior_sg.deploy.edge import check_arguments
 from prior_sg.deploy.errors import UserError
 from prior_sg.deploy.settings import DEFAULT_ROBOT, add_keys, connect_in_force, resolved_config, use_keys
 from prior_sg.deploy.terminal import complain
+from prior_sg.schemas.topics import EPOCH
 from prior_sg.services.runtime import extras
 from prior_sg.services.runtime.bus import BusError
 from prior_sg.services.runtime.config import ConfigError
 from prior_sg.services.runtime.host.host import Host
+from prior_sg.services.runtime.host.lease import Fence, Lease, SupersededError
 from prior_sg.services.runtime.logs import start_logging
 from prior_sg.services.runtime.record import LogError
 from prior_sg.services.runtime.service import Identity, Service, ServiceError
@@ -30,6 +33,7 @@ log = logging.getLogger(__name__)
 PARENT_CHECK_S = 1.0
 HOPELESS = (ConfigError, BusError, ServiceError, LogError)  # their messages say what to do
 EXIT_HOPELESS = 2  # starting again would fail again
+EXIT_SUPERSEDED = 3  # another is in charge: started again, it waits for that one's end
 
 
 def service_names() -> list[str]:
@@ -64,22 +68,64 @@ async def serve(arguments: argparse.Namespace, instance: str) -> None:
 async def stay(service: Service, cfg: Any, identity: Identity, connect: str, parent: int = 0) -> None:
     """Run a service on the bus of a router until a signal, or until the parent, if there is one, is gone."""
     bus = await asyncio.to_thread(ZenohBus, connect)
-    host = Host(service, bus, cfg, identity)
+    stopping = asyncio.Event()
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):
-        loop.add_signal_handler(number, host.stop)
-    watcher = asyncio.create_task(_stop_with_parent(host, parent))
+        loop.add_signal_handler(number, stopping.set)
+    watcher = asyncio.create_task(_stop_with_parent(stopping, parent))
     try:
-        await host.run()
+        host = await _unless(stopping, _in_charge(service, bus, cfg, identity))
+        if host is not None:
+            await _stopped_by(stopping, host)
     finally:
         watcher.cancel()
         bus.close()  # also when the service never got so far as to leave by itself
 
 
-async def _stop_with_parent(host: Host, parent: int) -> None:
+async def _in_charge(service: Service, bus: ZenohBus, cfg: Any, identity: Identity) -> Host:
+    """The host of a service, once it may write: what writes the same deltas has one lease, whatever it is called."""
+    from prior_sg.services.registry import LEASED, SERVICES
+
+    robot, instance = identity.robot, identity.instance
+    fence = await asyncio.to_thread(Fence, bus, robot, LEASED)
+    if service.scope != "robot":
+        return Host(service, bus, cfg, identity, fence=fence)
+    topics = [topic for topic in service.writes if topic.name in LEASED]
+    keepers = [other.name for other in SERVICES if EPOCH in other.answers and other is not service]
+    role = LEASED[topics[0].name] if topics else service.name
+    lease = Lease(bus, robot, role, instance, topics=topics, keepers=keepers)
+    return Host(service, bus, cfg, Identity(robot, instance, await lease.take()), lease=lease, fence=fence)
+
+
+async def _unless(stopping: asyncio.Event, starting: Coroutine[Any, Any, Host]) -> Host | None:
+    """What is awaited, or None where the process is to stop before."""
+    start, stop = asyncio.create_task(starting), asyncio.create_task(stopping.wait())
+    await asyncio.wait((start, stop), return_when=asyncio.FIRST_COMPLETED)
+    stop.cancel()
+    if start.done():
+        return start.result()
+    start.cancel()
+    return None
+
+
+async def _stopped_by(stopping: asyncio.Event, host: Host) -> None:
+    """Run a host until it ends or is told to."""
+
+    async def tell() -> None:
+        await stopping.wait()
+        host.stop()
+
+    telling = asyncio.create_task(tell())
+    try:
+        await host.run()
+    finally:
+        telling.cancel()
+
+
+async def _stop_with_parent(stopping: asyncio.Event, parent: int) -> None:
     while not parent or os.getppid() == parent:
         await asyncio.sleep(PARENT_CHECK_S)
-    host.stop()
+    stopping.set()
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -96,6 +142,9 @@ def run(arguments: argparse.Namespace) -> int:
     except HOPELESS as error:
         log.error(str(error))
         return EXIT_HOPELESS
+    except SupersededError as error:
+        log.error(str(error))
+        return EXIT_SUPERSEDED
     except Exception as error:
         if isinstance(error, ModuleNotFoundError) and (advice := extras.advice(error)) is not None:
             log.error(advice)

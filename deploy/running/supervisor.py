@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from prior_sg.deploy.errors import UserError
-from prior_sg.deploy.running.serve import EXIT_HOPELESS
+from prior_sg.deploy.running.serve import EXIT_HOPELESS, EXIT_SUPERSEDED
 from prior_sg.services.registry import BY_NAME
 
 RESTART_DELAY_S = 0.5
@@ -41,6 +41,7 @@ class Child:
     deaths: int = 0
     restarts: int = 0
     restart_at_s: float = 0.0
+    unique: str = ""  # its name on the bus
 
     def start(self) -> None:
         """Start the process; its log is appended to."""
@@ -55,11 +56,11 @@ class Child:
             *self.arguments,
         ]
         # Unique on the bus: another robot, host or run may have a process of the same short name.
-        instance = f"{self.instance}-{uuid.uuid4().hex[:6]}"
+        self.unique = f"{self.instance}-{uuid.uuid4().hex[:6]}"
         environment = os.environ | {name: str(self.threads) for name in THREAD_VARIABLES}
         with self.log_path.open("ab") as log:
             self.process = subprocess.Popen(
-                [*command, "--instance", instance],
+                [*command, "--instance", self.unique],
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=log,
@@ -67,6 +68,16 @@ class Child:
                 env=environment | {"OMP_WAIT_POLICY": "PASSIVE"},
             )
         self.started_s = time.monotonic()
+
+    @property
+    def pid(self) -> int:
+        """Of the process, 0 where there is none."""
+        return 0 if self.process is None else self.process.pid
+
+    def kill(self) -> None:
+        """End the process at once, also one that was stopped."""
+        if self.process is not None:
+            self.process.kill()
 
     def last_words(self) -> str:
         """The end of its log, for an error message."""
@@ -137,7 +148,8 @@ class Supervisor:
                     child.start()
                     events.append(f"{child.instance} restarted")
             elif (code := child.process.poll()) is not None:
-                child.deaths = 1 if now_s - child.started_s > STABLE_AFTER_S else child.deaths + 1
+                stable = now_s - child.started_s > STABLE_AFTER_S or code == EXIT_SUPERSEDED
+                child.deaths = 1 if stable else child.deaths + 1
                 if code == EXIT_HOPELESS or child.deaths >= GIVE_UP_AFTER:
                     died = child.last_words() if code >= 0 else f"it was ended by {_reason(code)}"
                     raise ChildFailed(f"{child.instance} does not run: {died} (log: {child.log_path})")

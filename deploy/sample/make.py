@@ -15,8 +15,8 @@ import numpy as np
 
 from prior_sg.deploy.sample.packed import PackError, keyframe_of, write_log
 from prior_sg.schemas.frames import Keyframe
+from prior_sg.services.headers import jpeg_segments
 from prior_sg.services.ingest.core.frames import RawFrame
-from prior_sg.services.ingest.core.headers import jpeg_segments
 from prior_sg.services.ingest.sources import Source, SourceError, open_source
 from prior_sg.services.runtime.record import LogError
 

@@ -90,11 +90,17 @@ class Bus(Protocol):
     def call(self, key: str, payload: bytes, timeout_s: float, on_answer: OnAnswer) -> None:
         """Ask whoever serves the key; the answer arrives in the callback, always exactly once."""
 
-    def announce(self, key: str) -> None:
-        """Be seen under this key until closed or dead."""
+    def announce(self, key: str) -> Callable[[], None]:
+        """Be seen under this key until closed or dead. Returns what ends it."""
 
     def watch(self, pattern: str, on_alive: OnAlive) -> None:
         """See announced keys come and go, beginning with those already there."""
+
+    def announced(self, pattern: str, timeout_s: float) -> set[str]:
+        """The keys announced now, by anybody."""
+
+    def connected(self) -> bool:
+        """Whether others can be reached now."""
 
     def close(self) -> None:
         """Leave the bus."""
@@ -201,11 +207,27 @@ class LocalBus:
         else:
             server(LocalRequest(payload, key, on_answer))
 
-    def announce(self, key: str) -> None:
+    def announce(self, key: str) -> Callable[[], None]:
         """Be seen."""
         with self._hub.lock:
             self._hub.tokens[key] = self._id
             self._tell(key, True)
+        return lambda: self._withdraw(key)
+
+    def _withdraw(self, key: str) -> None:
+        with self._hub.lock:
+            if self._hub.tokens.get(key) == self._id:
+                del self._hub.tokens[key]
+                self._tell(key, False)
+
+    def announced(self, pattern: str, timeout_s: float) -> set[str]:
+        """The keys announced now."""
+        with self._hub.lock:
+            return {key for key in self._hub.tokens if key_matches(pattern, key)}
+
+    def connected(self) -> bool:
+        """Always."""
+        return True
 
     def watch(self, pattern: str, on_alive: OnAlive) -> None:
         """See who comes and goes."""

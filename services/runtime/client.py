@@ -6,19 +6,40 @@ import time
 import uuid
 from collections.abc import Callable, Iterator
 from types import TracebackType
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from prior_sg.schemas.codec import DecodeError, Message, decode, encode
 from prior_sg.schemas.priors import Prior, PriorRequest, Task, TaskInForce, TaskRequest
 from prior_sg.schemas.status import ServiceStatus, StatusRequest
-from prior_sg.schemas.topics import PRIOR, PRIORS, TASK, TASK_IN_FORCE, Query, Topic, alive_key, status_key
+from prior_sg.schemas.topics import (
+    PRIOR,
+    PRIORS,
+    TASK,
+    TASK_IN_FORCE,
+    Query,
+    Topic,
+    alive_key,
+    lease_key,
+    roll_key,
+    status_key,
+)
 from prior_sg.services.errors import PriorSgError
 from prior_sg.services.runtime.bus import Answer, Bus, BusError, Sample, message_in, pack_header
+from prior_sg.services.runtime.host.lease import Standing, standing
 
 R = TypeVar("R", bound=Message)
 POLL_S = 0.5
 STAMP_TIMEOUT_S = 2.0
 PATIENT_POLLS = 4
+ALIVE_TIMEOUT_S = 2.0
+
+
+class OnTheRoll(NamedTuple):
+    """A process as who started it tells."""
+
+    service: str
+    instance: str
+    pid: str
 
 
 class NoPriorError(PriorSgError):
@@ -143,6 +164,16 @@ class BusClient:
             while not self._alive and time.monotonic() < end_s:
                 time.sleep(settle_s)
         return dict(self._alive)
+
+    def standings(self) -> list[Standing]:
+        """Who is in charge of which robot's services, and who waits for that, sorted."""
+        keys = self.bus.announced(lease_key("*", "*", "*", "*"), ALIVE_TIMEOUT_S)
+        return sorted((one for key in keys if (one := standing(key)) is not None), key=str)
+
+    def on_the_roll(self) -> list[OnTheRoll]:
+        """Every process that exists where it was started and was alive once, whether it is heard or not, sorted."""
+        keys = self.bus.announced(roll_key("*", "*", "*"), ALIVE_TIMEOUT_S)
+        return sorted(OnTheRoll(*key.split("/")[-3:]) for key in keys)
 
     def status(self, service: str, instance: str, timeout_s: float = 3.0) -> ServiceStatus:
         """Health of one process. Raises BusError."""

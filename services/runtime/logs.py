@@ -3,9 +3,11 @@
 import json
 import logging
 import sys
+import threading
 import time
 from typing import Any
 
+BURST, WINDOW_S = 20, 10.0  # warnings of one place in the code
 STANDARD = set(vars(logging.makeLogRecord({}))) | {"message", "asctime", "taskName"}
 
 
@@ -32,10 +34,37 @@ class JsonFormatter(logging.Formatter):
         return json.dumps(line, default=str)
 
 
+class Limit(logging.Filter):
+    """Lets at most `burst` warnings of one place in the code through within `window_s`; the next one after that says in
+    `left_out` how many were not written. What floods a service must not fill its disk.
+    """
+
+    def __init__(self, burst: int = BURST, window_s: float = WINDOW_S) -> None:
+        super().__init__()
+        self._burst, self._window_s = burst, window_s
+        self._lock = threading.Lock()
+        self._windows: dict[tuple[str, int], tuple[float, int]] = {}  # (start, warnings since) by place
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Whether a record is written."""
+        if record.levelno < logging.WARNING:
+            return True
+        place = (record.pathname, record.lineno)
+        with self._lock:
+            began_s, number = self._windows.get(place, (record.created, 0))
+            if not 0 <= record.created - began_s < self._window_s:
+                if number > self._burst:
+                    record.left_out = number - self._burst
+                began_s, number = record.created, 0
+            self._windows[place] = began_s, number + 1
+            return number < self._burst
+
+
 def start_logging(service: str, instance: str, level: str = "info") -> None:
     """Send the logs of this process to standard error."""
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(JsonFormatter(service, instance))
+    handler.addFilter(Limit())
     root = logging.getLogger()
     root.handlers[:] = [handler]
     root.setLevel(level.upper())

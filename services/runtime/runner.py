@@ -5,6 +5,7 @@
 too.
 """
 
+import contextlib
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Self, Union
@@ -12,6 +13,7 @@ from typing import Any, Self, Union
 from prior_sg.schemas.codec import Message, copied, encode
 from prior_sg.schemas.status import JobDone
 from prior_sg.schemas.topics import Query, Topic
+from prior_sg.services.refusals import NotYet
 from prior_sg.services.runtime.bus import key_matches
 from prior_sg.services.runtime.service import Ask, Errand, Identity, Service
 
@@ -103,12 +105,13 @@ class Runner:
     def _reply(self, ask: Ask) -> Message | None:
         """The reply, or None after noting that there is none yet."""
         answerer = self.answers.get(ask.query)
-        reply: Message | None
-        if isinstance(answerer, Runner):
-            assert isinstance(ask.query, Query)
-            reply = answerer.answer(ask.query, ask.request)
-        else:
-            reply = answerer(ask.request) if answerer is not None else None
+        reply: Message | None = None
+        with contextlib.suppress(NotYet):
+            if isinstance(answerer, Runner):
+                assert isinstance(ask.query, Query)
+                reply = answerer.answer(ask.query, ask.request)
+            elif answerer is not None:
+                reply = answerer(ask.request)
         if reply is None and all(_name(ask) != _name(open_) for open_ in self.asks):
             self.asks.append(ask)
         return reply

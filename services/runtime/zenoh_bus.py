@@ -290,9 +290,9 @@ class ZenohBus:
             encoding=_encoding(request),
         )
 
-    def announce(self, key: str) -> None:
+    def announce(self, key: str) -> Callable[[], None]:
         """Be seen."""
-        self._entities.append(self._session.liveliness().declare_token(key))
+        return self._kept(self._session.liveliness().declare_token(key))
 
     def watch(self, pattern: str, on_alive: OnAlive) -> None:
         """See who comes and goes."""
@@ -301,6 +301,15 @@ class ZenohBus:
                 pattern, lambda sample: on_alive(str(sample.key_expr), sample.kind == SampleKind.PUT), history=True
             )
         )
+
+    def announced(self, pattern: str, timeout_s: float) -> set[str]:
+        """The keys announced now, as the router knows them."""
+        replies = self._session.liveliness().get(pattern, timeout=timeout_s)
+        return {str(reply.ok.key_expr) for reply in replies if reply.ok is not None}
+
+    def connected(self) -> bool:
+        """Whether the router is there."""
+        return bool(self._session.info.routers_zid())
 
     def close(self) -> None:
         """Leave the bus, within a bound."""

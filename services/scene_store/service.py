@@ -1,8 +1,9 @@
 """Keeps every robot's scene graph durably: reads deltas, writes revisions, answers with the scene."""
 
+import logging
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import msgspec
 
@@ -13,8 +14,9 @@ from prior_sg.schemas.priors import Prior, Task, TaskInForce, TaskRequest
 from prior_sg.schemas.queries import SceneAnswer, SceneQuery
 from prior_sg.schemas.regions import RegionDelta
 from prior_sg.schemas.scene import HistoryRequest, RevisionList, Scene, SceneRequest
-from prior_sg.schemas.status import Tick
+from prior_sg.schemas.status import EpochKnown, EpochRequest, Tick
 from prior_sg.schemas.topics import (
+    EPOCH,
     HISTORY,
     OBJECT_DELTA,
     OBJECT_SNAPSHOT,
@@ -37,6 +39,7 @@ from prior_sg.services.scene_store.core.queries.answering import reply
 from prior_sg.services.scene_store.core.queries.index import Index
 from prior_sg.services.scene_store.database import Database
 
+log = logging.getLogger(__name__)
 CHECKPOINT_S = 1.0  # the write-ahead log is folded into the file between deltas, not within a commit
 D = TypeVar("D", PlaceDelta, RegionDelta, ObjectDelta)
 
@@ -87,6 +90,10 @@ def step(state: State, message: Message, cfg: core.Config) -> Iterator[Output]:
         case Prior():
             state.database.put_prior(message)
         case Tick():
+            for robot in state.robots.values():
+                if (task := core.mend_task(robot.graph, message.stamp_ns)) is not None:
+                    log.warning("a task was stamped in the far future: it is stamped anew", extra={"robot": task.robot})
+                    state.database.put_task(robot.graph, task)
             state.database.rest(robot.graph for robot in state.robots.values())
 
 
@@ -101,8 +108,9 @@ def _resume(state: State) -> Iterator[Output]:
 
 def _take_places(state: State, robot: Robot, delta: PlaceDelta) -> Iterator[Output]:
     """Where the cameras were is known even while the delta itself must wait."""
+    verdict = robot.places.verdict(delta)
     cameras = core.note_cameras(robot.graph, delta)
-    if cameras and robot.places.verdict(delta) != "apply":
+    if cameras and verdict != "apply":
         state.database.put_cameras(robot.graph, delta)
     yield from _follow(state, robot, robot.places, delta, apply=core.apply_places, snapshot=PLACE_SNAPSHOT)
 
@@ -182,6 +190,18 @@ def answer_task(state: State, request: TaskRequest, cfg: core.Config) -> TaskInF
     return TaskInForce(robot=request.robot, task=robot.graph.task if robot else None)
 
 
+def answer_epoch(state: State, request: EpochRequest, cfg: core.Config) -> EpochKnown:
+    """How far a writer's epochs have come, for its successor."""
+    robot = state.robots.get(request.robot) or _robot(core.Graph(request.robot))
+    followers: dict[str, Follower[Any]] = {
+        PLACE_DELTA.name: robot.places,
+        REGION_DELTA.name: robot.regions,
+        OBJECT_DELTA.name: robot.objects,
+    }
+    follower = followers.get(request.topic, Follower())
+    return EpochKnown(robot=request.robot, topic=request.topic, epoch=follower.epoch, revision=follower.revision)
+
+
 def close(state: State) -> None:
     """Close the database."""
     state.database.close()
@@ -196,7 +216,14 @@ SERVICE = Service(
     step=step,
     reads=(PLACE_DELTA, REGION_DELTA, OBJECT_DELTA, TASK, PRIOR),
     writes=(SCENE_REVISION,),
-    answers={SCENE: answer_scene, SCENE_QUERY: answer_query, HISTORY: answer_history, TASK_IN_FORCE: answer_task},
+    answers={
+        SCENE: answer_scene,
+        SCENE_QUERY: answer_query,
+        HISTORY: answer_history,
+        TASK_IN_FORCE: answer_task,
+        EPOCH: answer_epoch,
+    },
+    key_fields=lambda cfg: {"keeper": "scene_store"},
     asks=(PLACE_SNAPSHOT, REGION_SNAPSHOT, OBJECT_SNAPSHOT),
     tick_s=CHECKPOINT_S,
     close=close,

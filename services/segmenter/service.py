@@ -9,9 +9,11 @@ from prior_sg.schemas.objects import ObjectDelta
 from prior_sg.schemas.places import SnapshotRequest
 from prior_sg.schemas.priors import PriorRequest, TaskRequest
 from prior_sg.schemas.regions import PosteriorReply, PosteriorRequest, RegionDelta
+from prior_sg.schemas.status import EpochKnown, EpochRequest
 from prior_sg.schemas.topics import (
     BACKFILL,
     DETECTIONS,
+    EPOCH,
     OBJECT_DELTA,
     OBJECT_SNAPSHOT,
     PLACE_DELTA,
@@ -29,6 +31,7 @@ from prior_sg.schemas.topics import (
     TEXT,
     topic_of,
 )
+from prior_sg.services.deltas import Follower
 from prior_sg.services.runtime.service import Ask, Identity, Output, Service, ServiceError
 from prior_sg.services.segmenter.core import report, update
 from prior_sg.services.segmenter.core.config import Config
@@ -75,6 +78,12 @@ def answer_posterior(state: State, request: PosteriorRequest, cfg: Config) -> Po
     return report.explain(state, request, cfg)
 
 
+def answer_epoch(state: State, request: EpochRequest, cfg: Config) -> EpochKnown:
+    """How far the epochs of the place graph have come, for its successor."""
+    follower = state.map.follower if request.topic == PLACE_DELTA.name else Follower()
+    return EpochKnown(robot=request.robot, topic=request.topic, epoch=follower.epoch, revision=follower.revision)
+
+
 SERVICE = Service(
     "segmenter",
     purpose="Aligns places with the prior: a label and a belief for each place, and regions with lasting ids.",
@@ -84,8 +93,14 @@ SERVICE = Service(
     step=step,
     reads=(PLACE_DELTA, PYRAMID, DETECTIONS, POSE_UPDATE, TASK, PRIOR),
     writes=(REGION_DELTA, OBJECT_DELTA, BACKFILL, PRIOR_EVIDENCE),
-    asks=(PLACE_SNAPSHOT, TEXT, PRIORS, TASK_IN_FORCE),
-    answers={REGION_SNAPSHOT: answer_snapshot, OBJECT_SNAPSHOT: answer_objects, POSTERIOR: answer_posterior},
+    asks=(PLACE_SNAPSHOT, TEXT, PRIORS, TASK_IN_FORCE, EPOCH),
+    answers={
+        REGION_SNAPSHOT: answer_snapshot,
+        OBJECT_SNAPSHOT: answer_objects,
+        POSTERIOR: answer_posterior,
+        EPOCH: answer_epoch,
+    },
+    key_fields=lambda cfg: {"keeper": "segmenter"},
     losses=lambda state: state.seen.losses.told,
     tick_s=0.5,
 )

@@ -445,6 +445,8 @@ EXAMPLES: list[Message] = [
     ),
     status.Tick(stamp_ns=1),
     status.JobDone(topic="T", frame_id=1, worker="w", attempts=2, error="e"),
+    status.EpochRequest(robot="r", topic="T", keeper="k"),
+    status.EpochKnown(robot="r", topic="T", epoch=1, revision=2),
     status.StatusRequest(),
     status.ServiceStatus(
         service="s",
@@ -472,6 +474,7 @@ EXAMPLES: list[Message] = [
             )
         ],
         losses=[status.Loss(what="w", reason="r", count=1, example="e")],
+        step_s=7.5,
     ),
 ]
 

@@ -69,6 +69,13 @@ def test_what_was_written_before_the_store_kept_history_means_the_present(name, 
     assert decode(type(message), msgpack.packb(fields)) == msgspec.structs.replace(message, **defaults)
 
 
+def test_what_was_written_before_a_long_step_was_told_has_none():
+    message = next(example for example in EXAMPLES if by_name(example) == "ServiceStatus")
+    fields = msgpack.unpackb(encode(message), ext_hook=msgpack.ExtType)
+    del fields["step_s"]
+    assert decode(type(message), msgpack.packb(fields)) == msgspec.structs.replace(message, step_s=0.0)
+
+
 def test_what_was_asked_before_routes_could_begin_here_begins_elsewhere():
     asked = msgpack.packb({"point_m": [1.0, 2.0, 3.0], "what": None, "id": None, "label": ""})
     assert msgspec.msgpack.decode(asked, type=Spot) == Spot(point_m=(1.0, 2.0, 3.0))

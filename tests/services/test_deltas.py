@@ -3,11 +3,13 @@
 from dataclasses import dataclass
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from prior_sg.schemas.frames import PoseUpdate
-from prior_sg.services.deltas import Follower, PoseCorrections
+from prior_sg.services.deltas import BELIEVED_NS, BELIEVED_REVISIONS, Follower, PoseCorrections
+from prior_sg.services.refusals import InputRefused
 
 
 @dataclass(frozen=True)
@@ -99,3 +101,45 @@ def test_a_frame_without_a_correction_keeps_the_pose_it_was_announced_with():
     corrections.take(moved_to(1.0, epoch=1, revision=0))
     assert 7 in corrections and 9 not in corrections
     assert corrections.pose(9, announced) is announced
+
+
+@pytest.mark.parametrize(
+    ("followed", "absurd"),
+    [
+        ((5, 3), Delta(5 + BELIEVED_NS + 1, 0)),
+        ((5, 3), Delta(2**63 - 1, 0, snapshot=True)),
+        ((5, 3), Delta(5, 4 + BELIEVED_REVISIONS, snapshot=True)),
+        ((5, 3), Delta(6, 2**63 - 1)),
+        ((-1, -1), Delta(6, 2**63 - 1, snapshot=True)),
+    ],
+)
+def test_what_a_stranger_numbers_in_the_far_future_locks_no_writer_out(followed, absurd):
+    follower = Follower(*followed)
+    with pytest.raises(InputRefused, match="not believed"):
+        follower.take(absurd)
+    assert (follower.epoch, follower.revision, follower.needs_snapshot) == (*followed, False)
+    if followed[0] > 0:
+        assert applied(follower, Delta(5, 4)) == [(5, 4)]
+
+
+def test_a_writer_that_comes_back_after_years_is_believed():
+    follower = Follower(5, 3)
+    assert applied(follower, Delta(5 + BELIEVED_NS, 9, snapshot=True)) == [(5 + BELIEVED_NS, 9)]
+
+
+def test_poses_numbered_far_above_those_before_lock_no_writer_out():
+    def update(revision):
+        return PoseUpdate(
+            robot="r",
+            epoch=1,
+            revision=revision,
+            stamp_ns=1,
+            frame_ids=np.array([0]),
+            world_from_camera=np.eye(4)[None],
+        )
+
+    known = PoseCorrections()
+    assert known.take(update(10**18)) is not None  # whoever numbers by the time may
+    with pytest.raises(InputRefused, match="lies far above"):
+        known.take(update(2**63 - 1))
+    assert known.take(update(10**18 + 10**9)) is not None

@@ -6,7 +6,7 @@ import tokenize
 import cv2
 import numpy as np
 
-from prior_sg.services.ingest.core.headers import ImageError, image_size, is_sized, trimmed
+from prior_sg.services.headers import ImageError, image_size, is_sized, trimmed
 
 NPY_MAGIC, EXR_MAGIC = b"\x93NUMPY", b"\x76\x2f\x31\x01"
 BITS = {"uint8": 8, "int8": 8, "bool": 8}

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from prior_sg.schemas.frames import Intrinsics
+from prior_sg.services.headers import ImageError
 from prior_sg.services.ingest.core.frames import BadFrame, Closure, Correction, RawFrame, Unused
-from prior_sg.services.ingest.core.headers import ImageError
 from prior_sg.services.ingest.core.pixels import eight_bit, measured, stored
 from prior_sg.services.ingest.core.poses import Convention
 from prior_sg.services.ingest.sources.tables import SourceError, read_json

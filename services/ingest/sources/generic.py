@@ -23,6 +23,7 @@ from pathlib import Path
 import numpy as np
 
 from prior_sg.schemas.frames import Intrinsics
+from prior_sg.services.headers import ImageError
 from prior_sg.services.ingest.core.detection import (
     CHOICES,
     LEAST_SHARE,
@@ -35,7 +36,6 @@ from prior_sg.services.ingest.core.detection import (
     plausible_units,
     up_of,
 )
-from prior_sg.services.ingest.core.headers import ImageError
 from prior_sg.services.ingest.core.options import ReadOptions
 from prior_sg.services.ingest.core.pixels import NPY_MAGIC, stored
 from prior_sg.services.ingest.core.poses import Convention, PoseError, matrix_of, rigid

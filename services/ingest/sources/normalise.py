@@ -10,9 +10,9 @@ import msgspec
 import numpy as np
 
 from prior_sg.schemas.frames import Intrinsics
+from prior_sg.services.headers import JPEG_MAGIC, ImageError, is_sized, trimmed
 from prior_sg.services.ingest.core.detection import likely_unit_m
 from prior_sg.services.ingest.core.frames import BadFrame, RawFrame
-from prior_sg.services.ingest.core.headers import JPEG_MAGIC, ImageError, is_sized, trimmed
 from prior_sg.services.ingest.core.options import ORIGIN_AUTO, ReadOptions, offset_of
 from prior_sg.services.ingest.core.pixels import encoded, measured, millimetres, stored
 from prior_sg.services.ingest.core.poses import EXACT, PoseError, rigid, stretch

@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from prior_sg.services.ingest.core.headers import ImageError
+from prior_sg.services.headers import ImageError
 from prior_sg.services.ingest.core.pixels import array_of
 from prior_sg.services.ingest.core.poses import Convention
 from prior_sg.services.ingest.sources import colmap_binary

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from prior_sg.schemas.frames import Intrinsics
-from prior_sg.services.ingest.core.headers import ImageError, image_size
+from prior_sg.services.headers import ImageError, image_size
 from prior_sg.services.ingest.core.options import ReadOptions
 from prior_sg.services.ingest.core.poses import Convention
 from prior_sg.services.ingest.sources.base import (

@@ -99,6 +99,9 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
     map_window_max_radius_m: float = 20.0  # blocks farther from the camera are compressed; an update reads up to 19 m
     map_mb: float = 512.0  # all voxels, open and compressed; beyond it the oldest are dropped and their places freeze
     archive_mb: float = 256.0  # compressed depth images kept for pose updates, oldest dropped first
+    # Keyframes heard without an answer from ingest's archive before the map is told as it is; its publisher's cache
+    # brings 32 at once, behind which the answer waits.
+    archive_patience: int = 64
 
     # Distances and Voronoi diagram.
     max_distance_m: float = 3.0  # distances end here: half the height of the highest halls (Clio 3.0, habitat 4.5)

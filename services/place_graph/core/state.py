@@ -33,6 +33,8 @@ class State:
     corrections: PoseCorrections = field(default_factory=PoseCorrections)
     refused: dict[int, str] = field(default_factory=dict)  # why keyframes could not be used, by frame id
     joined_frame_id: int = 0  # first keyframe heard live; earlier ones come from the archive
+    behind: bool = False  # earlier keyframes are still to come from the archive: readers keep what they have
+    unanswered: int = 0  # keyframes heard live since the archive answered last, while behind
     revision: int = -1
     stamp_ns: int = 0
     frame_id: int = -1

@@ -18,20 +18,32 @@ import msgspec
 import psutil
 
 from prior_sg.schemas.codec import DecodeError, Message, decode, encode, versions
+from prior_sg.schemas.priors import Task, TaskInForce
 from prior_sg.schemas.status import Consumed, JobDone, ServiceStatus, Started, StatusRequest, Tick, TopicCount
-from prior_sg.schemas.topics import JOURNAL, Query, Topic, alive_key, fault_of_job, status_key, worker_keys
-from prior_sg.services.refusals import InputRefused
+from prior_sg.schemas.topics import (
+    DELTAS,
+    JOURNAL,
+    Query,
+    Topic,
+    alive_key,
+    fault_of_job,
+    status_key,
+    topic_of,
+    worker_keys,
+)
+from prior_sg.services.refusals import InputRefused, NotYet, fault_of_stamp
 from prior_sg.services.runtime.bus import Bus, Request, Sample
 from prior_sg.services.runtime.host.asks import Asks, Reply
 from prior_sg.services.runtime.host.door import Door
 from prior_sg.services.runtime.host.flow import Progress
 from prior_sg.services.runtime.host.inbox import Inbox
+from prior_sg.services.runtime.host.lease import Fence, Lease
 from prior_sg.services.runtime.host.outbox import Outbox
 from prior_sg.services.runtime.host.port import Fed, Port
 from prior_sg.services.runtime.host.timing import Timing
 from prior_sg.services.runtime.jobs.board import Ended
 from prior_sg.services.runtime.jobs.dispatcher import CREDITS
-from prior_sg.services.runtime.jobs.pool import JobPool
+from prior_sg.services.runtime.jobs.pool import JobPool, done
 from prior_sg.services.runtime.service import Ask, Identity, Service
 
 log = logging.getLogger(__name__)
@@ -54,12 +66,24 @@ class Work:
 
 
 class Host:
-    """One running service. `await run()` ends when `stop` is called or the service fails (then it raises)."""
+    """One running service. `await run()` ends when `stop` is called or the service fails (then it raises), also when
+    it loses its `lease`. What comes from writers that are not in charge stays outside the `fence`.
+    """
 
-    def __init__(self, service: Service, bus: Bus, cfg: Any, identity: Identity) -> None:
+    def __init__(
+        self,
+        service: Service,
+        bus: Bus,
+        cfg: Any,
+        identity: Identity,
+        *,
+        lease: Lease | None = None,
+        fence: Fence | None = None,
+    ) -> None:
         self.service, self.bus, self.cfg, self.identity = service, bus, cfg, identity
         self.inbox = Inbox(wake=self._wake)
         self._door = Door(self.inbox)
+        self._lease, self._fence = lease, fence
         self.stopping = asyncio.Event()
         self._loop = asyncio.get_running_loop()
         self._waiting = asyncio.Event()
@@ -83,6 +107,8 @@ class Host:
             tasks.append(asyncio.create_task(self._tick(self.service.tick_s)))
         if self.service.drive is not None:
             tasks.append(asyncio.create_task(self._drive()))
+        if self._lease is not None:
+            tasks.append(asyncio.create_task(self._lease.keep()))
         stop = asyncio.create_task(self.stopping.wait())
         try:
             pending = {*tasks, self._asks.fault, stop}
@@ -186,7 +212,9 @@ class Host:
             sample.payload,
             name=topic.name,
             key=key,
-            fault_of=partial(topic.fault_of, key),
+            fault_of=lambda message: (
+                topic.fault_of(key, message) or self._fault_of_writer(message) or _fault_of_clock(message)
+            ),
             writer=sample.writer,
         )
         if message is None:
@@ -207,8 +235,15 @@ class Host:
 
     def _handle_reply(self, reply: Reply) -> None:
         query = reply.ask.query
-        fault_of = partial(_fault_of_reply, reply.ask.request)
-        message = self._door.admitted(query.reply, reply.payload, name=query.name, key=query.key, fault_of=fault_of)
+        message = self._door.admitted(
+            query.reply,
+            reply.payload,
+            name=query.name,
+            key=query.key,
+            fault_of=lambda told: (
+                _fault_of_reply(reply.ask.request, told) or self._fault_of_writer(told) or _fault_of_clock(told)
+            ),
+        )
         if message is None:
             self._asks.ask_later(reply.ask)
             return
@@ -228,6 +263,9 @@ class Host:
         self.inbox.of(query.name).consumed += 1
         try:
             answer = encode(self.service.answers[query](self._state, request, self.cfg))
+        except NotYet as error:
+            question.request.refuse(f"{query.name}: {error}")
+            return
         except Exception as error:  # an answer changes no state: a question it cannot take must not end the service
             log.exception("question not answered", extra={"query": query.name})
             question.request.refuse(f"{query.name}: {error}")
@@ -245,14 +283,23 @@ class Host:
         self.inbox.of(job.name).consumed += 1
         if self.service.prepare is not None:
             self.service.prepare(self._state, [message, *self._waiting_jobs()], self.cfg)
+        before = self._outbox.written
         try:
             self._step(message)
         except Exception as error:  # jobs are independent of each other: one that cannot be done ends no worker
             log.exception("job failed", extra={"topic": job.name, "frame_id": getattr(message, "frame_id", -1)})
             work.request.refuse(f"failed: {error}")
             return
+        results = self._outbox.written - before
         self._outbox.journal(job.name, frame_id=getattr(message, "frame_id", -1))
-        work.request.reply(b"done")
+        work.request.reply(done(results if self.service.writes else 1))
+
+    def _fault_of_writer(self, message: Message) -> str:
+        """Why a delta is not let in: another than its writer is in charge."""
+        topic = topic_of(type(message))
+        if self._fence is None or topic is None or topic not in DELTAS:
+            return ""
+        return self._fence.fault_of(topic.name, message.robot, message.epoch)  # type: ignore[attr-defined]
 
     def _queue_question(self, query: Query, request: Request) -> None:
         """Questions come first: they change nothing, and whoever asks waits."""
@@ -281,7 +328,7 @@ class Host:
             self._door.refused(name, key, str(error), writer)
 
     def _step(self, message: Message) -> None:
-        started_s = time.monotonic()
+        started_s = self._timing.begins()
         for output in self.service.step(self._state, message, self.cfg):
             if isinstance(output, Ask):
                 self._ask(output)
@@ -297,6 +344,8 @@ class Host:
             group = getattr(message, "space", "")  # of a back-fill, which gives way to the stream
             self._pools[topic].submit(job_id, encode(message), group, later=bool(group))
         else:
+            if self._lease is not None and topic in DELTAS:
+                self._lease.tells(topic.name, message.revision)  # type: ignore[attr-defined]
             self._outbox.put(topic, message)
 
     def _ask(self, ask: Ask) -> None:
@@ -369,6 +418,7 @@ class Host:
             busy_share=figures.busy_share,
             step_ms_p50=figures.step_ms_p50,
             step_ms_p99=figures.step_ms_p99,
+            step_s=figures.step_s,
             resident_mb=psutil.Process().memory_info().rss / 1e6,
             waiting_for=self._asks.waiting_for,
             topics=[TopicCount(topic=name, **vars(counts)) for name, counts in sorted(self.inbox.counts.items())],
@@ -383,3 +433,9 @@ def _fault_of_reply(request: Message, reply: Message) -> str:
     """Why this is no answer to the request: it speaks of another robot."""
     asked, told = (getattr(message, "robot", None) for message in (request, reply))
     return "" if None in (asked, told) or asked == told else f"asked about {asked!r}, told about {told!r}"
+
+
+def _fault_of_clock(message: Message) -> str:
+    """Why a task cannot be as new as it says. Looked at here, where there is a clock: what is refused is no input."""
+    task = message.task if isinstance(message, TaskInForce) else message
+    return fault_of_stamp("the task", task.stamp_ns, time.time_ns()) if isinstance(task, Task) else ""

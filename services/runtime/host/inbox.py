@@ -1,7 +1,8 @@
 """Where a service's inputs wait: filled from foreign threads, emptied by one.
 
 `latest` samples replace an older one of the same key that nobody has read; `every` samples queue up. Repeats are
-dropped and gaps counted by each writer's own sequence numbers.
+dropped and gaps counted by each writer's own sequence numbers. What comes when `MOST_WAITING` wait is lost and counted;
+the revisions of deltas make good for it.
 """
 
 import threading
@@ -12,6 +13,9 @@ from itertools import count
 from typing import Any
 
 from prior_sg.services.runtime.bus import Sample
+
+MOST_WAITING = 20_000  # inputs: hours of a stream, seconds of a flood
+MOST_WRITERS = 4096  # whose newest sequence numbers are known, by key
 
 
 @dataclass
@@ -55,6 +59,9 @@ class Inbox:
                 place: Hashable = (sample.topic.name, sample.key)
                 if self._waiting.pop(place, None) is not None:
                     counts.skipped += 1
+            elif len(self._waiting) >= MOST_WAITING:
+                counts.missed += 1
+                return
             else:
                 place = next(self._ids)
             self._put(place, sample)
@@ -97,10 +104,13 @@ class Inbox:
         if not sample.writer:
             return True
         known = (sample.writer, sample.key)
-        last = self._sequences.get(known)
+        last = self._sequences.pop(known, None)
         if last is not None and sample.sequence <= last:
+            self._sequences[known] = last
             return False
         if last is not None and sample.topic.delivery != "latest":
             counts.missed += sample.sequence - last - 1
         self._sequences[known] = sample.sequence
+        if len(self._sequences) > MOST_WRITERS:
+            del self._sequences[next(iter(self._sequences))]
         return True

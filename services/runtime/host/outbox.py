@@ -19,6 +19,7 @@ class Outbox:
         self._service, self._identity, self._bus, self._progress = service, identity, bus, progress
         self._sequences: dict[str, int] = {}  # next one, by key
         self._order = 0
+        self.written = 0  # messages other than journal entries
 
     def put(self, topic: Topic, message: Message) -> None:
         """Publish one message."""
@@ -26,6 +27,7 @@ class Outbox:
         sequence = self._sequences.get(key, 0)
         self._sequences[key] = sequence + 1
         if topic is not JOURNAL:
+            self.written += 1
             self._progress.published(topic.name, sequence)
         self._bus.put(topic, key, encode(message), pack_header(self.writer, sequence, time.time_ns()))
 

@@ -16,6 +16,7 @@ class Figures(NamedTuple):
     busy_share: float
     step_ms_p50: float
     step_ms_p99: float
+    step_s: float
 
 
 class Timing:
@@ -23,11 +24,18 @@ class Timing:
 
     def __init__(self) -> None:
         self._started_s = time.monotonic()
+        self._began_s: float | None = None
         self._steps: deque[tuple[float, float]] = deque(maxlen=RECENT_STEPS)  # (end, duration), seconds
+
+    def begins(self) -> float:
+        """A step begins; its time."""
+        self._began_s = time.monotonic()
+        return self._began_s
 
     def stepped(self, started_s: float) -> None:
         """A step that began at this time has ended."""
         ended_s = time.monotonic()
+        self._began_s = None
         self._steps.append((ended_s, ended_s - started_s))
 
     def figures(self) -> Figures:
@@ -38,4 +46,6 @@ class Timing:
         uptime_s = now_s - self._started_s
         window_s = min(WINDOW_S, max(uptime_s, 1e-3))
         busy_s = sum(duration_s for end_s, duration_s in steps if end_s > now_s - window_s)
-        return Figures(uptime_s, min(1.0, busy_s / window_s), cuts[49], cuts[98])
+        began_s = self._began_s
+        step_s = now_s - began_s if began_s is not None else 0.0
+        return Figures(uptime_s, min(1.0, busy_s / window_s), cuts[49], cuts[98], step_s)

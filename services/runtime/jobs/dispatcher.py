@@ -16,6 +16,7 @@ CREDITS = 3  # the one under way, the next one, which the worker may prepare mea
 MAX_ATTEMPTS = 4
 BUSY_RETRY_S = 0.05
 QUARANTINE_S = 1.0
+NO_RESULT = "it gave no result"
 MAX_QUARANTINE_S = 30.0
 PACE_SHARE = 0.3  # of the newest job in a worker's pace
 OVERDUE_FACTOR = 3.0  # times its pace after which a worker is suspected to hang
@@ -150,7 +151,7 @@ class Dispatcher:
         if reason == "busy":
             run.job.attempts -= 1
             worker.not_before_s = now_s + BUSY_RETRY_S
-        elif reason == "timeout":
+        elif reason in ("timeout", NO_RESULT):
             worker.hangs += 1
             worker.not_before_s = now_s + min(QUARANTINE_S * 2 ** (worker.hangs - 1), MAX_QUARANTINE_S)
         elif reason == "nobody":

@@ -5,6 +5,7 @@ decides, the pool calls workers, watches them come and go, and looks again when 
 """
 
 import logging
+import re
 import threading
 from collections.abc import Callable, Hashable
 from functools import partial
@@ -12,11 +13,13 @@ from functools import partial
 from prior_sg.schemas.topics import Topic, job_key, worker_keys
 from prior_sg.services.runtime.bus import Answer, Bus
 from prior_sg.services.runtime.jobs.board import Board, Ended
-from prior_sg.services.runtime.jobs.dispatcher import Job
+from prior_sg.services.runtime.jobs.dispatcher import NO_RESULT, Job
 
 log = logging.getLogger(__name__)
 
 DEFAULT_TIMEOUT_S = 60.0
+DONE = "done"
+DONE_WITH = re.compile(rb"done (\d{1,6})")
 
 
 class JobPool:
@@ -100,12 +103,12 @@ class JobPool:
 
     def _answered(self, name: str, job: Job, answer: Answer) -> None:
         with self._lock:
-            if answer.payload is not None:
-                ended = self._board.finished(name, job.id, self._clock_s())
+            if reason := _fault_of(answer):
+                ended = self._board.failed(name, job.id, reason, self._clock_s())
             else:
-                ended = self._board.failed(name, job.id, answer.reason, self._clock_s())
-        if answer.payload is None and answer.reason != "busy":
-            log.warning("job not done", extra={"worker": name, "job": str(job.id), "reason": answer.reason})
+                ended = self._board.finished(name, job.id, self._clock_s())
+        if reason not in ("", "busy"):
+            log.warning("job not done", extra={"worker": name, "job": str(job.id), "reason": reason})
         self._tell(ended)
         self._send()
 
@@ -130,3 +133,16 @@ class JobPool:
         with self._lock:
             self._timer = None
         self._send()
+
+
+def done(results: int) -> bytes:
+    """The answer of a worker that has done a job and published so many results of it."""
+    return f"{DONE} {results}".encode()
+
+
+def _fault_of(answer: Answer) -> str:
+    """Why a job is not done; empty when it is."""
+    if answer.payload is None:
+        return answer.reason
+    told = DONE_WITH.fullmatch(answer.payload)
+    return "" if told is not None and int(told[1]) > 0 else NO_RESULT

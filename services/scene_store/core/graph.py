@@ -16,6 +16,7 @@ from prior_sg.schemas.places import PlaceDelta
 from prior_sg.schemas.priors import Task
 from prior_sg.schemas.regions import NO_REGION, Region, RegionDelta
 from prior_sg.schemas.scene import Scene, SceneRevision
+from prior_sg.services.refusals import fault_of_stamp
 
 Edge = tuple[int, int]
 _PASSWORD = re.compile(r"^postgres(?:ql)?://(?:[^/@?]*:[^/@?]+@|.*[?&](?:ssl)?password=.)")
@@ -239,6 +240,14 @@ def set_task(graph: Graph, task: Task) -> bool:
         return False
     graph.task = task
     return True
+
+
+def mend_task(graph: Graph, now_ns: int) -> Task | None:
+    """Stamp a task anew that no clock can have stamped, so that the next one is newer; None where there is none."""
+    if graph.task is None or not fault_of_stamp("the task", graph.task.stamp_ns, now_ns):
+        return None
+    graph.task = msgspec.structs.replace(graph.task, stamp_ns=now_ns)
+    return graph.task
 
 
 def scene(graph: Graph) -> Scene:

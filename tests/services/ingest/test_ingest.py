@@ -17,10 +17,10 @@ from prior_sg.schemas.frames import ArchiveRequest, Intrinsics, Keyframe, PoseUp
 from prior_sg.schemas.status import JobDone
 from prior_sg.schemas.topics import ARCHIVE, CAMERA_STATE, ENCODE, INGEST_STATE, KEYFRAME, POSE_UPDATE
 from prior_sg.services.geometry import back_project, inverse, pose_from_quaternion, project, transform
+from prior_sg.services.headers import ImageError, image_size
 from prior_sg.services.ingest.core import selection
 from prior_sg.services.ingest.core.config import Config
 from prior_sg.services.ingest.core.frames import BadFrame, Correction, EndOfSource, RawFrame
-from prior_sg.services.ingest.core.headers import ImageError, image_size
 from prior_sg.services.ingest.service import SERVICE, drive, step
 from prior_sg.services.ingest.sources import SourceError, open_source
 from prior_sg.services.ingest.sources.base import levelling

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from prior_sg.schemas.frames import Intrinsics
 from prior_sg.services.geometry import inverse
-from prior_sg.services.ingest.core.headers import ImageError
+from prior_sg.services.headers import ImageError
 from prior_sg.services.ingest.core.options import ReadOptions
 from prior_sg.services.ingest.core.pairing import associate
 from prior_sg.services.ingest.core.pixels import encoded, stored

@@ -13,8 +13,8 @@ pytest.importorskip("rosbags")
 from prior_sg.deploy.cli.main import main
 from prior_sg.schemas.frames import Intrinsics
 from prior_sg.services.geometry import inverse
+from prior_sg.services.headers import ImageError
 from prior_sg.services.ingest.core.frames import BadFrame, RawFrame
-from prior_sg.services.ingest.core.headers import ImageError
 from prior_sg.services.ingest.core.options import ReadOptions
 from prior_sg.services.ingest.core.pixels import encoded, stored
 from prior_sg.services.ingest.core.poses import PoseError

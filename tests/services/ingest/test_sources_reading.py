@@ -16,9 +16,9 @@ from prior_sg.deploy.inspecting.beside import truth_beside
 from prior_sg.deploy.inspecting.check import check
 from prior_sg.deploy.sample.packed import pack_source
 from prior_sg.schemas.frames import Intrinsics
+from prior_sg.services.headers import ImageError, image_size, trimmed
 from prior_sg.services.ingest.core.config import Config
 from prior_sg.services.ingest.core.frames import BadFrame, RawFrame
-from prior_sg.services.ingest.core.headers import ImageError, image_size, trimmed
 from prior_sg.services.ingest.core.options import ReadOptions
 from prior_sg.services.ingest.core.poses import PoseError, rigid
 from prior_sg.services.ingest.sources import SourceError, open_source

@@ -38,6 +38,7 @@ from prior_sg.services.place_graph.core.volume.grid import (
     Box,
     VoxelGrid,
 )
+from prior_sg.services.refusals import NotYet
 from prior_sg.services.runtime.config import resolve
 from prior_sg.services.runtime.runner import Runner
 from prior_sg.services.runtime.service import Identity
@@ -871,6 +872,37 @@ def test_a_process_that_joins_in_mid_stream_fetches_the_missed_keyframes_page_by
     last = frames[4].frame_id
     assert asked[0] == (0, last) and [end for _, end in asked] == [last] * len(asked) and len(asked) == 3
     assert sorted(runner.state.seen) == sorted(archive)
+
+
+def test_a_successor_tells_nothing_until_it_has_caught_up_and_then_everything():
+    archive = {frame.frame_id: frame for frame in ROOM_WALK}
+
+    def page_of(request):
+        wanted = range(request.first_frame_id, request.end_frame_id)
+        page = [archive[number] for number in sorted(archive) if number in wanted][:2]
+        return ArchiveReply(robot="r", oldest_frame_id=0, keyframes=page)
+
+    first = Runner(service.SERVICE, CFG, Identity("r", "p", 1))
+    told = read([delta for _, delta in first.feed(*ROOM_WALK[:6])])
+    runner = Runner(service.SERVICE, CFG, Identity("r", "p", 2))
+    assert runner.feed(*ROOM_WALK[4:6]) == [] and runner.asks[0].request.first_frame_id == 0
+    with pytest.raises(NotYet):
+        runner.answer(PLACE_SNAPSHOT, SnapshotRequest(robot="r"))
+    runner.answers[ARCHIVE] = page_of
+    [(topic, delta)] = runner.feed(page_of(runner.asks[0].request))
+    assert topic is PLACE_DELTA and delta.snapshot and delta.epoch == 2
+    assert sorted(delta.past_frame_ids.tolist()) == [frame.frame_id for frame in ROOM_WALK[:6]]
+    assert len(delta.place_ids) >= 0.8 * len(told.places)
+    assert len(runner.feed(*ROOM_WALK[6:7])) == 1
+
+
+def test_a_successor_waits_for_a_silent_archive_within_a_bound():
+    cfg = msgspec.structs.replace(CFG, archive_patience=3)
+    runner = Runner(service.SERVICE, cfg, Identity("r", "p", 2))
+    assert runner.feed(*ROOM_WALK[4:6]) == []
+    [(_, delta)] = runner.feed(*ROOM_WALK[6:7])
+    assert delta.snapshot and len(delta.past_frame_ids) == 3
+    assert len(runner.feed(*ROOM_WALK[7:8])) == 1
 
 
 def test_the_offset_of_the_world_travels_with_the_places():

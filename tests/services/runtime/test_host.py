@@ -14,8 +14,19 @@ from prior_sg.schemas.frames import Intrinsics, Keyframe
 from prior_sg.schemas.places import MapRequest, SnapshotRequest, VoxelMap
 from prior_sg.schemas.priors import Task, TaskInForce
 from prior_sg.schemas.status import Consumed, JobDone, Started, Tick
-from prior_sg.schemas.topics import ENCODE, JOURNAL, KEYFRAME, PLACE_SNAPSHOT, TASK, TASK_IN_FORCE, VOXEL_MAP, job_key
-from prior_sg.services.refusals import InputRefused
+from prior_sg.schemas.topics import (
+    ENCODE,
+    JOURNAL,
+    KEYFRAME,
+    PLACE_SNAPSHOT,
+    TASK,
+    TASK_IN_FORCE,
+    VOXEL_MAP,
+    alive_key,
+    job_key,
+    worker_keys,
+)
+from prior_sg.services.refusals import InputRefused, fault_of_stamp
 from prior_sg.services.runtime.bus import Hub, LocalBus, pack_header
 from prior_sg.services.runtime.client import BusClient
 from prior_sg.services.runtime.host.host import Host
@@ -313,7 +324,7 @@ def test_a_message_counts_for_the_robot_of_its_key_only(new_bus, caplog):
             bus.call(job_key(ENCODE, "w", "r"), encode(forged), 2.0, answers.append)
             bus.call(job_key(ENCODE, "w", "r"), encode(keyframe(3)), 2.0, answers.append)
             await until(lambda: reader._state == [2] and len(answers) == 3)
-            assert [answer.payload for answer in answers if answer.payload] == [b"done"] and worker._state == [3]
+            assert [answer.payload for answer in answers if answer.payload] == [b"done 1"] and worker._state == [3]
             refused = (reader, "KEYFRAME"), (answerer, "VOXEL_MAP"), (worker, "ENCODE")
             assert [host.inbox.of(name).malformed for host, name in refused] == [1, 1, 1]
             await asyncio.to_thread(bus.close)
@@ -331,6 +342,7 @@ def test_a_reader_of_another_robot_is_not_waited_for(new_bus):
     async def main():
         async with running(new_bus, (SOURCE, Config(frames=1), "s"), (WORKER, Config(), "w")) as (source, _):
             bus = await asyncio.to_thread(new_bus)
+            bus.announce(alive_key("x", "x"))
             bus.put(JOURNAL, JOURNAL.pattern("r"), encode(entry("other")), pack_header("x", 0, 0))
             await until(lambda: source.inbox.of("JOURNAL").malformed == 1)
             assert source._state["lead"] == []
@@ -401,5 +413,68 @@ def test_undeclared_outputs_are_faults_of_the_service(output):
         host = Host(service, LocalBus(Hub()), Config(), Identity("r", "x", 1))
         with pytest.raises(UndeclaredError, match="does not declare"):
             await asyncio.wait_for(host.run(), 5)
+
+    asyncio.run(main())
+
+
+def task_step(state, message, cfg):
+    if isinstance(message, Task):
+        state.append(message.stamp_ns)
+    yield from ()
+
+
+TASKED = Service("reader", "", "robot", Config, lambda cfg, me: [], task_step, reads=(TASK,))
+DAY_NS = 86_400 * 10**9
+
+
+def test_a_task_stamped_far_ahead_is_refused_in_a_sentence_and_one_by_a_clock_a_little_ahead_is_not(new_bus, caplog):
+    now_ns = time.time_ns()
+    stamps = [now_ns + 400 * DAY_NS, 2**63 - 1, now_ns + 90 * 10**9, 5]
+
+    async def main():
+        async with running(new_bus, (TASKED, Config(), "a")) as (reader,):
+            with BusClient(await asyncio.to_thread(new_bus)) as client:
+                for stamp_ns in stamps:
+                    client.publish(TASK, Task(robot="r", stamp_ns=stamp_ns, environment="home", task="tidy"))
+                await until(lambda: len(reader._state) == 2)
+            assert reader._state == stamps[2:] and reader.inbox.of("TASK").malformed == 2
+
+    asyncio.run(main())
+    whys = [record.why for record in caplog.records if hasattr(record, "why")]
+    assert any("the task is stamped 400 days ahead of the clock here: set the clock" in why for why in whys)
+
+
+@pytest.mark.parametrize(("now_ns", "refused"), [(10**18, False), (1_800_000_000 * 10**9, True)])
+def test_a_host_without_a_clock_judges_no_stamp(now_ns, refused):
+    assert bool(fault_of_stamp("it", now_ns + 10**18, now_ns)) is refused
+
+
+def result_step(state, message, cfg):
+    if isinstance(message, Keyframe):
+        state.append(message.frame_id)
+        yield KEYFRAME, message
+
+
+MAKER = Service("worker", "", "fleet", Config, lambda cfg, me: [], result_step, job=ENCODE, writes=(KEYFRAME,))
+EMPTY = Service("worker", "", "fleet", Config, lambda cfg, me: [], reader_step, job=ENCODE, writes=(KEYFRAME,))
+
+
+def test_a_worker_that_says_done_without_a_result_swallows_no_job(new_bus):
+    async def main():
+        services = [
+            (READER, Config(), "a"),
+            (EMPTY, Config(), "empty"),
+            (MAKER, Config(), "good"),
+            (SOURCE, Config(frames=8), "s"),
+        ]
+        liar = await asyncio.to_thread(new_bus)
+        run_key, live_key = worker_keys(ENCODE, "liar")
+        liar.serve(f"{run_key}/*", lambda request: request.reply(b"done"))
+        liar.announce(live_key)
+        async with running(new_bus, *services) as (_, empty, good, source):
+            await until(lambda: len(source._state["done"]) == 8)
+            assert {worker for _, worker, _ in source._state["done"]} == {"good"}
+            assert sorted(set(good._state)) == list(range(8)) and len(empty._state) < 8
+        await asyncio.to_thread(liar.close)
 
     asyncio.run(main())

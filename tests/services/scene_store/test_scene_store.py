@@ -17,8 +17,17 @@ from prior_sg.schemas.places import PlaceDelta
 from prior_sg.schemas.priors import ObjectPrior, Prior, Provenance, RegionPrior, Task, TaskRequest
 from prior_sg.schemas.regions import Region, RegionDelta, Transition
 from prior_sg.schemas.scene import Scene, SceneRequest
-from prior_sg.schemas.status import Tick
-from prior_sg.schemas.topics import OBJECT_SNAPSHOT, PLACE_SNAPSHOT, REGION_SNAPSHOT, SCENE, SCENE_REVISION
+from prior_sg.schemas.status import EpochRequest, Tick
+from prior_sg.schemas.topics import (
+    DELTAS,
+    EPOCH,
+    OBJECT_SNAPSHOT,
+    PLACE_SNAPSHOT,
+    REGION_SNAPSHOT,
+    SCENE,
+    SCENE_REVISION,
+    TASK_IN_FORCE,
+)
 from prior_sg.services.runtime.runner import Runner
 from prior_sg.services.runtime.service import Ask, Identity
 from prior_sg.services.scene_store import service
@@ -627,3 +636,25 @@ def test_a_stored_robot_whose_name_cannot_be_used_is_left_out(tmp_path, caplog):
     database.close()
     assert list(graphs) == ["good"] and graphs["good"].task.task == "'; DROP TABLE robots;--"
     assert "left out" in caplog.text
+
+
+def test_a_task_kept_from_a_clock_in_the_far_future_is_stamped_anew_so_that_the_next_one_is_newer(tmp_path):
+    now_ns = 1_800_000_000 * 10**9
+    forged = Task(robot=ROBOT, stamp_ns=2**62, environment="flat", task="old")
+    store = Store(tmp_path / "scene.sqlite")
+    store.feed(forged, Tick(stamp_ns=5))  # a clock that was never set judges none
+    assert store.runner.answer(TASK_IN_FORCE, TaskRequest(robot=ROBOT)).task == forged
+    store.feed(Tick(stamp_ns=now_ns), Task(robot=ROBOT, stamp_ns=now_ns + 1, environment="flat", task="new"))
+    assert store.runner.answer(TASK_IN_FORCE, TaskRequest(robot=ROBOT)).task.task == "new"
+    again = store.reopened()
+    again.feed(Tick(stamp_ns=now_ns), Task(robot=ROBOT, stamp_ns=now_ns + 2, environment="flat", task="newer"))
+    assert again.runner.answer(TASK_IN_FORCE, TaskRequest(robot=ROBOT)).task.task == "newer"
+
+
+def test_the_store_says_how_far_epochs_have_come():
+    store = Store()
+    store.feed(place_delta(0, epoch=4))
+    known = [store.runner.answer(EPOCH, EpochRequest(robot=ROBOT, topic=t.name, keeper="scene_store")) for t in DELTAS]
+    told = {one.topic: (one.epoch, one.revision) for one in known}
+    assert told == {"PLACE_DELTA": (4, 0), "REGION_DELTA": (-1, -1), "OBJECT_DELTA": (-1, -1)}
+    assert store.runner.answer(EPOCH, EpochRequest(robot="new", topic="PLACE_DELTA", keeper="scene_store")).epoch == -1

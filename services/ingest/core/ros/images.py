@@ -6,7 +6,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from prior_sg.services.ingest.core.headers import ImageError, is_sized, trimmed
+from prior_sg.services.headers import ImageError, is_sized, trimmed
 from prior_sg.services.ingest.core.pixels import encoded, stored
 
 COLOR, GREY, DEPTH = "colour", "grey", "depth"  # what an image shows

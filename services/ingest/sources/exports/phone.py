@@ -5,7 +5,7 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 
-from prior_sg.services.ingest.core.headers import ImageError
+from prior_sg.services.headers import ImageError
 from prior_sg.services.ingest.core.pixels import encoded, stored
 from prior_sg.services.ingest.sources.base import FrameError, Images
 

@@ -22,6 +22,14 @@ def is_sized(data: bytes) -> bool:
     return data.startswith((PNG_MAGIC, JPEG_MAGIC))
 
 
+def told_size(data: bytes) -> tuple[int, int]:
+    """Width and height in pixels as the header of a PNG or JPEG file says, whole or not. Raises ImageError."""
+    if not is_sized(data):
+        raise ImageError("it is neither a PNG nor a JPEG file")
+    width_px, height_px, _ = _png_size(data) if data.startswith(PNG_MAGIC) else _jpeg_size(data)
+    return width_px, height_px
+
+
 def image_size(data: bytes) -> tuple[int, int, int]:
     """Width and height in pixels and bits per channel of a whole PNG or JPEG file. Raises ImageError."""
     image_end(data)

@@ -1,0 +1,220 @@
+"""One writer for each robot and service: who is in charge holds a token that names its epoch.
+
+The token is Zenoh's liveliness: it goes when its holder ends, dies or cannot be reached. An epoch is drawn above every
+one seen: in tokens, and by the keepers, the services that follow the writer. Where two are in charge, after a link was
+cut or when both began at once, the higher epoch wins and the other stops itself. One that starts while another is in
+charge waits for its end.
+"""
+
+import asyncio
+import logging
+import re
+import time
+from collections.abc import Callable, Iterable, Sequence
+from typing import NamedTuple
+
+from prior_sg.schemas.codec import LAST_NUMBER, DecodeError, decode, encode
+from prior_sg.schemas.status import EpochKnown, EpochRequest
+from prior_sg.schemas.topics import EPOCH, WAITING, Topic, lease_key
+from prior_sg.services.deltas import next_epoch
+from prior_sg.services.errors import PriorSgError
+from prior_sg.services.runtime.bus import Answer, Bus
+
+log = logging.getLogger(__name__)
+
+GRACE_S = 1.5  # a router that was started again hears within a second from everybody who lost it
+CHECK_S = 5.0
+ANSWER_S = 2.0
+HISTORY_S = 0.3  # in which a watch hears of who is there
+
+
+class SupersededError(PriorSgError):
+    """This process is not the one that writes: it has stopped itself, and says why."""
+
+
+class Holder(NamedTuple):
+    """Who is in charge; of several, the greatest."""
+
+    epoch: int
+    instance: str
+
+
+class Standing(NamedTuple):
+    """What one token says."""
+
+    robot: str
+    service: str
+    holder: Holder | None  # None = waits
+    instance: str
+
+
+def standing(key: str) -> Standing | None:
+    """What a token of a lease says; None where it is none."""
+    parts = key.split("/")
+    if len(parts) != 6:
+        return None
+    _, robot, _, service, number, instance = parts
+    if number == WAITING:
+        return Standing(robot, service, None, instance)
+    if not re.fullmatch(r"[1-9]\d{0,18}", number) or int(number) > LAST_NUMBER:
+        return None
+    return Standing(robot, service, Holder(int(number), instance), instance)
+
+
+class Lease:
+    """The right of one process to write for a robot. `await take()`, then `await keep()`, which ends by
+    SupersededError.
+    """
+
+    def __init__(
+        self,
+        bus: Bus,
+        robot: str,
+        service: str,
+        instance: str,
+        *,
+        topics: Sequence[Topic] = (),
+        keepers: Sequence[str] = (),
+    ) -> None:
+        self._bus, self._robot, self._service, self._instance = bus, robot, service, instance
+        self._asked = [(topic.name, keeper) for topic in topics for keeper in keepers]
+        self._pattern = lease_key(robot, service, "*", "*")
+        self._loop = asyncio.get_running_loop()
+        self._changed = asyncio.Event()
+        self._revisions: dict[str, int] = {}  # told last, by topic
+        self._seen: frozenset[str] = frozenset()
+        self.holder = Holder(-1, instance)
+
+    async def take(self) -> int:
+        """Wait until nobody else is in charge, then be it; returns the epoch."""
+        others = await self._others()  # first: beside a watch, Zenoh answers from what that has heard so far
+        await asyncio.to_thread(self._bus.watch, self._pattern, self._saw)
+        await asyncio.sleep(HISTORY_S if others else 0.0)
+        await self._wait_for_others()
+        while True:
+            others = await self._others()
+            known = await self._known()
+            followed = max((epoch for epoch, _ in known.values()), default=-1)
+            epoch = next_epoch(time.time_ns(), max([followed, *(other.epoch for other in others)]))
+            self.holder = Holder(epoch, self._instance)
+            withdraw = await asyncio.to_thread(self._announce, str(epoch))
+            others = await self._others()
+            if max([self.holder, *others]) == self.holder:
+                return epoch
+            withdraw()
+            await self._wait_for_others()
+
+    async def keep(self) -> None:
+        """Until another is in charge. Raises SupersededError."""
+        while True:
+            self._changed.clear()
+            await self._check_others()
+            if ahead := [topic for topic, told in (await self._known()).items() if told > self._told(topic)]:
+                await asyncio.sleep(GRACE_S)  # after a pause or a cut, who is in charge is heard a moment later
+                await self._check_others()
+                raise SupersededError(
+                    f"readers of {', '.join(ahead)} follow what {self._what} did not write, and no other is in charge: "
+                    f"this process (epoch {self.holder.epoch}) starts again above it"
+                )
+            try:
+                await asyncio.wait_for(self._changed.wait(), CHECK_S)
+            except TimeoutError:
+                continue
+
+    async def _check_others(self) -> None:
+        if (other := max([self.holder, *await self._others()])) != self.holder:
+            raise SupersededError(
+                f"{other.instance} is in charge of {self._what} since epoch {other.epoch}, after this process (epoch "
+                f"{self.holder.epoch}): this one stops; end the other if it is not meant to write"
+            )
+
+    @property
+    def _what(self) -> str:
+        return f"{self._service} of {self._robot}"
+
+    def _announce(self, epoch: str) -> Callable[[], None]:
+        return self._bus.announce(lease_key(self._robot, self._service, epoch, self._instance))
+
+    async def _wait_for_others(self) -> None:
+        if not (others := await self._others()):
+            return
+        log.warning(
+            f"{max(others).instance} is in charge of {self._what}: waiting for its end, then this one takes over"
+        )
+        withdraw = await asyncio.to_thread(self._announce, WAITING)
+        while True:
+            self._changed.clear()
+            if not await self._others():
+                await asyncio.sleep(GRACE_S)
+                if not await self._others() and self._bus.connected():
+                    break
+            else:
+                await self._changed.wait()
+        withdraw()
+        log.warning(f"nobody is in charge of {self._what} any more: this process takes over")
+
+    async def _others(self) -> list[Holder]:
+        """The others in charge now."""
+        keys = self._seen | await asyncio.to_thread(self._bus.announced, self._pattern, ANSWER_S)
+        told = [one.holder for key in keys if (one := standing(key)) is not None]
+        return [holder for holder in told if holder is not None and holder != self.holder]
+
+    def tells(self, topic: str, revision: int) -> None:
+        """This process is about to tell a revision."""
+        self._revisions[topic] = revision
+
+    def _told(self, topic: str) -> tuple[int, int]:
+        return self.holder.epoch, self._revisions.get(topic, -1)
+
+    async def _known(self) -> dict[str, tuple[int, int]]:
+        """The highest epoch and revision that a keeper follows, by topic; those before any left out."""
+        known: dict[str, tuple[int, int]] = {}
+        for told in await asyncio.gather(*(self._ask(*asked) for asked in self._asked)):
+            if told is not None:
+                known[told.topic] = max(known.get(told.topic, (-1, -1)), (min(told.epoch, LAST_NUMBER), told.revision))
+        return known
+
+    async def _ask(self, topic: str, keeper: str) -> EpochKnown | None:
+        request = EpochRequest(robot=self._robot, topic=topic, keeper=keeper)
+        answered: asyncio.Future[Answer] = self._loop.create_future()
+
+        def receive(answer: Answer) -> None:
+            self._loop.call_soon_threadsafe(answered.set_result, answer)
+
+        await asyncio.to_thread(self._bus.call, EPOCH.key_of(request), encode(request), ANSWER_S, receive)
+        payload = (await answered).payload
+        try:
+            return None if payload is None else decode(EpochKnown, payload)
+        except DecodeError as error:
+            log.warning("epoch not understood", extra={"keeper": keeper, "why": str(error)[:200]})
+            return None
+
+    def _saw(self, key: str, alive: bool) -> None:
+        self._seen = self._seen | {key} if alive else self._seen - {key}
+        self._loop.call_soon_threadsafe(self._changed.set)
+
+
+class Fence:
+    """Which epochs of which writers are let in: none above that of the one in charge, where somebody is. `services`
+    names the service that writes each topic."""
+
+    def __init__(self, bus: Bus, robot: str, services: dict[str, str]) -> None:
+        self._services = services
+        self._holders: dict[tuple[str, str], set[Holder]] = {}
+        for service in sorted({*services.values()}):
+            bus.watch(lease_key(robot, service, "*", "*"), self._saw)
+
+    def fault_of(self, topic: str, robot: str, epoch: int) -> str:
+        """Why a delta of this epoch is not let in, as a sentence; empty when it is."""
+        service = self._services.get(topic, "")
+        holders: Iterable[Holder] = tuple(self._holders.get((robot, service), ()))
+        top = max(holders, default=None)
+        if top is None or epoch <= top.epoch:
+            return ""
+        return f"it is of epoch {epoch}, and {top.instance} is in charge of {service} of {robot} with epoch {top.epoch}"
+
+    def _saw(self, key: str, alive: bool) -> None:
+        one = standing(key)
+        if one is not None and one.holder is not None:
+            known = self._holders.get((one.robot, one.service), set())
+            self._holders[one.robot, one.service] = known | {one.holder} if alive else known - {one.holder}

@@ -1,0 +1,100 @@
+"""A process that exists and is not heard is named, with what mends it."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from prior_sg.deploy.inspecting.health import Found, look
+from prior_sg.deploy.running import roll as rolls
+from prior_sg.deploy.running.roll import Roll
+from prior_sg.deploy.running.supervisor import Child
+from prior_sg.schemas.status import ServiceStatus
+from prior_sg.schemas.topics import WAITING, alive_key, lease_key
+from prior_sg.services.runtime.client import BusClient
+from prior_sg.services.runtime.host.lease import standing
+from prior_sg.services.runtime.zenoh_bus import ZenohBus
+
+MUTE = """
+import sys, time
+from prior_sg.services.runtime.zenoh_bus import ZenohBus
+bus = ZenohBus(sys.argv[1])
+bus.announce(sys.argv[2])
+time.sleep(60)
+"""
+
+
+@pytest.fixture
+def child(endpoint, tmp_path, monkeypatch):
+    monkeypatch.setattr(rolls, "HUNG_AFTER_S", 0.3)
+    child = Child("maker", "maker-1", [], tmp_path / "log", 1, unique="maker-1-abc")
+    child.process = subprocess.Popen([sys.executable, "-c", MUTE, endpoint, alive_key("maker", "maker-1-abc")])
+    yield child
+    child.kill()
+    child.process.wait()
+
+
+def until(condition, timeout_s=10.0):
+    end_s = time.monotonic() + timeout_s
+    while not (found := condition()):
+        assert time.monotonic() < end_s, "did not happen"
+        time.sleep(0.05)
+    return found
+
+
+def errors(client):
+    return [entry["error"] for entry in look(client).silent]
+
+
+def test_a_stopped_process_is_told_by_who_started_it_and_by_health_and_so_is_its_return(endpoint, child):
+    with BusClient(ZenohBus(endpoint)) as starter, BusClient(ZenohBus(endpoint)) as anybody:
+        roll = Roll(starter.bus)
+        until(lambda: roll.check([child]) == ([], []) and anybody.on_the_roll())
+        os.kill(child.pid, signal.SIGSTOP)
+        events, hung = until(lambda: (found := roll.check([child]))[0] and found)
+        assert hung == [child]
+        assert events[0].startswith(f"maker-1 (pid {child.pid}) hangs") and f"kill -CONT {child.pid}" in events[0]
+        assert roll.check([child]) == ([], [child])  # told once
+        assert f"maker-1-abc (pid {child.pid}) exists on its host and is not heard" in str(errors(anybody))
+        os.kill(child.pid, signal.SIGCONT)
+        assert until(lambda: roll.check([child])[0]) == ["maker-1 is heard again"]
+        child.kill()
+        until(lambda: child.process.poll() is not None)
+        assert roll.check([child]) == ([], []) and until(lambda: not anybody.on_the_roll())
+
+
+def status(**changes):
+    fields = {"service": "maker", "instance": "m1", "robot": "r", "pid": 7, "uptime_s": 1.0, "backlog": 3}
+    fields |= {"busy_share": 0.0, "step_ms_p50": 0.0, "step_ms_p99": 0.0, "resident_mb": 1.0, "waiting_for": []}
+    return ServiceStatus(**fields, topics=[], **changes)
+
+
+def standings(*tokens):
+    return [standing(lease_key("r", "maker", *token)) for token in tokens]
+
+
+@pytest.mark.parametrize(
+    ("found", "well", "said"),
+    [
+        (Found(), False, ""),
+        (Found([status()]), True, ""),
+        (Found([status(step_s=29.0)]), True, ""),
+        (
+            Found([status(step_s=45.0)]),
+            False,
+            "m1 (pid 7) has been at one input for 45 s, 3 wait: if that goes on, `kill",
+        ),
+        (Found([status()], [{"error": "x"}]), False, ""),
+        (Found([status()], [], standings(("5", "a"))), True, ""),
+        (Found([status()], [], standings(("5", "a"), (WAITING, "b"))), True, "b waits: a is in charge of maker of r"),
+        (Found([status()], [], standings((WAITING, "b"))), False, "nobody is in charge of maker of r: b takes over"),
+        (Found([status()], [], standings(("5", "a"), ("6", "b"))), False, "a and b are in charge of maker of r"),
+    ],
+)
+def test_what_is_wrong_is_said_and_decides_whether_all_is_well(found, well, said):
+    assert found.well is well
+    told = " ".join(remark.text for remark in found.remarks)
+    assert told.startswith(said) and bool(told) is bool(said)
