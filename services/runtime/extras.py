@@ -1,6 +1,6 @@
 """Which extra of this distribution brings a package that is not installed."""
 
-from functools import cache
+from functools import lru_cache
 from importlib import metadata
 from importlib.util import find_spec
 
@@ -50,7 +50,7 @@ class ExtraMissing(ServiceError):
     """Packages are not installed; the message names the extra that brings them."""
 
 
-@cache
+@lru_cache(1)
 def release() -> str:
     """Of this distribution, such as 1.2.0; empty where only its code is there."""
     try:

@@ -9,7 +9,6 @@ from prior_sg.deploy.limits import FILES_WANTED, fault_of_files
 from prior_sg.schemas.migrations import tells_of_versions
 from prior_sg.schemas.status import ServiceStatus
 from prior_sg.services.refusals import CLOCK_SET_NS
-from prior_sg.services.runtime.keys import Participant
 
 CLOCK_LIMIT_S = 2.0  # by which clocks may differ, beyond what asking takes
 LEAST_FREE_B = 200e6  # a database, logs and a recording of some minutes
@@ -29,6 +28,15 @@ class Finding(NamedTuple):
         """All of it, the command once."""
         said = f"{self.topic}: {self.text.rstrip('.')}"
         return said if self.mend in said else f"{said}; `{self.mend}`"
+
+
+class Keys(NamedTuple):
+    """Whose bundle is used, and whether its owner takes part, is revoked or expired."""
+
+    name: str
+    role: str
+    until: str  # a day of UTC, as 2027-01-31
+    state: str
 
 
 class Folder(NamedTuple):
@@ -56,8 +64,7 @@ class Here:
 
     told: Sequence[Finding] = ()
     clock_ns: int = CLOCK_SET_NS
-    today: str = ""  # of UTC, as 2027-01-31
-    keys: Participant | None = None
+    keys: Keys | None = None
     folders: Sequence[Folder] = ()
     caches: Sequence[Cache] = ()
     files_allowed: int = FILES_WANTED
@@ -92,14 +99,14 @@ def findings(here: Here, bus: OnTheBus) -> list[Finding]:
 
 def _of_files(here: Here) -> Iterator[Finding]:
     if fault := fault_of_files(here.files_allowed):
-        yield Finding("open files", fault, f"ulimit -Hn {FILES_WANTED}")
+        yield Finding("open files", fault, f"sudo prlimit --pid $$ --nofile={FILES_WANTED}")
 
 
 def _of_keys(here: Here) -> Iterator[Finding]:
-    if here.keys is None or (state := here.keys.state(here.today)) == "takes part":
+    if here.keys is None or here.keys.state == "takes part":
         return
-    name, role = here.keys.name, here.keys.role
-    text = f"the keys of {name} are {state}" + (f" since {here.keys.until}" if state == "expired" else "")
+    name, role, until, state = here.keys
+    text = f"the keys of {name} are {state}" + (f" since {until}" if state == "expired" else "")
     command = f"prior-sg keys add {role} {name}" if state == "revoked" else f"prior-sg keys rotate {name}"
     yield Finding("keys", f"{text}; run `{command}` where the authority is, and copy the bundle here", command)
 

@@ -10,13 +10,13 @@ from pathlib import Path
 from typing import Any
 
 from prior_sg.deploy.errors import UserError
-from prior_sg.deploy.inspecting.doctor.findings import UPDATE, Cache, Finding, Folder, Here
+from prior_sg.deploy.inspecting.doctor.findings import UPDATE, Cache, Finding, Folder, Here, Keys
 from prior_sg.deploy.limits import check_memory, files_allowed
 from prior_sg.services import folders
 from prior_sg.services.errors import PriorSgError
 from prior_sg.services.runtime import extras
 from prior_sg.services.runtime.bus import BusError
-from prior_sg.services.runtime.keys import Bundle, bundle_in_force
+from prior_sg.services.runtime.keys import bundle_in_force
 
 COMMAND = re.compile(r"`([^`]+)`")
 
@@ -33,12 +33,11 @@ class Asked:
 
 def of_this_host(asked: Asked) -> Here:
     """Changes nothing, not even by trying to write."""
-    bundle, told = _keys()
+    keys, told = _keys()
     return Here(
         told=[*_limits(), *told, *_services(asked)],
         clock_ns=time.time_ns(),
-        today=time.strftime("%Y-%m-%d", time.gmtime()),
-        keys=None if bundle is None else bundle.own,
+        keys=keys,
         folders=[_folder("results and logs", asked.out, "prior-sg up --out FOLDER")],
         caches=_caches() if _lacking("map") is None else [],
         files_allowed=files_allowed(),
@@ -52,11 +51,15 @@ def _limits() -> Iterator[Finding]:
         yield Finding("memory", str(error), "ulimit -v unlimited")
 
 
-def _keys() -> tuple[Bundle | None, list[Finding]]:
+def _keys() -> tuple[Keys | None, list[Finding]]:
     try:
-        return bundle_in_force(), []
+        bundle = bundle_in_force()
     except BusError as error:
         return None, [_said("keys", error, "prior-sg keys add")]
+    if bundle is None:
+        return None, []
+    own, today = bundle.own, time.strftime("%Y-%m-%d", time.gmtime())
+    return Keys(own.name, own.role, own.until, own.state(today)), []
 
 
 def _folder(purpose: str, path: Path, mend: str) -> Folder:

@@ -318,4 +318,4 @@ def test_too_few_files(said, monkeypatch):
         limits.resource, "getrlimit", lambda which: (20, 20) if which == resource.RLIMIT_NOFILE else (-1, -1)
     )
     one = only(said("--before"), "open files")
-    assert "only 20 files may be open at once" in one.text and one.mend == "ulimit -Hn 1024"
+    assert "only 20 files may be open at once" in one.text and one.mend == "sudo prlimit --pid $$ --nofile=1024"
