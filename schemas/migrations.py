@@ -9,6 +9,7 @@ from typing import Any
 
 from prior_sg.schemas.codec import DecodeError, M, Message, Refused, decode, decode_plain, encode_plain, schema_name
 
+NEWER, OLDER = "is newer than this program's", "is too old for this program's"
 Migration = Callable[[dict[str, Any]], dict[str, Any]]
 
 # (name of the message, version before): fields by name, arrays as arrays, to the fields of the next version.
@@ -48,6 +49,11 @@ def received(message_type: type[Message], payload: bytes, schema: str) -> bytes:
         return Refused(str(error))
 
 
+def tells_of_versions(sentence: str) -> bool:
+    """Whether a sentence holds what is said here of a message of another version."""
+    return any(words in sentence for words in (NEWER, OLDER))
+
+
 def _steps(message_type: type[Message], schema: str) -> list[Migration]:
     """The migrations from `schema` up to our version."""
     ours, (name, _, number) = schema_name(message_type), schema.rpartition("/")
@@ -55,9 +61,9 @@ def _steps(message_type: type[Message], schema: str) -> list[Migration]:
         raise SchemaError(f"{schema} stands where a {ours} belongs: its writer puts another message there")
     version = int(number)
     if version > message_type.VERSION:
-        raise SchemaError(f"{schema} is newer than this program's {ours}; update it")
+        raise SchemaError(f"{schema} {NEWER} {ours}; update it")
     steps = [MIGRATIONS.get((name, step)) for step in range(version, message_type.VERSION)]
     found = [step for step in steps if step is not None]
     if version < 1 or len(found) < len(steps):
-        raise SchemaError(f"{schema} is too old for this program's {ours}; read it with the program that wrote it")
+        raise SchemaError(f"{schema} {OLDER} {ours}; read it with the program that wrote it")
     return found

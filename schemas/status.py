@@ -123,3 +123,5 @@ class ServiceStatus(Message, frozen=True, kw_only=True):
     topics: list[TopicCount]
     losses: list[Loss] = []  # most frequent first
     step_s: float = 0.0  # since when it has been at one input
+    clock_ns: Stamp = 0  # of its host when it answered; 0 = not told
+    release: str = ""  # of the program it runs

@@ -124,8 +124,7 @@ def _list(arguments: argparse.Namespace) -> int:
     table = Table("name", "role", "key", "until", "state")
     today = time.strftime("%Y-%m-%d", time.gmtime())
     for one in everybody:
-        state = "revoked" if one.revoked else "expired" if one.until < today else "takes part"
-        table.add_row(one.name, one.role, str(one.issue), one.until, state)
+        table.add_row(one.name, one.role, str(one.issue), one.until, one.state(today))
     console.print(table)
     return 0
 

@@ -11,6 +11,7 @@ def build_parser() -> argparse.ArgumentParser:
     """All commands with their options."""
     from prior_sg.deploy.cli import (
         check,
+        doctor,
         doors,
         encoders,
         export,
@@ -42,6 +43,7 @@ def build_parser() -> argparse.ArgumentParser:
         query,
         doors,
         check,
+        doctor,
         ros,
         hydra,
         packing,
@@ -86,9 +88,9 @@ def _told(argv: list[str] | None) -> int:
 
 
 def _run(argv: list[str] | None) -> int:
-    from prior_sg.deploy.cli.shared import check_memory
     from prior_sg.deploy.edge import check_arguments, check_encoding
     from prior_sg.deploy.interrupts import interrupt
+    from prior_sg.deploy.limits import check_memory
     from prior_sg.deploy.settings import use_keys
     from prior_sg.deploy.terminal import forgive
     from prior_sg.services.runtime import extras

@@ -2,12 +2,10 @@
 
 import argparse
 import contextlib
-import resource
 import time
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING
 
-from prior_sg.deploy.errors import UserError
 from prior_sg.deploy.interrupts import insist
 from prior_sg.deploy.settings import DEFAULT_ROBOT, add_keys, connect_in_force
 from prior_sg.deploy.terminal import Terminal
@@ -18,7 +16,6 @@ if TYPE_CHECKING:
 
     from prior_sg.services.runtime.client import BusClient
 
-MEMORY_NEEDED_B = 2_000_000 * 1024  # addresses, not memory in use
 POLL_S = 0.2
 console = Terminal()
 
@@ -51,13 +48,6 @@ class Commands:
 def with_example(text: str) -> dict:
     """Arguments of a parser whose help ends in an example."""
     return {"epilog": f"example: {text}", "formatter_class": argparse.RawDescriptionHelpFormatter}
-
-
-def check_memory(extra: str) -> None:
-    """That numeric packages may take what they need: some of them end the process without a word. Raises UserError."""
-    limit_b, _ = resource.getrlimit(resource.RLIMIT_AS)
-    if extra and limit_b != resource.RLIM_INFINITY and limit_b < MEMORY_NEEDED_B:
-        raise UserError(f"`ulimit -v` is {limit_b // 1024}; raise that limit to {MEMORY_NEEDED_B // 1024}")
 
 
 def add_bus(parser: argparse.ArgumentParser, robot: bool = True) -> None:

@@ -19,6 +19,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn
 from prior_sg.deploy.edge import check_robot, check_task
 from prior_sg.deploy.errors import UserError
 from prior_sg.deploy.interrupts import came
+from prior_sg.deploy.limits import fault_of_files, files_allowed
 from prior_sg.deploy.running.inprocess import InProcess
 from prior_sg.deploy.running.recorder import Recorder, Settling
 from prior_sg.deploy.running.supervisor import Supervisor
@@ -47,7 +48,6 @@ START_TIMEOUT_S = 180.0
 PRIOR_TIMEOUT_S = 900.0  # a model may need minutes
 POLL_S = 0.1
 STALL_AFTER_S = 120.0
-FILES_WANTED, FILES_NEEDED = 1024, 48  # open at once
 
 
 class RunError(UserError):
@@ -142,11 +142,11 @@ def make_folder(path: Path) -> None:
 def require_files() -> None:
     """Raise the limit of open files as far as this user may. Raises RunError where that is too few for a router."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    wanted = FILES_WANTED if hard == resource.RLIM_INFINITY else min(FILES_WANTED, hard)
+    wanted = files_allowed()
     if soft < wanted and soft != resource.RLIM_INFINITY:
         resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
-    if wanted < FILES_NEEDED:
-        raise RunError(f"only {wanted} files may be open at once (`ulimit -n`); raise that limit to {FILES_WANTED}")
+    if fault := fault_of_files(wanted):
+        raise RunError(fault)
 
 
 @contextmanager

@@ -141,6 +141,25 @@ def cannot_listen(endpoint: str, number: int, detail: str) -> str:
     return f"no router can listen on {endpoint}: {causes.get(number, f'{detail}; {OTHER}')}"
 
 
+def unanswered(endpoint: str) -> str:
+    """One sentence for a router that is not there."""
+    return f"no router answers on {endpoint}; start one with `prior-sg up`, or name another with --connect"
+
+
+def listened_to(text: str, timeout_s: float = 1.0) -> bool:
+    """Whether anything takes connections on an endpoint of TCP or TLS; of another kind, nothing is known: True. Raises
+    BusError.
+    """
+    if _of_path(text) or KINDS[(endpoint := parse_endpoint(text)).protocol] != socket.SOCK_STREAM:
+        return True
+    endpoint.addresses()
+    try:
+        socket.create_connection((endpoint.host, endpoint.port), timeout_s).close()
+    except OSError:
+        return False
+    return True
+
+
 def number_in(said: str) -> int:
     """The system's error number that a message of Zenoh names; 0 = none."""
     found = OS_ERROR.search(said)

@@ -1,5 +1,7 @@
 """Which extra of this distribution brings a package that is not installed."""
 
+from functools import lru_cache
+from importlib import metadata
 from importlib.util import find_spec
 
 from prior_sg.services.runtime.service import ServiceError
@@ -46,6 +48,15 @@ CONTAINS = {
 
 class ExtraMissing(ServiceError):
     """Packages are not installed; the message names the extra that brings them."""
+
+
+@lru_cache(1)
+def release() -> str:
+    """Of this distribution, such as 1.2.0; empty where only its code is there."""
+    try:
+        return metadata.version("prior-sg")
+    except metadata.PackageNotFoundError:
+        return ""
 
 
 def require(extra: str, user: str) -> None:

@@ -33,6 +33,12 @@ class Participant(msgspec.Struct, frozen=True, kw_only=True):
         """Of the certificate in force; `#` is in no name of a participant."""
         return f"{self.name}#{self.issue}"
 
+    def state(self, today: str) -> Literal["takes part", "revoked", "expired"]:
+        """On a day of UTC, as 2027-01-31."""
+        if self.revoked:
+            return "revoked"
+        return "expired" if self.until < today else "takes part"
+
 
 class About(msgspec.Struct, frozen=True, kw_only=True):
     """What bundle.json says: whose bundle it is, and everybody who takes part."""

@@ -42,6 +42,7 @@ from prior_sg.services.runtime.endpoints import (
     number_in,
     on_loopback,
     secured,
+    unanswered,
     without_places,
 )
 from prior_sg.services.runtime.keys import Beyond, Bundle, bundle_in_force
@@ -207,9 +208,7 @@ class ZenohBus:
                             f"no router answers on {endpoint}, or it takes not the keys in {bundle.folder} "
                             f"(of {bundle.own.name}, until {bundle.own.until}); ask who keeps the authority"
                         ) from error
-                    raise BusError(
-                        f"no router answers on {endpoint}; start one with `prior-sg up`, or name another with --connect"
-                    ) from error
+                    raise BusError(unanswered(endpoint)) from error
                 time.sleep(0.2)
 
     def put(self, topic: Topic, key: str, payload: bytes, header: bytes) -> None:

@@ -475,6 +475,8 @@ EXAMPLES: list[Message] = [
         ],
         losses=[status.Loss(what="w", reason="r", count=1, example="e")],
         step_s=7.5,
+        clock_ns=8,
+        release="1",
     ),
 ]
 

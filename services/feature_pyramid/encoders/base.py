@@ -9,8 +9,8 @@ import numpy as np
 from prior_sg.schemas.features import TextEmbeddings
 from prior_sg.services.runtime.service import ServiceError
 
-# family (how the choice begins) -> module with `load(choice, options) -> Encoder` and `space_of(choice) -> str`,
-# imported when needed
+# family (how the choice begins) -> module with `load(choice, options) -> Encoder`, `space_of(choice) -> str` and
+# `check(choice)`, which raises EncoderUnavailable where a package or a file is not there; imported when needed
 FAMILIES = {
     "conse/": "prior_sg.services.feature_pyramid.encoders.conse",
     "open_clip/": "prior_sg.services.feature_pyramid.encoders.open_clip",
@@ -64,6 +64,11 @@ def load_encoder(choice: str, options: Options) -> Encoder:
 def space_of(choice: str) -> str:
     """The embedding space of a choice, without loading weights. Raises EncoderUnavailable."""
     return _family(choice).space_of(choice)
+
+
+def check_encoder(choice: str) -> None:
+    """That what a choice needs is there, without loading it. Raises EncoderUnavailable."""
+    _family(choice).check(choice)
 
 
 def package(module: str, name: str = "") -> Any:

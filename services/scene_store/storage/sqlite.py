@@ -117,18 +117,12 @@ class Sqlite(Storage):
                 self.connection.close()
                 raise
         except (sqlite3.Error, OSError) as error:
-            raise StoreError(f"{cfg.path} cannot be used as a scene database ({error}); {_remedy(error)}") from error
+            raise unusable(cfg.path, error) from error
 
     def _open(self, cfg: core.Config, read_only: bool) -> None:
         run = self.connection.execute
         run(f"PRAGMA busy_timeout = {cfg.busy_timeout_ms}")
-        kind, version = (run(f"PRAGMA {name}").fetchone()[0] for name in ("application_id", "user_version"))
-        empty = run("SELECT count(*) FROM sqlite_schema").fetchone()[0] == 0
-        if not empty and (kind != APPLICATION_ID or not 1 <= version <= LAYOUT_VERSION):
-            found = (
-                f"layout {version}, this program needs {LAYOUT_VERSION}" if kind == APPLICATION_ID else "other content"
-            )
-            raise sqlite3.DatabaseError(f"it holds {found}")
+        empty, version = content(self.connection)
         if read_only and version == LAYOUT_VERSION:
             run("PRAGMA query_only = ON")
             return
@@ -149,9 +143,7 @@ class Sqlite(Storage):
         if read_only:
             run("PRAGMA query_only = ON")
             return
-        fault = run("PRAGMA quick_check(1)").fetchone()[0]
-        if fault != "ok":
-            raise sqlite3.DatabaseError(f"it is damaged: {' '.join(fault.split())}")
+        check_whole(self.connection)
 
     def _convert(self) -> None:
         """A file of the last layout without history: what it holds becomes each robot's first snapshot."""
@@ -261,6 +253,28 @@ class Sqlite(Storage):
     def close(self) -> None:
         """The last connection removes the write-ahead log."""
         self.connection.close()
+
+
+def content(connection: sqlite3.Connection) -> tuple[bool, int]:
+    """Whether a file is empty, and the version of its layout. Raises sqlite3.Error for one that holds no scenes."""
+    kind, version = (connection.execute(f"PRAGMA {name}").fetchone()[0] for name in ("application_id", "user_version"))
+    empty = connection.execute("SELECT count(*) FROM sqlite_schema").fetchone()[0] == 0
+    if not empty and (kind != APPLICATION_ID or not 1 <= version <= LAYOUT_VERSION):
+        found = f"layout {version}, this program needs {LAYOUT_VERSION}" if kind == APPLICATION_ID else "other content"
+        raise sqlite3.DatabaseError(f"it holds {found}")
+    return empty, version
+
+
+def check_whole(connection: sqlite3.Connection) -> None:
+    """Raises sqlite3.Error for a damaged file."""
+    fault = connection.execute("PRAGMA quick_check(1)").fetchone()[0]
+    if fault != "ok":
+        raise sqlite3.DatabaseError(f"it is damaged: {' '.join(fault.split())}")
+
+
+def unusable(path: str, error: Exception) -> StoreError:
+    """What there is to say of a file that cannot be opened."""
+    return StoreError(f"{path} cannot be used as a scene database ({error}); {_remedy(error)}")
 
 
 def _found(kind: Indexed, row: tuple[Any, ...]) -> Found:
