@@ -6,12 +6,15 @@ from typing import Generic, Literal, Protocol, TypeVar
 
 import numpy as np
 
+from prior_sg.schemas.codec import LAST_NUMBER
 from prior_sg.schemas.frames import PoseUpdate
 from prior_sg.services.refusals import InputRefused
 
 Verdict = Literal["apply", "stale", "gap"]
 MOST_DELTAS = 4096  # that wait for a missing one
 BELIEVED_REVISIONS = 2**32  # how far one revision may lie above the one before: years of an absent reader
+LAST_BELIEVED = 3 * LAST_NUMBER // 4  # of the year 2079: no clock's epoch; one message must not use up the numbers
+BELIEVED_STEP = 2**20  # how far one epoch beyond may lie above the one before: restarts
 BELIEVED_NS = 10 * 365 * 86400 * 10**9  # how far one epoch may lie above the one before: clocks mended, long rests
 
 
@@ -66,6 +69,8 @@ class Follower(Generic[D]):
     def _believe(self, delta: D) -> None:
         if self.epoch >= 0 and delta.epoch > self.epoch + BELIEVED_NS:
             raise InputRefused(f"epoch {delta.epoch} lies years above {self.epoch}, the one followed: not believed")
+        if delta.epoch > max(LAST_BELIEVED, self.epoch + BELIEVED_STEP):
+            raise InputRefused(f"epoch {delta.epoch} leaves hardly a number above itself: not believed")
         last = self.revision if delta.epoch == self.epoch else 0
         if delta.revision > max(last, 0) + BELIEVED_REVISIONS:
             raise InputRefused(f"revision {delta.revision} lies far above {last}, the one followed: not believed")

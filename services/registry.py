@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from prior_sg.schemas.topics import DELTAS, POSE_UPDATE, PRIOR_REVISION, TASK, Topic
+from prior_sg.schemas.topics import DELTAS, OBJECT_DELTA, POSE_UPDATE, PRIOR_REVISION, TASK, Topic
 from prior_sg.services.feature_pyramid.service import SERVICE as FEATURE_PYRAMID
 from prior_sg.services.ingest.service import SERVICE as INGEST
 from prior_sg.services.place_graph.service import SERVICE as PLACE_GRAPH
@@ -23,6 +23,11 @@ LEASED: dict[str, str] = {
     if service.scope == "robot"
     for topic in service.writes
     if topic in DELTAS
+}
+
+# Whose numbers bound those of a topic: the bridge to Hydra, which has the lease of the places, writes objects as well.
+WRITERS: dict[str, tuple[str, ...]] = {name: (service,) for name, service in LEASED.items()} | {
+    OBJECT_DELTA.name: (SEGMENTER.name, PLACE_GRAPH.name)
 }
 
 BY_NAME: dict[str, Service[Any, Any]] = {service.name: service for service in SERVICES}

@@ -5,6 +5,7 @@ import queue
 import threading
 import time
 import weakref
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Self
@@ -56,6 +57,7 @@ from prior_sg.services.runtime.zenoh_bus import ZenohBus
 ROUTER_WAIT_S = 2.0
 STORE_POLL_S = 0.1
 NAMES_WAIT_S = 5.0  # for the objects' names, which follow a task's regions
+MOST_CHANGES = 4096  # that wait for a follower
 MOST_PRIORS = 16  # that a client keeps
 DELTAS = (PLACE_DELTA, REGION_DELTA, OBJECT_DELTA)
 
@@ -78,22 +80,39 @@ class Health:
 
 
 class Changes:
-    """Messages as they arrive; iteration waits for the next and ends when the client, or this, is closed."""
+    """Messages as they arrive; iteration waits for the next and ends when the client, or this, is closed. Of those that
+    nobody takes, the newest are kept; `lost` counts the others.
+    """
 
     def __init__(self) -> None:
-        self._arrived: queue.SimpleQueue[Message | None] = queue.SimpleQueue()
+        self.lost = 0
+        self._arrived: deque[Message] = deque(maxlen=MOST_CHANGES)
+        self._closed = False
+        self._changed = threading.Condition()
 
     def __iter__(self) -> Iterator[Message]:
-        while (message := self._arrived.get()) is not None:
+        while (message := self._next()) is not None:
             yield message
 
+    def _next(self) -> Message | None:
+        with self._changed:
+            self._changed.wait_for(lambda: self._arrived or self._closed)
+            return self._arrived.popleft() if self._arrived else None
+
     def put(self, message: Message) -> None:
-        """One more message, from any thread."""
-        self._arrived.put(message)
+        """One more message, from any thread; none after the end."""
+        with self._changed:
+            if self._closed:
+                return
+            self.lost += len(self._arrived) == MOST_CHANGES
+            self._arrived.append(message)
+            self._changed.notify()
 
     def close(self) -> None:
         """End the iteration after what has arrived."""
-        self._arrived.put(None)
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
 
 
 class Client(Asking):

@@ -84,16 +84,17 @@ async def stay(service: Service, cfg: Any, identity: Identity, connect: str, par
 
 async def _in_charge(service: Service, bus: ZenohBus, cfg: Any, identity: Identity) -> Host:
     """The host of a service, once it may write: what writes the same deltas has one lease, whatever it is called."""
-    from prior_sg.services.registry import LEASED, SERVICES
+    from prior_sg.services.registry import LEASED, SERVICES, WRITERS
 
     robot, instance = identity.robot, identity.instance
-    fence = await asyncio.to_thread(Fence, bus, robot, LEASED)
+    fence = await asyncio.to_thread(Fence, bus, robot, WRITERS)
     if service.scope != "robot":
         return Host(service, bus, cfg, identity, fence=fence)
     topics = [topic for topic in service.writes if topic.name in LEASED]
     keepers = [other.name for other in SERVICES if EPOCH in other.answers and other is not service]
     role = LEASED[topics[0].name] if topics else service.name
-    lease = Lease(bus, robot, role, instance, topics=topics, keepers=keepers)
+    shared = [name for name, services in WRITERS.items() if len(services) > 1]
+    lease = Lease(bus, robot, role, instance, topics=topics, keepers=keepers, shared=shared)
     return Host(service, bus, cfg, Identity(robot, instance, await lease.take()), lease=lease, fence=fence)
 
 

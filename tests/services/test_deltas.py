@@ -7,8 +7,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from prior_sg.schemas.codec import LAST_NUMBER
 from prior_sg.schemas.frames import PoseUpdate
-from prior_sg.services.deltas import BELIEVED_NS, BELIEVED_REVISIONS, Follower, PoseCorrections
+from prior_sg.services.deltas import (
+    BELIEVED_NS,
+    BELIEVED_REVISIONS,
+    LAST_BELIEVED,
+    Follower,
+    PoseCorrections,
+    next_epoch,
+)
 from prior_sg.services.refusals import InputRefused
 
 
@@ -143,3 +151,13 @@ def test_poses_numbered_far_above_those_before_lock_no_writer_out():
     with pytest.raises(InputRefused, match="lies far above"):
         known.take(update(2**63 - 1))
     assert known.take(update(10**18 + 10**9)) is not None
+
+
+def test_a_single_message_cannot_use_up_the_epochs_and_who_goes_on_from_a_high_one_is_believed():
+    fresh = Follower()
+    with pytest.raises(InputRefused, match="hardly a number above itself"):
+        fresh.take(Delta(LAST_NUMBER, 0))
+    assert fresh.epoch == -1 and fresh.take(Delta(LAST_BELIEVED, 0))
+    assert fresh.take(Delta(next_epoch(1, fresh.epoch), 0)) and fresh.epoch == LAST_BELIEVED + 1
+    with pytest.raises(InputRefused):
+        fresh.take(Delta(LAST_NUMBER, 0))

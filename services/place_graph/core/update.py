@@ -52,11 +52,12 @@ def integrate(state: State, keyframe: Keyframe, cfg: Config) -> PlaceDelta:
 def correct(state: State, update: PoseUpdate, cfg: Config) -> PlaceDelta | None:
     """Move keyframes to their corrected poses: the map becomes what it would be, had these poses been known.
 
-    None when the update has been seen before. Keyframes that are still to come are moved when they come; those that
-    the archive no longer holds stay where they are, which the delta's `event` says.
+    None when the update has been seen before, or there is no map yet: readers keep that of a predecessor. Keyframes
+    that are still to come are moved when they come; those that the archive no longer holds stay, which the
+    delta's `event` says.
     """
     poses = state.corrections.take(update)
-    if poses is None:
+    if poses is None or not state.seen:
         return None
     changed = [np.empty((0, 3), np.int64)]
     moved_ids, lost = [], 0

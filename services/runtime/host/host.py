@@ -10,7 +10,6 @@ import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from functools import partial
 from typing import Any, cast
 
@@ -18,7 +17,6 @@ import msgspec
 import psutil
 
 from prior_sg.schemas.codec import DecodeError, Message, decode, encode, versions
-from prior_sg.schemas.priors import Task, TaskInForce
 from prior_sg.schemas.status import Consumed, JobDone, ServiceStatus, Started, StatusRequest, Tick, TopicCount
 from prior_sg.schemas.topics import (
     DELTAS,
@@ -28,16 +26,17 @@ from prior_sg.schemas.topics import (
     alive_key,
     fault_of_job,
     status_key,
-    topic_of,
     worker_keys,
 )
-from prior_sg.services.refusals import InputRefused, NotYet, fault_of_stamp
+from prior_sg.services.refusals import InputRefused, NotYet
 from prior_sg.services.runtime.bus import Bus, Request, Sample
 from prior_sg.services.runtime.extras import release
 from prior_sg.services.runtime.host.asks import Asks, Reply
 from prior_sg.services.runtime.host.door import Door
+from prior_sg.services.runtime.host.faults import fault_of_clock, fault_of_reply, fault_of_writer
 from prior_sg.services.runtime.host.flow import Progress
 from prior_sg.services.runtime.host.inbox import Inbox
+from prior_sg.services.runtime.host.items import Question, Work
 from prior_sg.services.runtime.host.lease import Fence, Lease
 from prior_sg.services.runtime.host.outbox import Outbox
 from prior_sg.services.runtime.host.port import Fed, Port
@@ -48,22 +47,6 @@ from prior_sg.services.runtime.jobs.pool import JobPool, done
 from prior_sg.services.runtime.service import Ask, Identity, Service
 
 log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class Question:
-    """Somebody's question to this service."""
-
-    query: Query
-    request: Request
-
-
-@dataclass(frozen=True)
-class Work:
-    """A job to do for a dispatcher."""
-
-    request: Request
-    message: Message | None  # None = malformed
 
 
 class Host:
@@ -214,7 +197,7 @@ class Host:
             name=topic.name,
             key=key,
             fault_of=lambda message: (
-                topic.fault_of(key, message) or self._fault_of_writer(message) or _fault_of_clock(message)
+                topic.fault_of(key, message) or fault_of_writer(self._fence, message) or fault_of_clock(message)
             ),
             writer=sample.writer,
         )
@@ -242,7 +225,7 @@ class Host:
             name=query.name,
             key=query.key,
             fault_of=lambda told: (
-                _fault_of_reply(reply.ask.request, told) or self._fault_of_writer(told) or _fault_of_clock(told)
+                fault_of_reply(reply.ask.request, told) or fault_of_writer(self._fence, told) or fault_of_clock(told)
             ),
         )
         if message is None:
@@ -294,13 +277,6 @@ class Host:
         results = self._outbox.written - before
         self._outbox.journal(job.name, frame_id=getattr(message, "frame_id", -1))
         work.request.reply(done(results if self.service.writes else 1))
-
-    def _fault_of_writer(self, message: Message) -> str:
-        """Why a delta is not let in: another than its writer is in charge."""
-        topic = topic_of(type(message))
-        if self._fence is None or topic is None or topic not in DELTAS:
-            return ""
-        return self._fence.fault_of(topic.name, message.robot, message.epoch)  # type: ignore[attr-defined]
 
     def _queue_question(self, query: Query, request: Request) -> None:
         """Questions come first: they change nothing, and whoever asks waits."""
@@ -430,15 +406,3 @@ class Host:
 
     async def _on_thread(self, function: Callable[..., Any], *arguments: Any) -> Any:
         return await self._loop.run_in_executor(self._thread, function, *arguments)
-
-
-def _fault_of_reply(request: Message, reply: Message) -> str:
-    """Why this is no answer to the request: it speaks of another robot."""
-    asked, told = (getattr(message, "robot", None) for message in (request, reply))
-    return "" if None in (asked, told) or asked == told else f"asked about {asked!r}, told about {told!r}"
-
-
-def _fault_of_clock(message: Message) -> str:
-    """Why a task cannot be as new as it says. Looked at here, where there is a clock: what is refused is no input."""
-    task = message.task if isinstance(message, TaskInForce) else message
-    return fault_of_stamp("the task", task.stamp_ns, time.time_ns()) if isinstance(task, Task) else ""

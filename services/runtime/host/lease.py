@@ -10,7 +10,7 @@ import asyncio
 import logging
 import re
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from typing import NamedTuple
 
 from prior_sg.schemas.codec import LAST_NUMBER, DecodeError, decode, encode
@@ -63,7 +63,7 @@ def standing(key: str) -> Standing | None:
 
 class Lease:
     """The right of one process to write for a robot. `await take()`, then `await keep()`, which ends by
-    SupersededError.
+    SupersededError. `shared` names the topics that another writes as well, by right, and may number above.
     """
 
     def __init__(
@@ -75,9 +75,11 @@ class Lease:
         *,
         topics: Sequence[Topic] = (),
         keepers: Sequence[str] = (),
+        shared: Container[str] = (),
     ) -> None:
         self._bus, self._robot, self._service, self._instance = bus, robot, service, instance
         self._asked = [(topic.name, keeper) for topic in topics for keeper in keepers]
+        self._shared = shared
         self._pattern = lease_key(robot, service, "*", "*")
         self._loop = asyncio.get_running_loop()
         self._changed = asyncio.Event()
@@ -109,7 +111,7 @@ class Lease:
         while True:
             self._changed.clear()
             await self._check_others()
-            if ahead := [topic for topic, told in (await self._known()).items() if told > self._told(topic)]:
+            if ahead := [topic for topic, told in (await self._known()).items() if self._is_foreign(topic, told)]:
                 await asyncio.sleep(GRACE_S)  # after a pause or a cut, who is in charge is heard a moment later
                 await self._check_others()
                 raise SupersededError(
@@ -163,8 +165,9 @@ class Lease:
         """This process is about to tell a revision."""
         self._revisions[topic] = revision
 
-    def _told(self, topic: str) -> tuple[int, int]:
-        return self.holder.epoch, self._revisions.get(topic, -1)
+    def _is_foreign(self, topic: str, told: tuple[int, int]) -> bool:
+        """Whether this process cannot have told this epoch and revision, nor another by right."""
+        return topic not in self._shared and told > (self.holder.epoch, self._revisions.get(topic, -1))
 
     async def _known(self) -> dict[str, tuple[int, int]]:
         """The highest epoch and revision that a keeper follows, by topic; those before any left out."""
@@ -195,26 +198,32 @@ class Lease:
 
 
 class Fence:
-    """Which epochs of which writers are let in: none above that of the one in charge, where somebody is. `services`
-    names the service that writes each topic."""
+    """Which epochs of which writers are let in: none above that of those in charge, where somebody is. `services` names
+    the services that write each topic; where there are several, one may number its own just above the other's."""
 
-    def __init__(self, bus: Bus, robot: str, services: dict[str, str]) -> None:
+    def __init__(self, bus: Bus, robot: str, services: Mapping[str, Sequence[str]]) -> None:
         self._services = services
         self._holders: dict[tuple[str, str], set[Holder]] = {}
-        for service in sorted({*services.values()}):
+        for service in sorted({name for names in services.values() for name in names}):
             bus.watch(lease_key(robot, service, "*", "*"), self._saw)
 
     def fault_of(self, topic: str, robot: str, epoch: int) -> str:
         """Why a delta of this epoch is not let in, as a sentence; empty when it is."""
-        service = self._services.get(topic, "")
-        holders: Iterable[Holder] = tuple(self._holders.get((robot, service), ()))
-        top = max(holders, default=None)
-        if top is None or epoch <= top.epoch:
+        services = self._services.get(topic, ())
+        holders = [(one, name) for name in services for one in tuple(self._holders.get((robot, name), ()))]
+        if not holders:
+            return ""
+        top, service = max(holders)
+        if epoch <= top.epoch + len(services) - 1:
             return ""
         return f"it is of epoch {epoch}, and {top.instance} is in charge of {service} of {robot} with epoch {top.epoch}"
 
     def _saw(self, key: str, alive: bool) -> None:
         one = standing(key)
-        if one is not None and one.holder is not None:
-            known = self._holders.get((one.robot, one.service), set())
-            self._holders[one.robot, one.service] = known | {one.holder} if alive else known - {one.holder}
+        if one is None or one.holder is None:
+            return
+        role = (one.robot, one.service)
+        known = self._holders.get(role, set())
+        self._holders[role] = known | {one.holder} if alive else known - {one.holder}
+        if not self._holders[role]:
+            del self._holders[role]

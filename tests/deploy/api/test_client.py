@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import prior_sg
-from prior_sg.deploy.api.client import MOST_PRIORS, Client
+from prior_sg.deploy.api.client import MOST_CHANGES, MOST_PRIORS, Changes, Client
 from prior_sg.schemas.codec import decode, encode
 from prior_sg.schemas.priors import PriorList, PriorRequest
 from prior_sg.schemas.scene import SceneRevision
@@ -140,6 +140,14 @@ def test_changes_arrive_until_the_client_is_closed():
     follower.join(5)
     assert not follower.is_alive() and [change.revision for change in seen] == [1, 2]
     assert [type(change).__name__ for change in all_] == ["SceneRevision", "RegionDelta", "SceneRevision"]
+
+
+def test_of_changes_that_nobody_takes_the_newest_are_kept_and_the_others_counted():
+    changes = Changes()
+    for number in range(MOST_CHANGES + 3):
+        changes.put(revision(number))
+    changes.close()
+    assert [change.revision for change in changes] == list(range(3, MOST_CHANGES + 3)) and changes.lost == 3
 
 
 def test_health_names_who_is_silent():

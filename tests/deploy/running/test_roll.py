@@ -8,10 +8,12 @@ import time
 
 import pytest
 
+from prior_sg.deploy.cli.live import _tell
 from prior_sg.deploy.inspecting.health import Found, look
 from prior_sg.deploy.running import roll as rolls
+from prior_sg.deploy.running import supervisor as supervisors
 from prior_sg.deploy.running.roll import Roll
-from prior_sg.deploy.running.supervisor import Child
+from prior_sg.deploy.running.supervisor import Child, Supervisor
 from prior_sg.schemas.status import ServiceStatus
 from prior_sg.schemas.topics import WAITING, alive_key, lease_key
 from prior_sg.services.runtime.client import BusClient
@@ -98,3 +100,19 @@ def test_what_is_wrong_is_said_and_decides_whether_all_is_well(found, well, said
     assert found.well is well
     told = " ".join(remark.text for remark in found.remarks)
     assert told.startswith(said) and bool(told) is bool(said)
+
+
+def test_what_hangs_is_ended_and_started_again_only_where_that_is_wished(endpoint, child, tmp_path, monkeypatch):
+    monkeypatch.setattr(Child, "start", lambda again: setattr(again, "process", subprocess.Popen(["sleep", "60"])))
+    monkeypatch.setattr(supervisors, "RESTART_DELAY_S", 0.0)
+    supervisor = Supervisor(endpoint, "robot1", tmp_path, children=[child])
+    with BusClient(ZenohBus(endpoint)) as starter:
+        roll, pid = Roll(starter.bus), child.pid
+        until(lambda: roll.check([child]) == ([], []) and child.unique in roll._met)
+        os.kill(pid, signal.SIGSTOP)
+        until(lambda: roll.check([child])[1])
+        for _ in range(3):
+            _tell(supervisor, roll, restart_hung=False)
+        assert child.pid == pid and child.process.poll() is None
+        until(lambda: _tell(supervisor, roll, restart_hung=True) or child.pid not in (0, pid))
+        assert child.restarts == 1

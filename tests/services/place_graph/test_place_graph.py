@@ -905,6 +905,15 @@ def test_a_successor_waits_for_a_silent_archive_within_a_bound():
     assert len(runner.feed(*ROOM_WALK[7:8])) == 1
 
 
+def test_a_pose_update_from_before_the_first_keyframe_empties_no_readers_map():
+    runner = Runner(service.SERVICE, CFG, Identity("r", "p", 2))
+    poses = ROOM_WALK[0].world_from_camera[None]
+    early = PoseUpdate(robot="r", epoch=1, revision=0, stamp_ns=1, frame_ids=np.array([0]), world_from_camera=poses)
+    assert runner.feed(early) == []
+    [(_, delta)] = runner.feed(ROOM_WALK[0])
+    assert (delta.epoch, delta.revision) == (2, 0)
+
+
 def test_the_offset_of_the_world_travels_with_the_places():
     origin_m = (512_345.0, 5_403_210.0, 312.0)
     state = core.empty("r", 1, CFG)

@@ -185,7 +185,7 @@ def test_what_a_stranger_numbers_above_the_one_in_charge_is_not_let_in(new_bus, 
         async with writers(new_bus, "r") as those:
             _, epoch = await those.take("a")
             bus = await asyncio.to_thread(new_bus)
-            fence = Fence(bus, "r", {PLACE_DELTA.name: "maker"})
+            fence = Fence(bus, "r", {PLACE_DELTA.name: ["maker"]})
             host = Host(READER, bus, Nothing(), Identity("r", "reader", 1), fence=fence)
             running = asyncio.create_task(host.run())
             await asyncio.sleep(0.3)
