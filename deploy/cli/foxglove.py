@@ -1,11 +1,10 @@
-"""The command that serves a map to Foxglove."""
+"""The command that serves a map to Foxglove, on this machine."""
 
 import argparse
-import contextlib
 from pathlib import Path
 
 from prior_sg.deploy.cli.doors import port_in
-from prior_sg.deploy.cli.shared import Commands, add_bus, console
+from prior_sg.deploy.cli.shared import Commands, add_bus, console, until_interrupted
 from prior_sg.deploy.cli.view import source_of
 from prior_sg.deploy.errors import UserError
 
@@ -18,7 +17,7 @@ def add_commands(commands: Commands) -> None:
     foxglove = commands.add(
         "foxglove",
         cmd_foxglove,
-        "serve a map to Foxglove on this machine: a running system, or a run that is over; until Ctrl-C",
+        "look at a map in Foxglove: a running system, or a run that is over",
         "prior-sg foxglove --layout layout.json",
         needs="foxglove",
     )
@@ -52,9 +51,8 @@ def cmd_foxglove(arguments: argparse.Namespace) -> int:
 
     source = source_of(arguments)
     try:
-        with contextlib.suppress(KeyboardInterrupt):
+        with until_interrupted():
             serve(source, arguments.port, say, WAIT_S, insist)
     finally:
         source.close()
-    console.print("stopping")
     return 0

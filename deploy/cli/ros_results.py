@@ -1,10 +1,9 @@
 """`prior-sg ros bridge` and `ros rviz`: a scene where RViz, Nav2 and nodes of ROS 2 see it."""
 
 import argparse
-import contextlib
 from pathlib import Path
 
-from prior_sg.deploy.cli.shared import Commands, add_bus, console
+from prior_sg.deploy.cli.shared import Commands, add_bus, console, until_interrupted
 from prior_sg.deploy.cli.source_options import source_option
 from prior_sg.deploy.errors import UserError
 from prior_sg.deploy.ros.options import add_options, options_of
@@ -62,9 +61,8 @@ def cmd_bridge(arguments: argparse.Namespace) -> int:
     from prior_sg.deploy.ros.bridge import serve_ros
 
     options = options_of(arguments)
-    with contextlib.suppress(KeyboardInterrupt):
+    with until_interrupted():
         serve_ros(arguments.connect, arguments.robot, options, say_until, console.print)
-    console.print("stopping")
     return 0
 
 

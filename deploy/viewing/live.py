@@ -27,7 +27,6 @@ from prior_sg.services.runtime.client import BusClient
 MOST_REVISIONS = 1000  # that the slider goes back
 MOST_CAMERAS = 2000
 TASK_WAIT_S = 300.0  # a language model may take minutes
-ROUTER_WAIT_S = 2.0
 
 
 class Live:
