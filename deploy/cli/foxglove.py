@@ -4,9 +4,8 @@ import argparse
 from pathlib import Path
 
 from prior_sg.deploy.cli.doors import port_in
-from prior_sg.deploy.cli.shared import Commands, add_bus, console, until_interrupted
+from prior_sg.deploy.cli.shared import Commands, add_bus, console, until_interrupted, writing
 from prior_sg.deploy.cli.view import source_of
-from prior_sg.deploy.errors import UserError
 
 FOXGLOVE_PORT = 8765  # that Foxglove proposes
 WAIT_S = 0.2
@@ -40,10 +39,8 @@ def cmd_foxglove(arguments: argparse.Namespace) -> int:
     from prior_sg.deploy.viewing.foxglove.server import serve
 
     if arguments.layout is not None:
-        try:
+        with writing(arguments.layout):
             save_layout(arguments.layout)
-        except OSError as error:
-            raise UserError(f"cannot write {arguments.layout} ({error.strerror}); name another file") from error
         console.print(f"layout: {arguments.layout} (in Foxglove: Layouts, Import from file)")
 
     def say(address: str) -> None:

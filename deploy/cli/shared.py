@@ -4,8 +4,10 @@ import argparse
 import contextlib
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import TYPE_CHECKING
 
+from prior_sg.deploy.errors import UserError
 from prior_sg.deploy.interrupts import insist
 from prior_sg.deploy.settings import DEFAULT_ROBOT, ROUTER_WAIT_S, add_keys, connect_in_force
 from prior_sg.deploy.terminal import Terminal
@@ -80,6 +82,15 @@ def open_client(connect: str) -> "BusClient":
     from prior_sg.services.runtime.zenoh_bus import ZenohBus
 
     return BusClient(ZenohBus(connect, ROUTER_WAIT_S))
+
+
+@contextlib.contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """A file is written within. Raises UserError where it cannot be."""
+    try:
+        yield
+    except OSError as error:
+        raise UserError(f"cannot write {path} ({error.strerror or error}); name another file") from error
 
 
 @contextlib.contextmanager
