@@ -25,7 +25,7 @@ def add_commands(commands: Commands) -> None:
     topics.add_argument(
         "source", help="a rosbag2 folder, a file ending in .mcap, .db3 or .bag, or ros2:/ for a robot (docs/sources.md)"
     )
-    topics.add_argument("--domain", type=int, default=0, help="ROS_DOMAIN_ID of a robot (default: %(default)s)")
+    topics.add_argument("--domain", default="", help="domain of a robot; default: ROS_DOMAIN_ID, else 0")
     topics.add_argument("--seconds", type=float, default=3.0, help="to listen to a robot (default: %(default)s)")
     topics.add_argument("--json", action="store_true", help="print JSON")
     add_results(actions)
@@ -61,11 +61,13 @@ def _recorded(path: Path) -> "list[Topic]":
 
 
 def _heard(arguments: argparse.Namespace) -> "list[Topic]":
-    """Topics of a running robot, of the types that can serve. Raises SourceError."""
+    """Topics of a running robot, of the types that can serve. Raises UserError and SourceError."""
+    from prior_sg.deploy.ros.options import domain_of
     from prior_sg.services.ingest.sources.ros.live import heard
 
+    domain = domain_of(arguments.domain)
     with console.status(f"listening to {arguments.source}"):
-        return heard(arguments.source, arguments.domain, arguments.seconds)
+        return heard(arguments.source, domain, arguments.seconds)
 
 
 def _table(topics: "list[Topic]") -> Table:

@@ -1,6 +1,7 @@
 """Options of every command that reads a source: one table, each option one setting of ingest."""
 
 import argparse
+import os
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -84,7 +85,7 @@ OPTIONS = (
     Option(
         "--sync-tolerance", "sync_tolerance_s", "SECONDS", "most between stamps of one frame's colour, depth and pose"
     ),
-    Option("--domain", "ros_domain", "ID", "ROS_DOMAIN_ID of a live robot (default: 0)"),
+    Option("--domain", "ros_domain", "ID", "domain of a live robot; default: ROS_DOMAIN_ID, else 0"),
     Option("--end-after", "end_after_s", "SECONDS", "without a frame, a live source has ended (default: 30; 0: never)"),
     Option("--clock", "clock", "CLOCK", "stamps of a ROS recording: of its", choices=("header", "received")),
 )
@@ -113,7 +114,17 @@ def source_option(arguments: argparse.Namespace, flag: str) -> str | None:
 def source_settings(arguments: argparse.Namespace) -> list[str]:
     """Settings of ingest for the options that were given; none for a command that has no such options."""
     given = ((option, getattr(arguments, option.dest, None)) for option in OPTIONS)
-    return [f"ingest.{option.setting}={_value(option, text)}" for option, text in given if text is not None]
+    told = [f"ingest.{option.setting}={_value(option, text)}" for option, text in given if text is not None]
+    return [*_surroundings(arguments), *told]
+
+
+def _surroundings(arguments: argparse.Namespace) -> list[str]:
+    """What ROS's own environment says of a running robot. Raises UserError."""
+    from prior_sg.deploy.ros.options import DOMAIN_VARIABLE, domain_of
+    from prior_sg.services.ingest.core.options import is_live
+
+    live = is_live(str(getattr(arguments, "source", None) or ""))
+    return [f"ingest.ros_domain={domain_of('')}"] if live and os.environ.get(DOMAIN_VARIABLE) else []
 
 
 def read_options(arguments: argparse.Namespace) -> "Config":

@@ -79,7 +79,7 @@ def options_of(arguments: argparse.Namespace) -> Options:
     except ValueError as error:
         raise UserError(f"--mask: {error}") from error
     look = Look(arguments.node, arguments.frame, arguments.cell, (low_m, high_m), rules)
-    return Options(look, arguments.ros_router, _domain(arguments.domain), arguments.interval, arguments.take_tasks)
+    return Options(look, arguments.ros_router, domain_of(arguments.domain), arguments.interval, arguments.take_tasks)
 
 
 def check_node(name: str) -> None:
@@ -99,7 +99,8 @@ def _check(option: str, value: float, least: float, most: float, unit: str) -> N
         raise UserError(f"{option} {value:g} is not between {least:g} and {most:g} {unit}")
 
 
-def _domain(told: str) -> int:
+def domain_of(told: str) -> int:
+    """The domain of ROS that was told, else the environment's, else 0. Raises UserError."""
     name, text = ("--domain", told) if told else (DOMAIN_VARIABLE, os.environ.get(DOMAIN_VARIABLE, "") or "0")
     if not (text.isascii() and text.isdigit() and int(text) <= LARGEST_DOMAIN):
         raise UserError(f"{name} {text!r} is no domain of ROS: give a number up to {LARGEST_DOMAIN}")

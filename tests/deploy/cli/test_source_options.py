@@ -4,6 +4,7 @@ import pytest
 
 from prior_sg.deploy.cli.main import build_parser
 from prior_sg.deploy.cli.source_options import OPTIONS, read_options, source_settings
+from prior_sg.deploy.errors import UserError
 from prior_sg.services.ingest.core.options import ReadOptions
 from prior_sg.services.runtime.config import ConfigError
 
@@ -30,3 +31,18 @@ def test_an_option_that_cannot_be_meant_is_one_sentence(flag, value):
     with pytest.raises(ConfigError) as error:
         read_options(build_parser().parse_args([*RUN, flag, value]))
     assert "\n" not in str(error.value)
+
+
+def test_a_robot_is_heard_on_the_domain_of_ros_environment_unless_told(monkeypatch):
+    def domain(source, *more):
+        return read_options(build_parser().parse_args(["run", source, *RUN[2:], *more])).ros_domain
+
+    monkeypatch.setenv("ROS_DOMAIN_ID", "5")
+    assert domain("ros2:/") == 5
+    assert domain("ros2:/", "--domain", "7") == 7
+    assert domain("walk.bag") == 0
+    monkeypatch.setenv("ROS_DOMAIN_ID", "many")
+    with pytest.raises(UserError, match="ROS_DOMAIN_ID 'many' is no domain"):
+        domain("ros2:/")
+    monkeypatch.delenv("ROS_DOMAIN_ID")
+    assert domain("ros2:/") == 0
