@@ -239,11 +239,14 @@ def _with_focal_length(camera: dict[str, Any]) -> dict[str, Any]:
 
 def _colmap(path: Path) -> PoseList:
     """Poses by the names of images, and the camera of most of them."""
+    cameras_file = path.with_stem(Path(COLMAP_CAMERAS).stem)
     if path.suffix == ".bin":
-        cameras, images = colmap_binary.cameras_of(path.with_stem("cameras")), colmap_binary.images_of(path)
+        cameras, images = colmap_binary.cameras_of(cameras_file), colmap_binary.images_of(path)
         images = [words for words in images if words[8] in cameras]
     else:
         cameras, images = _colmap_words(path)
+    if not images:
+        raise SourceError(f"{path} has no image with a pose and a camera of {cameras_file.name}")
     try:
         rows = [np.array([*words[5:8], *words[1:5]], float) for words in images]
         used = [words[8] for words in images]
@@ -251,11 +254,7 @@ def _colmap(path: Path) -> PoseList:
         named = dict(zip(COLMAP_PARAMETERS[model], map(float, numbers), strict=False))
     except (KeyError, ValueError) as error:
         known = ", ".join(COLMAP_PARAMETERS)
-        raise SourceError(
-            f"{path.parent / COLMAP_CAMERAS} has a camera that is not read ({error}): {known} are"
-        ) from error
-    if not rows:
-        raise SourceError(f"{path} has no image with a pose and a camera of {COLMAP_CAMERAS}")
+        raise SourceError(f"{cameras_file} has a camera that is not read ({error}): {known} are") from error
     if "f" in named:
         named |= {"fx": named["f"], "fy": named.pop("f")}
     lens = {"model": "opencv_fisheye" if "FISHEYE" in model else "opencv"} if {"k1", "k2"} & set(named) else {}

@@ -201,6 +201,16 @@ def test_a_recording_of_record3d_is_the_walk(tmp_path, unpacks, packed):
     assert_a_phone_s_walk(source)
 
 
+@pytest.mark.parametrize("stamp", ["Infinity", '"late"'])
+def test_stamps_of_record3d_that_are_none_are_told(tmp_path, unpacks, stamp):
+    path = record3d(tmp_path / "d", packed=False)
+    said = (path / "metadata").read_text()
+    (path / "metadata").write_text(said.replace('"frameTimestamps": [100.0', f'"frameTimestamps": [{stamp}'))
+    assert stamp in (path / "metadata").read_text()
+    with pytest.raises(SourceError, match="has no metadata of Record3D"):
+        open_source(path)
+
+
 def test_without_lzfse_record3d_says_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "lzfse", None)
     monkeypatch.setattr("prior_sg.services.runtime.extras.find_spec", lambda name: None if name == "lzfse" else name)
