@@ -13,7 +13,7 @@ Rows without a number or name belong to the images in their order, so that there
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from itertools import chain
 from pathlib import Path
@@ -22,8 +22,10 @@ from typing import Any
 import numpy as np
 
 from prior_sg.services.headers import ImageError
+from prior_sg.services.ingest.core.options import ReadOptions
 from prior_sg.services.ingest.core.pixels import array_of
 from prior_sg.services.ingest.core.poses import Convention
+from prior_sg.services.ingest.core.ros.transforms import Stamped, Track
 from prior_sg.services.ingest.sources import colmap_binary
 from prior_sg.services.ingest.sources.tables import SourceError, lines_of, read_json, words_of
 
@@ -112,6 +114,24 @@ def read(path: Path) -> PoseList:
     if _redwood_lines(lines):
         return _redwood(path, lines)
     return _table(path, [words_of(line) for line in lines])
+
+
+def track_of(path: Path, stamps_ns: Sequence[int | None], rows: Iterable[np.ndarray], options: ReadOptions) -> Track:
+    """Where a body was over time, of rows of tx ty tz qx qy qz qw; those without stamp are left out.
+
+    Raises SourceError.
+    """
+    shift_ns = round((options.stamp_offset_s or 0.0) * 1e9)
+    track = Track(
+        [
+            Stamped(stamp + shift_ns, "world", "body", tuple(row[:3].tolist()), tuple(row[3:].tolist()))
+            for stamp, row in zip(stamps_ns, rows, strict=True)
+            if stamp is not None
+        ]
+    )
+    if not len(track.stamps_ns):
+        raise SourceError(f"{path} has no pose that can be used")
+    return track
 
 
 def _nearest(numbers: Sequence[float], rows: Sequence[np.ndarray], keys: Sequence[float]) -> dict[float, np.ndarray]:

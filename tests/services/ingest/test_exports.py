@@ -15,6 +15,7 @@ from prior_sg.deploy.inspecting.check import check
 from prior_sg.services.geometry import back_project, transform
 from prior_sg.services.ingest.core.config import Config
 from prior_sg.services.ingest.core.frames import BadFrame, RawFrame
+from prior_sg.services.ingest.core.options import ReadOptions
 from prior_sg.services.ingest.sources import SourceError, open_source
 from prior_sg.services.runtime.extras import ExtraMissing
 from tests.services.ingest.test_pose_lists import bare, redwood
@@ -199,6 +200,12 @@ def test_a_recording_of_record3d_is_the_walk(tmp_path, unpacks, packed):
     source = open_source(record3d(tmp_path / "walk", packed))
     assert source.layout == "record3d"
     assert_a_phone_s_walk(source)
+
+
+@pytest.mark.parametrize("name", ["stray-scanner", "rtabmap"])
+def test_a_rate_that_is_told_counts_in_place_of_an_export_s_stamps(written, name):
+    source = open_source(written(name), options=ReadOptions(rate_hz=2.0))
+    assert [frame.stamp_ns for frame in source] == [i * 500_000_000 for i in range(FRAMES)]
 
 
 @pytest.mark.parametrize("stamp", ["Infinity", '"late"'])
