@@ -412,6 +412,13 @@ def test_depth_images_go_before_clouds_unless_these_are_named(tmp_path):
     assert any("depth of /points" in note for note in source.notes)
 
 
+def test_clouds_without_stamps_say_which_option_reads_them(tmp_path, monkeypatch):
+    header = Maker.header
+    monkeypatch.setattr(Maker, "header", lambda maker, stamp_ns, frame: header(maker, 0, frame))
+    with pytest.raises(SourceError, match="headers of /points have no stamps; give --clock received"):
+        open_source(bag(tmp_path, pictures=False))
+
+
 def swapped(rows):
     """Bytes of points that end in the middle of a field."""
     return rows[["x", "y"]]

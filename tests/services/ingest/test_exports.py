@@ -5,6 +5,7 @@ import shutil
 import struct
 import sys
 import zipfile
+from unittest.mock import Mock
 
 import cv2
 import numpy as np
@@ -17,6 +18,8 @@ from prior_sg.services.ingest.core.config import Config
 from prior_sg.services.ingest.core.frames import BadFrame, RawFrame
 from prior_sg.services.ingest.core.options import ReadOptions
 from prior_sg.services.ingest.sources import SourceError, open_source
+from prior_sg.services.ingest.sources.base import FrameError
+from prior_sg.services.ingest.sources.exports.film import Film
 from prior_sg.services.runtime.extras import ExtraMissing
 from tests.services.ingest.test_pose_lists import bare, redwood
 from tests.services.ingest.test_sources import off_wall
@@ -200,6 +203,17 @@ def test_a_recording_of_record3d_is_the_walk(tmp_path, unpacks, packed):
     source = open_source(record3d(tmp_path / "walk", packed))
     assert source.layout == "record3d"
     assert_a_phone_s_walk(source)
+
+
+def test_pictures_after_a_damaged_one_are_those_that_were_asked_for(written, monkeypatch):
+    film = Film(written("stray-scanner") / "rgb.mp4")
+    expected = film.picture(3)
+    film.picture(0)
+    with monkeypatch.context() as damaged:
+        damaged.setattr(film, "_film", Mock(grab=lambda: False))
+        with pytest.raises(FrameError, match="before picture 2"):
+            film.picture(2)
+    np.testing.assert_array_equal(film.picture(3), expected)
 
 
 @pytest.mark.parametrize("name", ["stray-scanner", "rtabmap"])
