@@ -12,6 +12,7 @@ from prior_sg.services.runtime.service import Service
 
 DEFAULT_CONNECT = "tcp/127.0.0.1:7447"
 DEFAULT_ROBOT = "robot1"
+ROUTER_WAIT_S = 5.0  # before a program or a person is told that none answers: a busy machine takes its time
 DEMO_ENVIRONMENT = "residential home"
 DEMO_TASK = "real-estate listing"
 

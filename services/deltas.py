@@ -22,7 +22,15 @@ def next_epoch(now_ns: int, known: int) -> int:
     """The epoch of a writer that starts now, where `known` is the highest seen (-1 = none): the time, which no other
     draws, unless the clock is behind what was seen or too far ahead to be believed.
     """
-    return now_ns if known < 0 or known < now_ns <= known + BELIEVED_NS else known + 1
+    believed = now_ns <= LAST_BELIEVED and (known < 0 or known < now_ns <= known + BELIEVED_NS)
+    return now_ns if believed else max(known, 0) + 1
+
+
+def fault_of_epoch(epoch: int, known: int) -> str:
+    """Why no writer can have drawn an epoch where `known` is the highest seen (-1 = none); empty when one can."""
+    if epoch <= max(LAST_BELIEVED, known + BELIEVED_STEP) and epoch < LAST_NUMBER:
+        return ""
+    return f"epoch {epoch} leaves hardly a number above itself: not believed"
 
 
 class Delta(Protocol):
@@ -69,8 +77,8 @@ class Follower(Generic[D]):
     def _believe(self, delta: D) -> None:
         if self.epoch >= 0 and delta.epoch > self.epoch + BELIEVED_NS:
             raise InputRefused(f"epoch {delta.epoch} lies years above {self.epoch}, the one followed: not believed")
-        if delta.epoch > max(LAST_BELIEVED, self.epoch + BELIEVED_STEP):
-            raise InputRefused(f"epoch {delta.epoch} leaves hardly a number above itself: not believed")
+        if fault := fault_of_epoch(delta.epoch, self.epoch):
+            raise InputRefused(fault)
         last = self.revision if delta.epoch == self.epoch else 0
         if delta.revision > max(last, 0) + BELIEVED_REVISIONS:
             raise InputRefused(f"revision {delta.revision} lies far above {last}, the one followed: not believed")

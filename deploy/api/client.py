@@ -16,7 +16,7 @@ from prior_sg.deploy.api.asking import Asking
 from prior_sg.deploy.api.errors import NotInSceneError, PosesError, TaskError
 from prior_sg.deploy.api.kept import kept
 from prior_sg.deploy.api.scene import Scene
-from prior_sg.deploy.settings import DEFAULT_CONNECT, DEFAULT_ROBOT
+from prior_sg.deploy.settings import DEFAULT_CONNECT, DEFAULT_ROBOT, ROUTER_WAIT_S
 from prior_sg.schemas.codec import DecodeError, Message
 from prior_sg.schemas.features import TextEmbeddings, TextRequest
 from prior_sg.schemas.frames import PoseUpdate
@@ -54,7 +54,6 @@ from prior_sg.services.runtime.bus import Bus, BusError, Sample, message_in
 from prior_sg.services.runtime.client import BusClient
 from prior_sg.services.runtime.zenoh_bus import ZenohBus
 
-ROUTER_WAIT_S = 2.0
 STORE_POLL_S = 0.1
 NAMES_WAIT_S = 5.0  # for the objects' names, which follow a task's regions
 MOST_CHANGES = 4096  # that wait for a follower

@@ -3,8 +3,7 @@
 import errno
 import resource
 
-from prior_sg.deploy.errors import UserError
-from prior_sg.deploy.running.serve import HOPELESS
+from prior_sg.services.errors import PriorSgError
 from prior_sg.services.runtime import extras
 
 FULL = (errno.ENOSPC, errno.EDQUOT)
@@ -14,7 +13,7 @@ THREADS = "can't start new thread"  # the interpreter's words
 
 def sentence_of(error: Exception) -> str | None:
     """One sentence for a fault of the user or the system; None for one of the program."""
-    if isinstance(error, (UserError, *HOPELESS)):
+    if isinstance(error, PriorSgError):
         return str(error)
     if isinstance(error, ModuleNotFoundError):
         return extras.advice(error)

@@ -1,13 +1,11 @@
-"""The command that serves a map to Foxglove."""
+"""The command that serves a map to Foxglove, on this machine."""
 
 import argparse
-import contextlib
 from pathlib import Path
 
 from prior_sg.deploy.cli.doors import port_in
-from prior_sg.deploy.cli.shared import Commands, add_bus, console
+from prior_sg.deploy.cli.shared import Commands, add_bus, console, until_interrupted, writing
 from prior_sg.deploy.cli.view import source_of
-from prior_sg.deploy.errors import UserError
 
 FOXGLOVE_PORT = 8765  # that Foxglove proposes
 WAIT_S = 0.2
@@ -18,7 +16,7 @@ def add_commands(commands: Commands) -> None:
     foxglove = commands.add(
         "foxglove",
         cmd_foxglove,
-        "serve a map to Foxglove on this machine: a running system, or a run that is over; until Ctrl-C",
+        "look at a map in Foxglove: a running system, or a run that is over",
         "prior-sg foxglove --layout layout.json",
         needs="foxglove",
     )
@@ -41,10 +39,8 @@ def cmd_foxglove(arguments: argparse.Namespace) -> int:
     from prior_sg.deploy.viewing.foxglove.server import serve
 
     if arguments.layout is not None:
-        try:
+        with writing(arguments.layout):
             save_layout(arguments.layout)
-        except OSError as error:
-            raise UserError(f"cannot write {arguments.layout} ({error.strerror}); name another file") from error
         console.print(f"layout: {arguments.layout} (in Foxglove: Layouts, Import from file)")
 
     def say(address: str) -> None:
@@ -52,9 +48,8 @@ def cmd_foxglove(arguments: argparse.Namespace) -> int:
 
     source = source_of(arguments)
     try:
-        with contextlib.suppress(KeyboardInterrupt):
+        with until_interrupted():
             serve(source, arguments.port, say, WAIT_S, insist)
     finally:
         source.close()
-    console.print("stopping")
     return 0

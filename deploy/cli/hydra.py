@@ -2,12 +2,11 @@
 
 import argparse
 import asyncio
-import contextlib
 import logging
 import time
 import uuid
 
-from prior_sg.deploy.cli.shared import Commands, add_bus, console
+from prior_sg.deploy.cli.shared import Commands, add_bus, console, until_interrupted
 from prior_sg.deploy.errors import UserError
 
 
@@ -59,9 +58,8 @@ def cmd_hydra(arguments: argparse.Namespace) -> int:
     back = f"; names of rooms to {cfg.labels_to}" if cfg.labels_to else ""
     console.print(f"scene graphs of Hydra from {cfg.graph_from}{back}; Ctrl-C stops")
     identity = Identity(arguments.robot, f"{SERVICE.name}-{uuid.uuid4().hex[:8]}", time.time_ns())
-    with contextlib.suppress(KeyboardInterrupt):
+    with until_interrupted():
         asyncio.run(stay(SERVICE, cfg, identity, arguments.connect))
-    console.print("stopping")
     return 0
 
 

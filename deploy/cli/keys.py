@@ -5,7 +5,7 @@ import json
 import time
 from pathlib import Path
 
-from prior_sg.deploy.cli.shared import Commands, Run, add_bus, add_router, console, until_interrupted, wait
+from prior_sg.deploy.cli.shared import Commands, Run, add_bus, add_router, console, until_interrupted, wait, writing
 from prior_sg.deploy.errors import UserError
 from prior_sg.services.folders import user_settings
 
@@ -136,7 +136,8 @@ def _router(arguments: argparse.Namespace) -> int:
     beyond = beyond_this_host(arguments.listen, arguments.join)
     if arguments.write is not None:
         check_router(arguments.connect, beyond)
-        arguments.write.write_text(json.dumps(router_settings(arguments.connect, beyond), indent=1) + "\n")
+        with writing(arguments.write):
+            arguments.write.write_text(json.dumps(router_settings(arguments.connect, beyond), indent=1) + "\n")
         console.print(f"wrote {arguments.write}; start it with `zenohd -c {arguments.write}`")
         return 0
     stop = open_router(arguments.connect, beyond)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 def add_commands(commands: Commands) -> None:
     """`ros` and its actions."""
-    what = "look into a recording of ROS, or at a robot"
+    what = "look into a recording of ROS or at a robot, and tell ROS 2 of a running system"
     parser = commands.add("ros", cmd_topics, what, "prior-sg ros topics walk.bag", "ros")
     actions = Commands(parser, "action", "ACTION", "prior-sg ros ")
     listing = "list the topics of a recording, or of a robot, and what each would serve as"

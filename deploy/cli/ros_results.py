@@ -1,13 +1,13 @@
 """`prior-sg ros bridge` and `ros rviz`: a scene where RViz, Nav2 and nodes of ROS 2 see it."""
 
 import argparse
-import contextlib
 from pathlib import Path
 
-from prior_sg.deploy.cli.shared import Commands, add_bus, console
+from prior_sg.deploy.cli.shared import Commands, add_bus, console, until_interrupted, writing
 from prior_sg.deploy.cli.source_options import source_option
 from prior_sg.deploy.errors import UserError
 from prior_sg.deploy.ros.options import add_options, options_of
+from prior_sg.deploy.ros.rules import Look
 from prior_sg.services.runtime import extras
 
 
@@ -24,8 +24,8 @@ def add_results(actions: Commands) -> None:
     add_bus(bridge)
     rviz = actions.add("rviz", cmd_rviz, "write a configuration of RViz that shows what the bridge tells", "rviz")
     rviz.add_argument("--out", type=Path, default=Path("prior_sg.rviz"), help="file (default: %(default)s)")
-    rviz.add_argument("--node", default="prior_sg", help="the bridge's --node (default: %(default)s)")
-    rviz.add_argument("--frame", default="map", help="the bridge's --frame (default: %(default)s)")
+    rviz.add_argument("--node", default=Look.node, help="the bridge's --node (default: %(default)s)")
+    rviz.add_argument("--frame", default=Look.frame, help="the bridge's --frame (default: %(default)s)")
 
 
 def add_ros(up: argparse.ArgumentParser) -> None:
@@ -62,9 +62,8 @@ def cmd_bridge(arguments: argparse.Namespace) -> int:
     from prior_sg.deploy.ros.bridge import serve_ros
 
     options = options_of(arguments)
-    with contextlib.suppress(KeyboardInterrupt):
+    with until_interrupted():
         serve_ros(arguments.connect, arguments.robot, options, say_until, console.print)
-    console.print("stopping")
     return 0
 
 
@@ -72,6 +71,8 @@ def cmd_rviz(arguments: argparse.Namespace) -> int:
     """Write the configuration."""
     from prior_sg.deploy.ros.rviz import configuration
 
-    arguments.out.write_text(configuration(arguments.node, arguments.frame))
+    text = configuration(arguments.node, arguments.frame)
+    with writing(arguments.out):
+        arguments.out.write_text(text)
     console.print(f"wrote {arguments.out}; open it with `rviz2 -d {arguments.out}`")
     return 0

@@ -4,10 +4,12 @@ import argparse
 import contextlib
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import TYPE_CHECKING
 
+from prior_sg.deploy.errors import UserError
 from prior_sg.deploy.interrupts import insist
-from prior_sg.deploy.settings import DEFAULT_ROBOT, add_keys, connect_in_force
+from prior_sg.deploy.settings import DEFAULT_ROBOT, ROUTER_WAIT_S, add_keys, connect_in_force
 from prior_sg.deploy.terminal import Terminal
 from prior_sg.schemas.names import shown
 
@@ -79,16 +81,24 @@ def open_client(connect: str) -> "BusClient":
     from prior_sg.services.runtime.client import BusClient
     from prior_sg.services.runtime.zenoh_bus import ZenohBus
 
-    return BusClient(ZenohBus(connect, wait_s=2.0))
+    return BusClient(ZenohBus(connect, ROUTER_WAIT_S))
+
+
+@contextlib.contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """A file is written within. Raises UserError where it cannot be."""
+    try:
+        yield
+    except OSError as error:
+        raise UserError(f"cannot write {path} ({error.strerror or error}); name another file") from error
 
 
 @contextlib.contextmanager
 def until_interrupted() -> Iterator[None]:
-    """Ctrl-C ends what goes on within, and it is said."""
-    try:
+    """Ctrl-C ends what goes on within, be it by itself or by the exception; and that is said."""
+    with contextlib.suppress(KeyboardInterrupt):
         yield
-    except KeyboardInterrupt:
-        console.print("stopping")
+    console.print("stopping")
 
 
 def wait(meanwhile: Callable[[], object] = lambda: None) -> None:

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 
 from prior_sg.deploy.cli.shared import Commands, add_bus, console, until_interrupted, wait
 from prior_sg.deploy.errors import UserError
+from prior_sg.deploy.settings import ROUTER_WAIT_S
 
 if TYPE_CHECKING:
     from prior_sg.deploy.viewing.sources import Source
@@ -64,7 +65,7 @@ def source_of(arguments: argparse.Namespace) -> "Source":
         from prior_sg.deploy.viewing.recorded import open_recorded
 
         return open_recorded(arguments.source, arguments.robot)
-    from prior_sg.deploy.viewing.live import ROUTER_WAIT_S, Live
+    from prior_sg.deploy.viewing.live import Live
     from prior_sg.services.runtime.zenoh_bus import ZenohBus
 
     return Live(ZenohBus(arguments.connect, ROUTER_WAIT_S), arguments.robot)

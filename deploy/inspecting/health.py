@@ -22,16 +22,18 @@ class Remark(NamedTuple):
 
 @dataclass
 class Found:
-    """What there is: statuses of those that answered, why others did not, who is in charge."""
+    """What there is: statuses of those that answered, why others did not, who is in charge, or why that is unknown."""
 
     processes: list[ServiceStatus] = field(default_factory=list)
     silent: list[dict[str, str]] = field(default_factory=list)
     standings: list[Standing] = field(default_factory=list)
+    unknown: str = ""
 
     @property
     def remarks(self) -> list[Remark]:
         """Faults and what else should be known."""
-        return [*self._hanging(), *self._waiting(), *self._contested()]
+        unknown = [Remark(f"who is in charge and who ought to be there: {self.unknown}", True)] if self.unknown else []
+        return [*unknown, *self._hanging(), *self._waiting(), *self._contested()]
 
     @property
     def well(self) -> bool:
@@ -103,9 +105,13 @@ def look(client: BusClient) -> Found:
             found.processes.append(client.status(service, instance))
         except BusError as error:
             found.silent.append({"service": service, "instance": instance, "error": f"{instance}: {error}"})
-    found.standings = client.standings()
+    try:
+        found.standings, on_the_roll = client.standings(), client.on_the_roll()
+    except BusError as error:
+        found.unknown = str(error)
+        return found
     waiting = {one.instance for one in found.standings if one.holder is None}
-    for one in client.on_the_roll():
+    for one in on_the_roll:
         if one.instance not in alive and one.instance not in waiting:
             found.silent.append({"service": one.service, "instance": one.instance, "error": _unheard(one)})
     return found

@@ -3,7 +3,6 @@
 import asyncio
 import contextlib
 import logging
-import os
 import signal
 import threading
 import time
@@ -16,6 +15,7 @@ from prior_sg.deploy.ros import frames, masks, parameters
 from prior_sg.deploy.ros.options import Options
 from prior_sg.deploy.ros.parameters import Parameters, fault_of_task_text
 from prior_sg.deploy.ros.topics import SET_TASK, STRING, TASK_STATE, TF_TOPIC, Teller, latched_types
+from prior_sg.deploy.running.serve import parent_gone
 from prior_sg.deploy.serving.door import joined
 from prior_sg.deploy.serving.system import System
 from prior_sg.schemas.names import normal
@@ -31,7 +31,6 @@ TF_PERIOD_S = 1.0
 IDLE_S = 10.0  # after which the scene is asked for though nobody told of a change: such notices may be lost
 REST = 2.0  # times as long as telling of a large scene takes, nothing is told: others need the processor as well
 TASK_WAIT_S = 300.0  # a language model may take minutes
-PARENT_CHECK_S = 1.0
 TF_DEPTH = 100
 CLOSED = "this bridge takes no tasks: start it with --take-tasks"
 BUSY = "a task is being given: try again when the topic task tells of its end"
@@ -222,7 +221,7 @@ async def _until_end(bridge: Bridge, parent: int) -> None:
     stop = asyncio.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         asyncio.get_running_loop().add_signal_handler(number, stop.set)
-    ends: tuple[Coroutine[Any, Any, Any], ...] = (bridge.run(), stop.wait(), _parent_gone(parent))
+    ends: tuple[Coroutine[Any, Any, Any], ...] = (bridge.run(), stop.wait(), parent_gone(parent))
     jobs = [asyncio.create_task(job) for job in ends]
     done, others = await asyncio.wait(jobs, return_when=asyncio.FIRST_COMPLETED)
     for job in others:
@@ -230,8 +229,3 @@ async def _until_end(bridge: Bridge, parent: int) -> None:
     await asyncio.wait(jobs)
     for job in done:
         job.result()
-
-
-async def _parent_gone(parent: int) -> None:
-    while not parent or os.getppid() == parent:
-        await asyncio.sleep(PARENT_CHECK_S)

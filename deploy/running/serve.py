@@ -123,9 +123,14 @@ async def _stopped_by(stopping: asyncio.Event, host: Host) -> None:
         telling.cancel()
 
 
-async def _stop_with_parent(stopping: asyncio.Event, parent: int) -> None:
+async def parent_gone(parent: int) -> None:
+    """Until the parent process is gone; 0 = there is none that matters, and this waits for ever."""
     while not parent or os.getppid() == parent:
         await asyncio.sleep(PARENT_CHECK_S)
+
+
+async def _stop_with_parent(stopping: asyncio.Event, parent: int) -> None:
+    await parent_gone(parent)
     stopping.set()
 
 

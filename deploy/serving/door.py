@@ -7,14 +7,13 @@ from prior_sg.deploy.serving.gate import Entrance
 from prior_sg.deploy.serving.system import System
 from prior_sg.services.runtime.zenoh_bus import ZenohBus
 
-ROUTER_WAIT_S = 10.0
 Say = Callable[[str], None]
 
 
 @contextlib.contextmanager
 def joined(connect: str, robot: str) -> Iterator[System]:
     """The system behind a router. Raises BusError."""
-    system = System(lambda: ZenohBus(connect, ROUTER_WAIT_S), robot)
+    system = System(lambda: ZenohBus(connect), robot)
     try:
         yield system
     finally:

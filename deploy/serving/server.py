@@ -3,7 +3,6 @@
 import asyncio
 import contextlib
 import errno
-import os
 import socket
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -11,11 +10,11 @@ from typing import Any
 import uvicorn
 
 from prior_sg.deploy.errors import UserError
+from prior_sg.deploy.running.serve import parent_gone
 from prior_sg.deploy.serving.gate import App
 
 BACKLOG = 128
 GRACE_S = 2  # for answers that are under way at the end
-PARENT_CHECK_S = 1.0
 IDLE_CHECK_S, LONGEST_IDLE_S = 1.0, 30.0  # in which a connection has to ask for something, or to have asked
 MOST_CONNECTIONS = 1000
 STUCK_MS = 30_000  # after which a connection is given up whose other end takes nothing
@@ -91,8 +90,7 @@ class Server(uvicorn.Server):
                     connection.transport.close()
 
     async def _stop_with_parent(self) -> None:
-        while not self._parent or os.getppid() == self._parent:
-            await asyncio.sleep(PARENT_CHECK_S)
+        await parent_gone(self._parent)
         self.should_exit = True
 
 

@@ -1,5 +1,6 @@
 """What is told beside a final scene: how it came about, and of a log the surface's colours and the settings."""
 
+import contextlib
 from pathlib import Path
 from typing import Any
 
@@ -8,12 +9,13 @@ import numpy as np
 
 from prior_sg.deploy.api.history import History
 from prior_sg.deploy.showing.material import Cloud, Moment
-from prior_sg.schemas.codec import decode
+from prior_sg.schemas.codec import DecodeError, decode
 from prior_sg.schemas.frames import Keyframe, PoseUpdate
 from prior_sg.schemas.status import Consumed, Started
 from prior_sg.schemas.topics import JOURNAL, KEYFRAME, POSE_UPDATE
 from prior_sg.services.deltas import PoseCorrections
 from prior_sg.services.images import MAX_PRINCIPAL_OFFSET, ImageFault, color_of, depth_of
+from prior_sg.services.refusals import InputRefused
 from prior_sg.services.runtime.record import read_log
 
 CLOUD_FRAMES, CLOUD_POINTS, PIXEL_STEP, CLOUD_VOXEL_M = 60, 400_000, 4, 0.04
@@ -35,16 +37,19 @@ def cloud_of(log: Path, robot: str) -> Cloud | None:
     step = max(1, total // CLOUD_FRAMES)
     corrections = PoseCorrections()
     for logged in read_log(log, (POSE_UPDATE,)):
-        if (update := decode(PoseUpdate, logged.payload)).robot == robot:
-            corrections.take(update)
+        with contextlib.suppress(DecodeError, InputRefused):  # nobody took it either
+            if (update := decode(PoseUpdate, logged.payload)).robot == robot:
+                corrections.take(update)
     points, colors = [], []
     for row, logged in enumerate(read_log(log, (KEYFRAME,))):
-        keyframe = decode(Keyframe, logged.payload) if row % step == 0 else None
-        if keyframe is None or keyframe.robot != robot:
+        if row % step:
             continue
         try:
+            keyframe = decode(Keyframe, logged.payload)
+            if keyframe.robot != robot:
+                continue
             found = _surface(keyframe, corrections.pose(keyframe.frame_id, keyframe.world_from_camera))
-        except ImageFault:
+        except (DecodeError, ImageFault):
             continue
         points.append(found.points_world)
         colors.append(found.colors)

@@ -21,13 +21,13 @@ from prior_sg.schemas.scene import Scene, StoredRevision
 from prior_sg.schemas.topics import ARCHIVE, KEYFRAME, POSE_UPDATE
 from prior_sg.services.deltas import PoseCorrections
 from prior_sg.services.images import ImageFault
+from prior_sg.services.refusals import InputRefused
 from prior_sg.services.runtime.bus import Bus, BusError, Sample
 from prior_sg.services.runtime.client import BusClient
 
 MOST_REVISIONS = 1000  # that the slider goes back
 MOST_CAMERAS = 2000
 TASK_WAIT_S = 300.0  # a language model may take minutes
-ROUTER_WAIT_S = 2.0
 
 
 class Live:
@@ -73,7 +73,7 @@ class Live:
 
     def _read_images(self) -> None:
         while (arrived := self._samples.get()) is not None:
-            with contextlib.suppress(DecodeError):
+            with contextlib.suppress(DecodeError, InputRefused):  # no service takes it either
                 if isinstance(arrived, ArchiveReply):
                     for keyframe in arrived.keyframes:
                         self._take_image(keyframe)

@@ -16,7 +16,7 @@ from prior_sg.deploy.errors import UserError
 from prior_sg.deploy.inspecting import replay
 from prior_sg.deploy.viewing.cloud import Cloud, small_image
 from prior_sg.deploy.viewing.sources import Camera, Likeness, Say
-from prior_sg.schemas.codec import Message, decode
+from prior_sg.schemas.codec import DecodeError, Message, decode
 from prior_sg.schemas.frames import Keyframe, PoseUpdate
 from prior_sg.schemas.priors import Prior
 from prior_sg.schemas.regions import PosteriorReply, PosteriorRequest
@@ -24,6 +24,7 @@ from prior_sg.schemas.scene import Scene
 from prior_sg.schemas.topics import KEYFRAME, POSE_UPDATE, POSTERIOR, PRIOR
 from prior_sg.services.deltas import PoseCorrections
 from prior_sg.services.images import ImageFault
+from prior_sg.services.refusals import InputRefused
 from prior_sg.services.runtime.record import LogError, Logged, read_log
 from prior_sg.services.runtime.runner import Runner
 from prior_sg.services.scene_store.storage import is_url
@@ -60,7 +61,8 @@ class Recorded:
             for logged in [] if self._log is None else read_log(self._log, (KEYFRAME, POSE_UPDATE, PRIOR)):
                 if self._closed.is_set():
                     return
-                self._take(logged, poses)
+                with contextlib.suppress(DecodeError, InputRefused):  # no service took it either
+                    self._take(logged, poses)
         except LogError as error:
             logger.warning("the rest of the images is not shown: %s", error)
 

@@ -106,8 +106,12 @@ def _arrows(steps: np.ndarray) -> np.ndarray:
 
 
 def _names(way: Way, points_m: np.ndarray) -> Picture:
-    """The goal with the length, the regions that are entered, numbered, and the start where it was chosen."""
-    told = [(f"goal, {way.route.length_m:.1f} m", points_m[-1].tolist())]
+    """The goal with the length, the regions that are entered, numbered, and the start where it was chosen.
+
+    The goal's is below it: above the middle of a region stands the region's own name.
+    """
+    x, y, z = points_m[-1].tolist()
+    told = [(f"goal, {way.route.length_m:.1f} m", (x, y, z - 2 * NAME_ABOVE_M))]
     told += [(f"{number} {shown(stop.label)}", stop.point_m) for number, stop in enumerate(way.stops[1:], 1)]
     told += [] if way.from_robot else [("start", points_m[0].tolist())]
     return {

@@ -271,7 +271,7 @@ def _title(name: str, kind: str) -> str:
 
 
 def _percent(share: float) -> str:
-    return f"{100 * share:.0f} %"
+    return f"{100 * share:.0f}\N{NO-BREAK SPACE}%"
 
 
 def region_of(scene: Scene, region: int) -> Region | None:

@@ -97,7 +97,7 @@ class Bus(Protocol):
         """See announced keys come and go, beginning with those already there."""
 
     def announced(self, pattern: str, timeout_s: float) -> set[str]:
-        """The keys announced now, by anybody."""
+        """The keys announced now, by anybody. Raises BusError without an answer, which is not the same as nobody."""
 
     def connected(self) -> bool:
         """Whether others can be reached now."""

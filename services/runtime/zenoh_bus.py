@@ -303,7 +303,12 @@ class ZenohBus:
 
     def announced(self, pattern: str, timeout_s: float) -> set[str]:
         """The keys announced now, as the router knows them."""
-        replies = self._session.liveliness().get(pattern, timeout=timeout_s)
+        replies = list(self._session.liveliness().get(pattern, timeout=timeout_s))
+        if any(reply.ok is None for reply in replies) or not self.connected():
+            raise BusError(
+                f"the router has not said within {timeout_s:g} s who is there, so it is busy or gone; try again, or "
+                "start it again"
+            )
         return {str(reply.ok.key_expr) for reply in replies if reply.ok is not None}
 
     def connected(self) -> bool:

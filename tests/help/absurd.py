@@ -64,7 +64,7 @@ def _array(draw: Any, shape: Shape, lengths: dict[str, int]) -> np.ndarray:
         return np.broadcast_to(IDENTITY, size).astype(shape.dtype)
     assert shape.dtype.name in DTYPES
     if shape.dtype.kind == "f":
-        values = [value for value in FLOATS if abs(value) <= np.finfo(shape.dtype).max]
+        values = [value for value in FLOATS if abs(value) <= float(np.finfo(shape.dtype).max)]
     else:
         info = np.iinfo(shape.dtype)
         values = [value for value in NUMBERS if info.min <= value <= info.max]

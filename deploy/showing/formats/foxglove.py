@@ -16,6 +16,7 @@ from prior_sg.schemas.codec import DecodeError, decode
 from prior_sg.schemas.frames import Intrinsics, Keyframe, PoseUpdate
 from prior_sg.schemas.topics import KEYFRAME, POSE_UPDATE
 from prior_sg.services.deltas import PoseCorrections
+from prior_sg.services.refusals import InputRefused
 from prior_sg.services.runtime.record import read_log
 
 LAYOUT = "{}-layout.json"  # beside a recording of that name
@@ -71,7 +72,7 @@ def _images(material: Material) -> Iterator[Told]:
         return
     poses, robot = PoseCorrections(), material.scene.robot
     for logged in read_log(material.log, (POSE_UPDATE,)):
-        with contextlib.suppress(DecodeError):  # nobody took it either
+        with contextlib.suppress(DecodeError, InputRefused):  # nobody took it either
             if (update := decode(PoseUpdate, logged.payload)).robot == robot:
                 poses.take(update)
     for logged in read_log(material.log, (KEYFRAME,)):

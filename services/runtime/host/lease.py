@@ -16,15 +16,16 @@ from typing import NamedTuple
 from prior_sg.schemas.codec import LAST_NUMBER, DecodeError, decode, encode
 from prior_sg.schemas.status import EpochKnown, EpochRequest
 from prior_sg.schemas.topics import EPOCH, WAITING, Topic, lease_key
-from prior_sg.services.deltas import next_epoch
+from prior_sg.services.deltas import fault_of_epoch, next_epoch
 from prior_sg.services.errors import PriorSgError
-from prior_sg.services.runtime.bus import Answer, Bus
+from prior_sg.services.runtime.bus import Answer, Bus, BusError
 
 log = logging.getLogger(__name__)
 
 GRACE_S = 1.5  # a router that was started again hears within a second from everybody who lost it
 CHECK_S = 5.0
 ANSWER_S = 2.0
+MOST_TOLD = 100  # sentences, of whoever invents tokens
 HISTORY_S = 0.3  # in which a watch hears of who is there
 
 
@@ -85,19 +86,21 @@ class Lease:
         self._changed = asyncio.Event()
         self._revisions: dict[str, int] = {}  # told last, by topic
         self._seen: frozenset[str] = frozenset()
+        self._followed = -1  # the highest epoch that a keeper has said it follows
+        self._told: set[str] = set()
         self.holder = Holder(-1, instance)
 
     async def take(self) -> int:
         """Wait until nobody else is in charge, then be it; returns the epoch."""
+        await self._known()
         others = await self._others()  # first: beside a watch, Zenoh answers from what that has heard so far
         await asyncio.to_thread(self._bus.watch, self._pattern, self._saw)
         await asyncio.sleep(HISTORY_S if others else 0.0)
         await self._wait_for_others()
         while True:
+            await self._known()
             others = await self._others()
-            known = await self._known()
-            followed = max((epoch for epoch, _ in known.values()), default=-1)
-            epoch = next_epoch(time.time_ns(), max([followed, *(other.epoch for other in others)]))
+            epoch = next_epoch(time.time_ns(), max([self._followed, *(other.epoch for other in others)]))
             self.holder = Holder(epoch, self._instance)
             withdraw = await asyncio.to_thread(self._announce, str(epoch))
             others = await self._others()
@@ -156,10 +159,38 @@ class Lease:
         log.warning(f"nobody is in charge of {self._what} any more: this process takes over")
 
     async def _others(self) -> list[Holder]:
-        """The others in charge now."""
-        keys = self._seen | await asyncio.to_thread(self._bus.announced, self._pattern, ANSWER_S)
-        told = [one.holder for key in keys if (one := standing(key)) is not None]
-        return [holder for holder in told if holder is not None and holder != self.holder]
+        """The others in charge now. No answer says nothing about them: asked again until there is one, or until one of
+        them is heard.
+        """
+        while True:
+            try:
+                announced = await asyncio.to_thread(self._bus.announced, self._pattern, ANSWER_S)
+            except BusError as error:
+                self._tell(f"who is in charge of {self._what} cannot be found out yet: {error}")
+                if others := self._believed(self._seen):
+                    return others
+                await asyncio.sleep(GRACE_S)
+            else:
+                return self._believed(self._seen | announced)
+
+    def _believed(self, keys: frozenset[str]) -> list[Holder]:
+        """The others that these tokens name, without those whose deltas no reader would take."""
+        found = []
+        for key in keys:
+            one = standing(key)
+            if one is None or one.holder is None or one.holder == self.holder:
+                continue
+            if fault := fault_of_epoch(one.holder.epoch, max(self._followed, self.holder.epoch)):
+                self._tell(f"{one.instance} poses as {self._what}: {fault}; end it")
+            else:
+                found.append(one.holder)
+        return found
+
+    def _tell(self, sentence: str) -> None:
+        """Once, however often it is found out."""
+        if sentence not in self._told and len(self._told) < MOST_TOLD:
+            self._told.add(sentence)
+            log.warning(sentence)
 
     def tells(self, topic: str, revision: int) -> None:
         """This process is about to tell a revision."""
@@ -174,7 +205,8 @@ class Lease:
         known: dict[str, tuple[int, int]] = {}
         for told in await asyncio.gather(*(self._ask(*asked) for asked in self._asked)):
             if told is not None:
-                known[told.topic] = max(known.get(told.topic, (-1, -1)), (min(told.epoch, LAST_NUMBER), told.revision))
+                known[told.topic] = max(known.get(told.topic, (-1, -1)), (told.epoch, told.revision))
+                self._followed = max(self._followed, told.epoch)
         return known
 
     async def _ask(self, topic: str, keeper: str) -> EpochKnown | None:
@@ -187,10 +219,14 @@ class Lease:
         await asyncio.to_thread(self._bus.call, EPOCH.key_of(request), encode(request), ANSWER_S, receive)
         payload = (await answered).payload
         try:
-            return None if payload is None else decode(EpochKnown, payload)
+            told = None if payload is None else decode(EpochKnown, payload)
         except DecodeError as error:
             log.warning("epoch not understood", extra={"keeper": keeper, "why": str(error)[:200]})
             return None
+        if told is not None and (fault := fault_of_epoch(told.epoch, told.epoch)):
+            self._tell(f"{keeper} says of what it follows of {self._what}: {fault}; start it without what it has kept")
+            return None
+        return told
 
     def _saw(self, key: str, alive: bool) -> None:
         self._seen = self._seen | {key} if alive else self._seen - {key}

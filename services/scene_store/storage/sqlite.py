@@ -3,7 +3,7 @@
 import os
 import sqlite3
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -102,7 +102,9 @@ LAYOUT = ROBOTS + _PRIORS + HISTORY
 
 
 class Sqlite(Storage):
-    """One open file. Raises StoreError when it is no scene database, is damaged or cannot be written."""
+    """One open file. Raises StoreError when it is no scene database, is damaged or cannot be written. One of an older
+    layout is converted; to be only read, a copy of it in memory is.
+    """
 
     def __init__(self, cfg: core.Config, *, read_only: bool = False) -> None:
         self.location = cfg.path
@@ -128,6 +130,9 @@ class Sqlite(Storage):
             return
         if read_only and empty:
             raise sqlite3.DatabaseError("it holds no scenes")
+        if read_only:
+            self._copy()
+            run = self.connection.execute
         run("PRAGMA journal_mode = WAL")
         run(f"PRAGMA synchronous = {cfg.synchronous}")
         run(f"PRAGMA wal_autocheckpoint = {cfg.checkpoint_pages}")
@@ -144,6 +149,15 @@ class Sqlite(Storage):
             run("PRAGMA query_only = ON")
             return
         check_whole(self.connection)
+
+    def _copy(self) -> None:
+        """Go on with a copy in memory; the file stays as it is."""
+        file, self.connection = (
+            self.connection,
+            sqlite3.connect(":memory:", isolation_level=None, check_same_thread=False),
+        )
+        with closing(file):
+            file.backup(self.connection)
 
     def _convert(self) -> None:
         """A file of the last layout without history: what it holds becomes each robot's first snapshot."""

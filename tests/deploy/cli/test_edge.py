@@ -8,10 +8,12 @@ import unicodedata
 
 import pytest
 
+from prior_sg.deploy.cli.faults import sentence_of
 from prior_sg.deploy.cli.main import main
 from prior_sg.deploy.errors import UserError
 from prior_sg.deploy.running.job import Job
 from prior_sg.deploy.sample import SAMPLE
+from prior_sg.services.runtime.host.lease import SupersededError
 from tests.help.paths import ROOT
 
 PLACE = ["--environment", "residential home"]
@@ -112,3 +114,13 @@ def test_markup_in_the_name_of_a_region_is_printed_as_it_is(capsys):
     assert main(["priors", "show", *PLACE, "--task", "sort [/x] bins", "--regions", names]) == 0
     out = capsys.readouterr().out
     assert "tv corner [/den]" in out and "lounge [east]" in out
+
+
+def test_a_service_that_is_no_longer_in_charge_says_so():
+    assert sentence_of(SupersededError("another is in charge: end it first")) == "another is in charge: end it first"
+
+
+@pytest.mark.parametrize("command", [["ros", "rviz", "--out"], ["router", "--write"]])
+def test_a_file_that_cannot_be_written_is_told(command, tmp_path, capsys):
+    assert main([*command, str(tmp_path / "none" / "file")]) == 1
+    assert "name another file" in capsys.readouterr().err

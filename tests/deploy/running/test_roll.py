@@ -16,7 +16,10 @@ from prior_sg.deploy.running.roll import Roll
 from prior_sg.deploy.running.supervisor import Child, Supervisor
 from prior_sg.schemas.status import ServiceStatus
 from prior_sg.schemas.topics import WAITING, alive_key, lease_key
+from prior_sg.services.runtime import client as clients
+from prior_sg.services.runtime.bus import BusError
 from prior_sg.services.runtime.client import BusClient
+from prior_sg.services.runtime.endpoints import free_endpoint
 from prior_sg.services.runtime.host.lease import standing
 from prior_sg.services.runtime.zenoh_bus import ZenohBus
 
@@ -66,6 +69,32 @@ def test_a_stopped_process_is_told_by_who_started_it_and_by_health_and_so_is_its
         child.kill()
         until(lambda: child.process.poll() is not None)
         assert roll.check([child]) == ([], []) and until(lambda: not anybody.on_the_roll())
+
+
+ROUTER = """
+import sys, time
+from prior_sg.services.runtime.zenoh_bus import open_router
+stop = open_router(sys.argv[1])
+time.sleep(60)
+"""
+
+
+def test_a_router_that_does_not_answer_is_not_one_on_which_nobody_is(monkeypatch):
+    monkeypatch.setattr(clients, "ALIVE_TIMEOUT_S", 0.2)
+    address = free_endpoint("tcp/127.0.0.1:7447")
+    router = subprocess.Popen([sys.executable, "-c", ROUTER, address])
+    try:
+        with BusClient(ZenohBus(address)) as anybody:
+            assert anybody.standings() == [] and look(anybody).remarks == []
+            os.kill(router.pid, signal.SIGSTOP)
+            with pytest.raises(BusError, match=r"has not said within 0.2 s who is there"):
+                anybody.standings()
+            found = look(anybody)
+            assert not found.well and "has not said within 0.2 s" in str(found.remarks)
+            assert "has not said" in str(found.plain())
+    finally:
+        router.kill()
+        router.wait()
 
 
 def status(**changes):

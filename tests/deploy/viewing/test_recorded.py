@@ -1,3 +1,4 @@
+import time
 from pathlib import Path
 
 import numpy as np
@@ -5,12 +6,16 @@ import pytest
 
 from prior_sg.deploy.cli.main import main
 from prior_sg.deploy.errors import UserError
+from prior_sg.deploy.showing.moments import cloud_of
+from prior_sg.deploy.viewing.live import Live
 from prior_sg.deploy.viewing.recorded import open_recorded
-from prior_sg.schemas.codec import encode
+from prior_sg.schemas.codec import LAST_NUMBER, encode
+from prior_sg.schemas.frames import PoseUpdate
 from prior_sg.schemas.places import PlaceDelta
 from prior_sg.schemas.regions import RegionDelta
-from prior_sg.schemas.topics import KEYFRAME, PLACE_DELTA, REGION_DELTA
-from prior_sg.services.runtime.record import LogError, LogWriter
+from prior_sg.schemas.topics import KEYFRAME, PLACE_DELTA, POSE_UPDATE, REGION_DELTA
+from prior_sg.services.runtime.bus import Hub, LocalBus
+from prior_sg.services.runtime.record import LogError, LogWriter, read_log
 from tests.help.homes import home, keyframe
 
 NO_IDS, NO_PAIRS = np.zeros(0, np.int64), np.zeros((0, 2), np.int64)
@@ -77,6 +82,46 @@ def test_a_log_shows_every_moment_with_its_image_and_points(log: Path) -> None:
     with pytest.raises(UserError, match="prior-sg up"):
         source.switch("tidy up", "", lambda text: None)
     source.close()
+
+
+def pose_update(revision: int) -> PoseUpdate:
+    return PoseUpdate(
+        robot="robot1",
+        epoch=1,
+        revision=revision,
+        stamp_ns=1,
+        frame_ids=np.array([9]),
+        world_from_camera=np.eye(4)[None],
+    )
+
+
+def test_what_no_service_took_hides_nothing_of_a_log(log: Path, tmp_path: Path) -> None:
+    """Garbage, and poses numbered so far ahead that they are not believed."""
+    path = tmp_path / "log.mcap"
+    absurd = [encode(pose_update(0)), encode(pose_update(LAST_NUMBER)), b"\xff" * 20]
+    with LogWriter(path) as writer:
+        for payload in absurd:
+            writer.add(POSE_UPDATE, POSE_UPDATE.key_of(pose_update(0)), payload, "test", 0, 1, 1)
+        writer.add(KEYFRAME, KEYFRAME.key_of(keyframe()), b"\xff" * 20, "test", 0, 1, 1)
+        for logged in read_log(log, (KEYFRAME, PLACE_DELTA)):
+            writer.add(logged.topic, logged.key, logged.payload, "test", 0, 1, 1)
+    source = open_recorded(str(path), "robot1")
+    source._reader.join()
+    assert len(source.cloud) > 100
+    source.close()
+    cloud = cloud_of(path, "robot1")
+    assert cloud is not None and len(cloud.points_world) > 20
+
+    bus = LocalBus(Hub())
+    live = Live(bus, "robot1")
+    for payload in absurd:
+        bus.put(POSE_UPDATE, POSE_UPDATE.key_of(pose_update(0)), payload, b"")
+    bus.put(KEYFRAME, KEYFRAME.key_of(keyframe()), encode(keyframe()), b"")
+    end_s = time.monotonic() + 5
+    while not len(live.cloud) and time.monotonic() < end_s:
+        time.sleep(0.02)
+    assert len(live.cloud) > 100
+    live.close()
 
 
 def test_another_robot_is_named(log: Path, capsys: pytest.CaptureFixture[str]) -> None:

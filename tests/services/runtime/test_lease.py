@@ -11,8 +11,8 @@ from prior_sg.schemas.codec import LAST_NUMBER, encode
 from prior_sg.schemas.places import PlaceDelta
 from prior_sg.schemas.status import EpochKnown
 from prior_sg.schemas.topics import PLACE_DELTA, WAITING, lease_key
-from prior_sg.services.deltas import BELIEVED_NS, next_epoch
-from prior_sg.services.runtime.bus import Hub, LocalBus, pack_header
+from prior_sg.services.deltas import BELIEVED_NS, BELIEVED_STEP, LAST_BELIEVED, next_epoch
+from prior_sg.services.runtime.bus import BusError, Hub, LocalBus, pack_header
 from prior_sg.services.runtime.host import lease as leases
 from prior_sg.services.runtime.host.host import Host
 from prior_sg.services.runtime.host.lease import Fence, Lease, SupersededError, standing
@@ -155,6 +155,8 @@ def test_an_epoch_lies_above_what_readers_follow_and_one_they_do_not_follow_is_d
         (100, 5000, 5001),
         (60 + BELIEVED_NS, 60, 60 + BELIEVED_NS),
         (61 + BELIEVED_NS, 60, 61),
+        (LAST_BELIEVED + 1, -1, 1),
+        (LAST_BELIEVED + 1, LAST_BELIEVED - 1, LAST_BELIEVED),
     ],
 )
 def test_an_epoch_is_the_time_unless_that_says_nothing(now_ns, known, drawn):
@@ -166,6 +168,110 @@ def test_a_token_that_is_no_number_is_nobodys(epoch):
     found = standing(f"psg/r/lease/maker/{epoch}/a")
     assert found is None or found.holder is None
     assert standing(f"psg/r/lease/maker/{epoch}") is None
+
+
+class Busy(LocalBus):
+    """A router that is too busy to say who is there, so many times."""
+
+    def __init__(self, hub, times):
+        super().__init__(hub)
+        self.times = times
+
+    def announced(self, pattern, timeout_s):
+        self.times -= 1
+        if self.times >= 0:
+            raise BusError("no answer")
+        return super().announced(pattern, timeout_s)
+
+
+def lying(hub, epoch):
+    """A keeper that says it follows this epoch."""
+    told = EpochKnown(robot="r", topic=PLACE_DELTA.name, epoch=epoch, revision=0)
+    LocalBus(hub).serve("psg/r/ask/epoch/*/keeper", lambda request: request.reply(encode(told)))
+
+
+def kept_by(hub, instance):
+    return Lease(LocalBus(hub), "r", "maker", instance, topics=[PLACE_DELTA], keepers=["keeper"])
+
+
+async def taken_and_kept(lease):
+    epoch = await asyncio.wait_for(lease.take(), 5.0)
+    keeping = asyncio.create_task(lease.keep())
+    await asyncio.sleep(0.5)
+    assert not keeping.done()
+    keeping.cancel()
+    return epoch
+
+
+def test_no_answer_of_a_busy_router_is_not_nobody_in_charge(caplog):
+    async def main():
+        hub = Hub()
+        other = LocalBus(hub)
+        other.announce(lease_key("r", "maker", "7", "first"))
+        starting = asyncio.create_task(Lease(Busy(hub, 2), "r", "maker", "second").take())
+        end_s = time.monotonic() + 5
+        while "first is in charge of maker of r: waiting" not in caplog.text and time.monotonic() < end_s:
+            await asyncio.sleep(0.02)
+        assert not starting.done()
+        other.close()
+        await asyncio.wait_for(starting, 5.0)
+        with pytest.raises(TimeoutError):
+            await asyncio.wait_for(Lease(Busy(Hub(), 10**9), "r", "maker", "third").take(), 0.5)
+
+    asyncio.run(main())
+    assert "cannot be found out yet: no answer" in caplog.text and "first is in charge of maker of r:" in caplog.text
+
+
+def test_who_is_in_charge_and_gets_no_answer_goes_on_until_it_hears_of_another():
+    async def main():
+        hub = Hub()
+        bus = Busy(hub, 0)
+        lease = Lease(bus, "r", "maker", "a")
+        epoch = await lease.take()
+        bus.times = 10**9
+        keeping = asyncio.create_task(lease.keep())
+        await asyncio.sleep(0.5)
+        assert not keeping.done()
+        LocalBus(hub).announce(lease_key("r", "maker", str(epoch + 1), "b"))
+        with pytest.raises(SupersededError):
+            await asyncio.wait_for(keeping, 5.0)
+
+    asyncio.run(main())
+
+
+@pytest.mark.parametrize("absurd", [LAST_BELIEVED + BELIEVED_STEP + 1, LAST_NUMBER - 1, LAST_NUMBER])
+def test_a_token_that_no_reader_would_believe_keeps_nobody_from_writing(absurd, caplog):
+    hub = Hub()
+    LocalBus(hub).announce(lease_key("r", "maker", str(absurd), "liar"))
+
+    async def main():
+        return await taken_and_kept(Lease(LocalBus(hub), "r", "maker", "a"))
+
+    assert asyncio.run(main()) <= LAST_BELIEVED
+    assert f"liar poses as maker of r: epoch {absurd} leaves hardly a number above itself" in caplog.text
+
+
+def test_an_answer_that_leaves_no_number_above_itself_is_not_believed(caplog):
+    hub = Hub()
+    lying(hub, LAST_NUMBER)
+
+    async def main():
+        return await taken_and_kept(kept_by(hub, "a"))
+
+    assert asyncio.run(main()) <= LAST_BELIEVED
+    assert caplog.text.count("keeper says of what it follows of maker of r: epoch") == 1
+
+
+def test_who_goes_on_from_an_epoch_that_readers_follow_though_none_would_come_to_it_is_in_charge():
+    hub = Hub()
+    lying(hub, LAST_BELIEVED + 5)
+
+    async def main():
+        assert await kept_by(hub, "a").take() == LAST_BELIEVED + 6
+        with pytest.raises(TimeoutError):
+            await asyncio.wait_for(kept_by(hub, "b").take(), 0.5)
+
+    asyncio.run(main())
 
 
 def reader_step(state, message, cfg):

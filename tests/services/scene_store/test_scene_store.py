@@ -519,6 +519,22 @@ def test_files_of_older_layouts_are_upgraded_step_by_step(tmp_path, layout):
     assert len(scene.predicted_ids) == (0 if layout == 1 else len(expected.predicted_ids))
 
 
+@pytest.mark.parametrize("layout", [*OLDER, 5])
+def test_a_file_of_an_older_layout_that_is_only_read_stays_as_it_is(tmp_path, layout):
+    path = tmp_path / "scene.sqlite"
+    missing = ("DROP TABLE place_details", "DROP TABLE objects") if layout == 1 else ()
+    write_layout_5(path, *OLDER.get(layout, ()), *missing, f"PRAGMA user_version = {layout}")
+    before = path.read_bytes()
+    reader = Database(core.Config(path=str(path)), read_only=True)
+    expected = decode(Scene, SCENE_OF_LAYOUT_5.read_bytes())
+    assert core.scene(reader.at(ROBOT)).place_ids.tolist() == expected.place_ids.tolist()
+    with pytest.raises(StoreError):
+        reader.put_task(core.Graph(ROBOT), Task(robot=ROBOT, stamp_ns=1, environment="e", task="t"))
+    reader.close()
+    assert path.read_bytes() == before and [*tmp_path.iterdir()] == [path]
+    assert Store(path).scene().place_ids.tolist() == expected.place_ids.tolist()
+
+
 def test_the_offset_of_the_world_is_kept(tmp_path):
     origin_m = (512_345.0, 5_403_210.0, 312.0)
     store = Store(tmp_path / "scene.sqlite")
