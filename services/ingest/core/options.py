@@ -80,6 +80,10 @@ class ReadOptions(msgspec.Struct, frozen=True, kw_only=True):
         """Nanoseconds between frames of a layout without stamps."""
         return 1e9 / (self.rate_hz or published_hz)
 
+    def told_ns(self, number: int, stamp_ns: int) -> int:
+        """The stamp of a frame that has one: by the rate where that is told, else its own."""
+        return round(number * self.frame_ns(1)) if self.rate_hz else stamp_ns
+
 
 def is_live(source: str) -> bool:
     """Whether a source is a running robot rather than a file."""

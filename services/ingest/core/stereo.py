@@ -45,7 +45,9 @@ class Pair:
         size = left.intrinsics.width_px, left.intrinsics.height_px
         if size != (right.intrinsics.width_px, right.intrinsics.height_px):
             raise ValueError("the two cameras have pictures of different sizes")
-        fisheye = "fisheye" in (left.model, right.model)
+        fisheye = left.model == "fisheye"
+        if fisheye != (right.model == "fisheye"):
+            raise ValueError("one of the two cameras has a fisheye lens and the other has none")
         of = cv2.fisheye if fisheye else cv2
         ks = left.matrix(), right.matrix()
         ds = [np.array(lens.distortion or (0.0,) * 4) for lens in (left, right)]

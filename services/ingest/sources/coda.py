@@ -101,7 +101,7 @@ def load(path: Path, options: ReadOptions) -> Found:
     entries = [
         Entry(
             frame,
-            stamp if (stamp := _stamp(files, frame)) is not None else 0,
+            options.told_ns(frame, _stamp(files, frame) or 0),
             partial(_pose, files, camera, frame, order),
             partial(_images, files, camera, frame),
         )

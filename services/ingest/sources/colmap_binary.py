@@ -9,10 +9,10 @@ from typing import Any
 
 from prior_sg.services.ingest.sources.tables import SourceError
 
-MODELS = (
+MODELS = dict(enumerate((
     ("SIMPLE_PINHOLE", 3), ("PINHOLE", 4), ("SIMPLE_RADIAL", 4), ("RADIAL", 5), ("OPENCV", 8), ("OPENCV_FISHEYE", 8),
     ("FULL_OPENCV", 12), ("FOV", 5), ("SIMPLE_RADIAL_FISHEYE", 4), ("RADIAL_FISHEYE", 5), ("THIN_PRISM_FISHEYE", 12),
-)  # fmt: skip
+)))  # fmt: skip
 COUNT, CAMERA, IMAGE = struct.Struct("<Q"), struct.Struct("<iiQQ"), struct.Struct("<i7di")
 POINT_BYTES = 24
 
@@ -29,7 +29,7 @@ def cameras_of(path: Path) -> dict[str, list[Any]]:
             values = struct.unpack_from(f"<{parameters}d", data, at + CAMERA.size)
             cameras[str(number)] = [name, width, height, *values]
             at += CAMERA.size + 8 * parameters
-    except (struct.error, IndexError, OverflowError) as error:
+    except (struct.error, KeyError, OverflowError) as error:
         raise SourceError(f"{path} is damaged, or of a model of cameras that is not known: {error}") from error
     return cameras
 

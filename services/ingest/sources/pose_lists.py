@@ -13,7 +13,7 @@ Rows without a number or name belong to the images in their order, so that there
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from itertools import chain
 from pathlib import Path
@@ -22,8 +22,10 @@ from typing import Any
 import numpy as np
 
 from prior_sg.services.headers import ImageError
+from prior_sg.services.ingest.core.options import ReadOptions
 from prior_sg.services.ingest.core.pixels import array_of
 from prior_sg.services.ingest.core.poses import Convention
+from prior_sg.services.ingest.core.ros.transforms import Stamped, Track
 from prior_sg.services.ingest.sources import colmap_binary
 from prior_sg.services.ingest.sources.tables import SourceError, lines_of, read_json, words_of
 
@@ -112,6 +114,24 @@ def read(path: Path) -> PoseList:
     if _redwood_lines(lines):
         return _redwood(path, lines)
     return _table(path, [words_of(line) for line in lines])
+
+
+def track_of(path: Path, stamps_ns: Sequence[int | None], rows: Iterable[np.ndarray], options: ReadOptions) -> Track:
+    """Where a body was over time, of rows of tx ty tz qx qy qz qw; those without stamp are left out.
+
+    Raises SourceError.
+    """
+    shift_ns = round((options.stamp_offset_s or 0.0) * 1e9)
+    track = Track(
+        [
+            Stamped(stamp + shift_ns, "world", "body", tuple(row[:3].tolist()), tuple(row[3:].tolist()))
+            for stamp, row in zip(stamps_ns, rows, strict=True)
+            if stamp is not None
+        ]
+    )
+    if not len(track.stamps_ns):
+        raise SourceError(f"{path} has no pose that can be used")
+    return track
 
 
 def _nearest(numbers: Sequence[float], rows: Sequence[np.ndarray], keys: Sequence[float]) -> dict[float, np.ndarray]:
@@ -239,11 +259,14 @@ def _with_focal_length(camera: dict[str, Any]) -> dict[str, Any]:
 
 def _colmap(path: Path) -> PoseList:
     """Poses by the names of images, and the camera of most of them."""
+    cameras_file = path.with_stem(Path(COLMAP_CAMERAS).stem)
     if path.suffix == ".bin":
-        cameras, images = colmap_binary.cameras_of(path.with_stem("cameras")), colmap_binary.images_of(path)
+        cameras, images = colmap_binary.cameras_of(cameras_file), colmap_binary.images_of(path)
         images = [words for words in images if words[8] in cameras]
     else:
         cameras, images = _colmap_words(path)
+    if not images:
+        raise SourceError(f"{path} has no image with a pose and a camera of {cameras_file.name}")
     try:
         rows = [np.array([*words[5:8], *words[1:5]], float) for words in images]
         used = [words[8] for words in images]
@@ -251,11 +274,7 @@ def _colmap(path: Path) -> PoseList:
         named = dict(zip(COLMAP_PARAMETERS[model], map(float, numbers), strict=False))
     except (KeyError, ValueError) as error:
         known = ", ".join(COLMAP_PARAMETERS)
-        raise SourceError(
-            f"{path.parent / COLMAP_CAMERAS} has a camera that is not read ({error}): {known} are"
-        ) from error
-    if not rows:
-        raise SourceError(f"{path} has no image with a pose and a camera of {COLMAP_CAMERAS}")
+        raise SourceError(f"{cameras_file} has a camera that is not read ({error}): {known} are") from error
     if "f" in named:
         named |= {"fx": named["f"], "fy": named.pop("f")}
     lens = {"model": "opencv_fisheye" if "FISHEYE" in model else "opencv"} if {"k1", "k2"} & set(named) else {}

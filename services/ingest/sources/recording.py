@@ -142,7 +142,7 @@ def _frames(
         try:
             keyframe = decode(Keyframe, payload)
             frame_id = keyframe.frame_id
-            stamp_ns = round(index * options.frame_ns(1)) if options.rate_hz else keyframe.stamp_ns
+            stamp_ns = options.told_ns(index, keyframe.stamp_ns)
             pose = convention.of_matrix(np.array(keyframe.world_from_camera))
             normaliser = normaliser_of((keyframe.intrinsics, keyframe.depth_scale_m))
             make = normaliser.frame if wanted is None or wanted(index, normaliser.pose(pose)) else normaliser.bare

@@ -78,9 +78,13 @@ def load(path: Path, options: ReadOptions) -> Found:
     for index, (stamp, words) in enumerate(zip(colors.stamps_ns, colors.lines, strict=True)):
         depth = depths.lines[depth_of[index]][0] if index in depth_of else None
         pose = poses.lines[pose_of[index]] if index in pose_of else None
-        stamp_ns = round(index * options.frame_ns(1)) if options.rate_hz else stamp
         entries.append(
-            Entry(index, stamp_ns, partial(_pose, depth, pose, convention), partial(_images, path, words[0], depth))
+            Entry(
+                index,
+                options.told_ns(index, stamp),
+                partial(_pose, depth, pose, convention),
+                partial(_images, path, words[0], depth),
+            )
         )
     return Found(
         NAME,

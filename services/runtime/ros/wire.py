@@ -204,7 +204,7 @@ def _quality(written: str) -> Quality:
     """Of a token. Raises WireError."""
     parts = written.split(":")
     history = parts[2].split(",") if len(parts) > 2 else []
-    if len(history) < 2 or not (history[1].isdecimal() or not history[1]):
+    if len(history) < 2 or not re.fullmatch(r"[0-9]{0,9}", history[1]):
         raise WireError(f"{written[:40]!r} is no quality of service")
     depth = int(history[1]) if history[1] else DEFAULT_DEPTH
     return Quality(depth, parts[1] == TRANSIENT_LOCAL, parts[0] != BEST_EFFORT)

@@ -97,6 +97,27 @@ def test_a_pcd_file_has_the_points_that_were_written(form):
 
 
 @pytest.mark.parametrize("form", ["binary", "ascii"])
+def test_a_field_of_several_numbers_moves_no_other(form):
+    kind = [("normal", "f4", 3), ("x", "f4"), ("y", "f4"), ("z", "f4"), ("t", "u4")]
+    rows = np.array([((9, 8, 7), 1, 2, 3, 0), ((9, 8, 7), 4, 5, 6, 50_000_000)], kind)
+    head = "FIELDS normal x y z t\nSIZE 4 4 4 4 4\nTYPE F F F F U\nCOUNT 3 1 1 1 1\nPOINTS 2\nDATA "
+    text = b"9 8 7 1 2 3 0\n9 8 7 4 5 6 50000000\n"
+    data = f"{head}{form}\n".encode() + (rows.tobytes() if form == "binary" else text)
+    sweep = sweep_of(columns_of(data, ".pcd"), START_NS)
+    assert sweep.points_lidar.tolist() == [[1, 2, 3], [4, 5, 6]]
+    assert sweep.offsets_ns.tolist() == [0, 50_000_000]  # whole numbers are nanoseconds, in a text too
+    assert "normal" not in columns_of(data, ".pcd")
+
+
+def test_a_cloud_of_no_points_and_whole_numbers_that_are_none_are_told():
+    head = "FIELDS x y z t\nSIZE 4 4 4 4\nTYPE F F F U\nPOINTS {}\nDATA ascii\n{}"
+    with pytest.raises(CloudError, match="it has 0 points"):
+        columns_of(head.format(0, "").encode(), ".pcd")
+    with pytest.raises(CloudError, match="its t is a whole number by its header"):
+        columns_of(head.format(1, "1 2 3 nan\n").encode(), ".pcd")
+
+
+@pytest.mark.parametrize("form", ["binary", "ascii"])
 def test_a_ply_file_of_trimesh_has_the_points_that_were_written(form):
     trimesh = pytest.importorskip("trimesh")
     points = np.random.default_rng(1).normal(size=(40, 3))
@@ -389,6 +410,13 @@ def test_depth_images_go_before_clouds_unless_these_are_named(tmp_path):
     assert len([frame for frame in open_source(path) if isinstance(frame, RawFrame)]) == 6
     source = open_source(path, options=ReadOptions(depth_topic="/points"))
     assert any("depth of /points" in note for note in source.notes)
+
+
+def test_clouds_without_stamps_say_which_option_reads_them(tmp_path, monkeypatch):
+    header = Maker.header
+    monkeypatch.setattr(Maker, "header", lambda maker, stamp_ns, frame: header(maker, 0, frame))
+    with pytest.raises(SourceError, match="headers of /points have no stamps; give --clock received"):
+        open_source(bag(tmp_path, pictures=False))
 
 
 def swapped(rows):

@@ -5,6 +5,7 @@ import shutil
 import struct
 import sys
 import zipfile
+from unittest.mock import Mock
 
 import cv2
 import numpy as np
@@ -15,7 +16,10 @@ from prior_sg.deploy.inspecting.check import check
 from prior_sg.services.geometry import back_project, transform
 from prior_sg.services.ingest.core.config import Config
 from prior_sg.services.ingest.core.frames import BadFrame, RawFrame
+from prior_sg.services.ingest.core.options import ReadOptions
 from prior_sg.services.ingest.sources import SourceError, open_source
+from prior_sg.services.ingest.sources.base import FrameError
+from prior_sg.services.ingest.sources.exports.film import Film
 from prior_sg.services.runtime.extras import ExtraMissing
 from tests.services.ingest.test_pose_lists import bare, redwood
 from tests.services.ingest.test_sources import off_wall
@@ -199,6 +203,33 @@ def test_a_recording_of_record3d_is_the_walk(tmp_path, unpacks, packed):
     source = open_source(record3d(tmp_path / "walk", packed))
     assert source.layout == "record3d"
     assert_a_phone_s_walk(source)
+
+
+def test_pictures_after_a_damaged_one_are_those_that_were_asked_for(written, monkeypatch):
+    film = Film(written("stray-scanner") / "rgb.mp4")
+    expected = film.picture(3)
+    film.picture(0)
+    with monkeypatch.context() as damaged:
+        damaged.setattr(film, "_film", Mock(grab=lambda: False))
+        with pytest.raises(FrameError, match="before picture 2"):
+            film.picture(2)
+    np.testing.assert_array_equal(film.picture(3), expected)
+
+
+@pytest.mark.parametrize("name", ["stray-scanner", "rtabmap"])
+def test_a_rate_that_is_told_counts_in_place_of_an_export_s_stamps(written, name):
+    source = open_source(written(name), options=ReadOptions(rate_hz=2.0))
+    assert [frame.stamp_ns for frame in source] == [i * 500_000_000 for i in range(FRAMES)]
+
+
+@pytest.mark.parametrize("stamp", ["Infinity", '"late"'])
+def test_stamps_of_record3d_that_are_none_are_told(tmp_path, unpacks, stamp):
+    path = record3d(tmp_path / "d", packed=False)
+    said = (path / "metadata").read_text()
+    (path / "metadata").write_text(said.replace('"frameTimestamps": [100.0', f'"frameTimestamps": [{stamp}'))
+    assert stamp in (path / "metadata").read_text()
+    with pytest.raises(SourceError, match="has no metadata of Record3D"):
+        open_source(path)
 
 
 def test_without_lzfse_record3d_says_what_to_install(tmp_path, monkeypatch):

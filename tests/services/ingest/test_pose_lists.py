@@ -145,6 +145,14 @@ def test_a_camera_of_colmap_that_is_not_read_is_named(tmp_path):
         open_source(path)
 
 
+def test_a_model_of_colmap_without_images_is_told(tmp_path):
+    path = bare(tmp_path / "d", images="images")
+    colmap(path)
+    (path / "images.txt").write_text("# Image list\n1 1 0 0 0 0 0 0 7 000000.png\n\n")
+    with pytest.raises(SourceError, match=r"images\.txt has no image with a pose and a camera of cameras\.txt"):
+        open_source(path)
+
+
 ROS_1 = """header:
   seq: 12
   frame_id: camera

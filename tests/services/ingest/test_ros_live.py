@@ -317,6 +317,16 @@ def mutated(rng, data):
     return bytes(changed)
 
 
+def test_a_fault_of_our_own_is_not_waited_for(endpoint, walked, monkeypatch):
+    def broken(*_):
+        raise ValueError("shapes do not match")
+
+    monkeypatch.setattr("prior_sg.services.ingest.sources.ros.live.robot_of", broken)
+    monkeypatch.setattr("prior_sg.services.ingest.sources.ros.live.LOOK_S", 0.0)
+    with pytest.raises(ValueError, match=r"^shapes do not match$"):
+        open_source(f"ros2:/{endpoint}")
+
+
 def test_a_robot_on_a_router_is_read_like_its_bag(endpoint, walked, capsys):
     player = Robot(endpoint, walked, 11)
     address = f"ros2:/{endpoint}"

@@ -159,6 +159,13 @@ def test_images_without_a_partner_are_counted(tmp_path):
     assert any(f"{depths} of {len(WALK)} colour and {depths} depth images belong together" in n for n in source.notes)
 
 
+def test_a_fault_of_our_own_is_not_told_as_a_damaged_recording(tmp_path, monkeypatch):
+    path = whole("mcap").write(tmp_path)
+    monkeypatch.setattr("prior_sg.services.ingest.sources.ros.bag.shown_by", lambda message: message.no_such_field)
+    with pytest.raises(AttributeError, match="no_such_field"):
+        open_source(path)
+
+
 def test_stamps_of_arrival_where_headers_have_none(tmp_path):
     maker = Maker("mcap")
     for stamp_ns, color, depth_mm, pose in zip(STAMPS_NS, COLORS, DEPTHS_MM, WALK, strict=True):

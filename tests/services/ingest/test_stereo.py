@@ -106,7 +106,8 @@ def test_two_cameras_see_depth_on_the_walls(kept):
         depth_m = cv2.imdecode(np.frombuffer(frame.depth, np.uint8), cv2.IMREAD_UNCHANGED) * frame.depth_scale_m
         pose, of = frame.world_from_camera, frame.intrinsics
         true_m = cast(pose[:3, 3], rays(of, "", ()) @ pose[:3, :3].T)
-        off_px = of.fx_px * 0.11 * (1 / depth_m - 1 / true_m)[depth_m > 0]
+        seen = depth_m > 0
+        off_px = of.fx_px * 0.11 * (1 / depth_m[seen] - 1 / true_m[seen])
         assert abs(np.median(off_px)) < 0.12  # nothing is shifted
 
 
@@ -156,6 +157,12 @@ def test_a_network_replaces_the_matching_of_a_source(tmp_path, kept):
     assert depth[100, 200] == pytest.approx(expected, rel=0.02)
 
 
+def test_a_rate_that_is_told_counts_in_place_of_stamps(kept):
+    source = open_source(kept, options=ReadOptions(rate_hz=2.0))
+    assert any("2 frames a second, as told" in note for note in source.notes)
+    assert [frame.stamp_ns for frame in source] == [0, 500_000_000, 1_000_000_000, 1_500_000_000]
+
+
 @pytest.mark.parametrize("made", [lambda path: network(path, inputs=1), lambda path: path.write_bytes(b"no network")])
 def test_a_file_that_is_no_network_that_matches_is_told(tmp_path, kept, made):
     pytest.importorskip("onnxruntime")
@@ -182,9 +189,28 @@ def without(text, name="cam0/sensor.yaml"):
     return change
 
 
+def with_lens(text, name="cam0"):
+    """Another lens in place of the last two lines of a camera."""
+
+    def change(path):
+        file = path / f"mav0/{name}/sensor.yaml"
+        file.write_text(file.read_text().partition("distortion_model")[0] + text)
+
+    return change
+
+
+def later(path):
+    for file in (path / "mav0/cam1/data").iterdir():
+        file.rename(file.with_name(f"{int(file.stem) + 100_000_000}.png"))
+
+
 @pytest.mark.parametrize(
     ("damage", "said"),
     [
+        (with_lens("distortion_model: radtan\ndistortion_coefficients: [0.1, 0.2, 0.3]"), "coefficients, not 3"),
+        (with_lens("distortion_coefficients: [0.1, 0.2, 0.0, 0.0]"), "no distortion_model"),
+        (with_lens("distortion_model: equidistant\ndistortion_coefficients: [0, 0, 0, 0]", "cam1"), "other has none"),
+        (later, "within 1 ms: name both by the same stamps"),
         (no_right, "depth needs cam0 and cam1"),
         (exchanged, "exchange them"),
         (without("intrinsics"), "intrinsics with 4 numbers"),

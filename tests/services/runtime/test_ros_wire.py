@@ -192,6 +192,13 @@ def test_strangers_messages_are_told_and_passed_over(endpoint):
     assert [word for (_, said), word in zip(faults, ("no attachment", "4 bytes", "hash"), strict=True) if word in said]
 
 
+def test_a_token_of_a_depth_without_end_is_refused():
+    token = f"@ros2_lv/0/a/0/1/MP/%/%/n/%t/std_msgs::msg::dds_::String_/{STRING}/::,{{}}:,:,:,,"
+    assert wire.read_token(token.format(7)).channel.quality.depth == 7
+    with pytest.raises(WireError, match="no quality of service"):
+        wire.read_token(token.format("9" * 5000))  # Python itself refuses to read so long a number
+
+
 def test_an_entity_of_no_kind_has_no_token():
     with pytest.raises(WireError, match="none of the kinds"):
         Entity("XX", 0, "a", 0, 0, "node").token()

@@ -1,11 +1,12 @@
 """Clouds of points in files: .npy, .pcd, .ply, and .bin as KITTI has it (pure)."""
 
 import io
+import math
 import re
 
 import numpy as np
 
-from prior_sg.services.ingest.core.clouds.sweep import CloudError
+from prior_sg.services.ingest.core.clouds.sweep import MOST_POINTS, CloudError
 from prior_sg.services.ingest.core.pixels import NPY_FAULTS
 
 ENDINGS = (".npy", ".pcd", ".ply", ".bin")
@@ -17,7 +18,6 @@ PLY_TYPES = {
 }  # fmt: skip
 PLY_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
 KITTI_COLUMNS = ("x", "y", "z", "intensity")
-MOST_POINTS = 1 << 25
 HEADER_BYTES = 1 << 16
 
 
@@ -65,7 +65,7 @@ def _pcd(data: bytes) -> dict[str, np.ndarray]:
     if form == "binary":
         return _named(_rows(body, np.dtype(fields), points))
     if form == "ascii":
-        return _table(body, fields, points)
+        return _named(_table(body, np.dtype(fields), points))
     raise CloudError(f"its data is {form}: save it as binary (pcl_convert_pcd_ascii_binary IN.pcd OUT.pcd 1)")
 
 
@@ -81,24 +81,46 @@ def _ply(data: bytes) -> dict[str, np.ndarray]:
     own = lines[starts[0] + 1 : starts[1] if len(starts) > 1 else None]
     order = PLY_ORDERS.get(form, "<")
     fields = [(words[-1], order + PLY_TYPES[words[1]]) for words in own if words[:1] == ["property"]]
-    points, body = int(lines[starts[0]][2]), data[head.end() :]
-    return _named(_rows(body, np.dtype(fields), points)) if form in PLY_ORDERS else _table(body, fields, points)
+    rows = _rows if form in PLY_ORDERS else _table
+    return _named(rows(data[head.end() :], np.dtype(fields), int(lines[starts[0]][2])))
 
 
 def _rows(body: bytes, row: np.dtype, points: int) -> np.ndarray:
-    if not 0 < points <= MOST_POINTS or len(body) < points * row.itemsize:
+    _check_count(points)
+    if len(body) < points * row.itemsize:
         raise CloudError(f"its {len(body)} bytes are too few for {points} points of {row.itemsize} bytes")
     return np.frombuffer(body, row, points)
 
 
-def _table(body: bytes, fields: list, points: int) -> dict[str, np.ndarray]:
-    """Points of a text, a line each."""
+def _table(body: bytes, row: np.dtype, points: int) -> np.ndarray:
+    """Points of a text, a line each; numbers with a fraction keep all their digits."""
+    _check_count(points)
     lines = body.decode("ascii", errors="replace").splitlines()[:points]
-    rows = np.array([line.split() for line in lines if line.strip()], np.float64)
-    if len(rows) != points or rows.shape[1] < len(fields):
-        raise CloudError(f"it has {len(rows)} lines instead of {points}, or too few numbers in them")
-    return {field[0]: rows[:, i] for i, field in enumerate(fields)}
+    numbers = np.array([line.split() for line in lines if line.strip()], np.float64)
+    kinds = [(name, *_wide(row[name])) for name in row.names or ()]
+    width = sum(math.prod(shape) for _, _, shape in kinds)
+    if len(numbers) != points or numbers.shape[1] < width:
+        raise CloudError(f"it has {len(numbers)} lines instead of {points}, or too few numbers in them")
+    table, at = np.empty(points, kinds), 0
+    for name, kind, shape in kinds:
+        held = numbers[:, at : at + math.prod(shape)].reshape(points, *shape)
+        if kind.kind != "f" and not np.isfinite(held).all():
+            raise CloudError(f"its {name[:20]} is a whole number by its header and none in its lines")
+        table[name] = held
+        at += math.prod(shape)
+    return table
+
+
+def _wide(kind: np.dtype) -> tuple[np.dtype, tuple[int, ...]]:
+    """What holds a number that is written out, and how many make a field."""
+    return np.dtype(np.float64) if kind.base.kind == "f" else kind.base, kind.shape
+
+
+def _check_count(points: int) -> None:
+    if not 0 < points <= MOST_POINTS:
+        raise CloudError(f"it has {points} points instead of 1 to {MOST_POINTS}")
 
 
 def _named(rows: np.ndarray) -> dict[str, np.ndarray]:
-    return {name: rows[name] for name in rows.dtype.names or () if rows[name].dtype.kind in "fiu"}
+    """Those of one number per point."""
+    return {name: rows[name] for name in rows.dtype.names or () if rows.dtype[name].kind in "fiu"}

@@ -8,6 +8,7 @@ import numpy as np
 from prior_sg.services.geometry import transform
 
 TIMES = ("t", "time", "timestamp", "timestamps", "offset_time", "time_offset", "time_stamp", "point_time_offset")
+MOST_POINTS = 1 << 25
 NEAREST_M = 0.1  # drivers write zeros where nothing came back, and see their own mount
 SLICE_NS = 1_000_000  # within which the sensor is taken to stand still
 LONGEST_NS = 1_000_000_000  # a sweep; longer offsets are no offsets

@@ -4,10 +4,9 @@ from typing import Any
 
 import numpy as np
 
-from prior_sg.services.ingest.core.clouds.sweep import CloudError
+from prior_sg.services.ingest.core.clouds.sweep import MOST_POINTS, CloudError
 
 KINDS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}  # of PointField
-MOST_POINTS = 1 << 25
 
 
 def columns_of_message(message: Any) -> dict[str, np.ndarray]:

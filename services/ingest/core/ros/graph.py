@@ -20,20 +20,20 @@ def corrected(trail: Sequence[View], nodes: Sequence[Stamped], within_ns: int) -
 
     Raises PoseError where no node belongs to a frame.
     """
-    track = Track([_stamped(view) for view in trail], moves=True)
-    stamps_ns, moved = [], []
+    poses = np.array([view.world_from_camera for view in trail]).reshape(-1, 4, 4)
+    track = _track(trail, poses)
+    moved: dict[int, np.ndarray] = {}
     for node in sorted(nodes, key=lambda node: node.stamp_ns):
-        if node.is_motion() and node.stamp_ns not in stamps_ns:
+        if node.is_motion() and node.stamp_ns not in moved:
             try:
                 before = track.at(node.stamp_ns, within_ns)
             except PoseError:
                 continue
-            stamps_ns.append(node.stamp_ns)
-            moved.append(node.matrix() @ inverse(before))
+            moved[node.stamp_ns] = node.matrix() @ inverse(before)
     if not moved:
         raise PoseError("no pose of the graph has the stamp of a frame")
-    after_from_before = _between(np.array(stamps_ns), np.array(moved), np.array([view.stamp_ns for view in trail]))
-    return after_from_before @ np.array([view.world_from_camera for view in trail])
+    at_ns = np.array([view.stamp_ns for view in trail])
+    return _between(np.array(list(moved)), np.array(list(moved.values())), at_ns) @ poses
 
 
 def _between(stamps_ns: np.ndarray, motions: np.ndarray, at_ns: np.ndarray) -> np.ndarray:
@@ -47,6 +47,10 @@ def _between(stamps_ns: np.ndarray, motions: np.ndarray, at_ns: np.ndarray) -> n
     return found
 
 
-def _stamped(view: View) -> Stamped:
-    turn = Rotation.from_matrix(view.world_from_camera[:3, :3]).as_quat()
-    return Stamped(view.stamp_ns, "", "", tuple(view.world_from_camera[:3, 3]), tuple(turn))
+def _track(trail: Sequence[View], poses: np.ndarray) -> Track:
+    turns = Rotation.from_matrix(poses[:, :3, :3]).as_quat() if len(poses) else ()
+    samples = [
+        Stamped(view.stamp_ns, "", "", tuple(pose[:3, 3]), tuple(turn))
+        for view, pose, turn in zip(trail, poses, turns, strict=True)
+    ]
+    return Track(samples, moves=True)

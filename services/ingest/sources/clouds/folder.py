@@ -23,7 +23,7 @@ from prior_sg.services.ingest.core.clouds.files import ENDINGS, columns_of
 from prior_sg.services.ingest.core.clouds.sweep import CloudError, Sweep, sweep_of
 from prior_sg.services.ingest.core.options import ReadOptions
 from prior_sg.services.ingest.core.poses import PoseError, rigid
-from prior_sg.services.ingest.core.ros.transforms import Stamped, Track
+from prior_sg.services.ingest.core.ros.transforms import Track
 from prior_sg.services.ingest.sources import pose_lists
 from prior_sg.services.ingest.sources.base import (
     MILLIMETRE,
@@ -54,8 +54,6 @@ def fits(path: Path) -> bool:
 
 def load(path: Path, options: ReadOptions) -> Found:
     """A folder of clouds. Raises SourceError."""
-    if options.camera_axes or options.poses:
-        raise SourceError("poses of a folder of clouds are world_from_body: leave out --poses and --axes")
     said = read_json(path / DESCRIBED) if (path / DESCRIBED).is_file() else {}
     if not isinstance(said, dict):
         raise SourceError(f"{path / DESCRIBED} is not an object with camera and camera_from_lidar")
@@ -68,9 +66,9 @@ def load(path: Path, options: ReadOptions) -> Found:
 
     lidar = Lidar(stamps, partial(_sweep, files, stamps), world_from_lidar)
     colors = folder_of(path, COLORS)
-    notes: tuple[str, ...] = (f"the lidar moves as {list_name} says; quaternions are {options.quaternion or 'xyzw'}",)
+    notes: tuple[str, ...] = (f"the lidar moves as {list_name} says; quaternions are xyzw",)
     if colors is None:
-        camera, entries, note = view_entries(lidar, rigid)
+        camera, entries, note = view_entries(lidar, options)
         notes = (*notes, note)
     else:
         if "camera" not in said or "camera_from_lidar" not in said:
@@ -104,7 +102,12 @@ def _drawn(
 
     drawing = Drawing.of(lidar, camera, world_from_camera)
     entries = [
-        Entry(i, stamps[i], partial(world_from_camera, stamps[i]), partial(_images, drawing, files[i], stamps[i], j))
+        Entry(
+            i,
+            options.told_ns(i, stamps[i]),
+            partial(world_from_camera, stamps[i]),
+            partial(_images, drawing, files[i], stamps[i], j),
+        )
         for i, j in lidar.partners(stamps)
     ]
     if not entries:
@@ -151,17 +154,7 @@ def _track(path: Path, options: ReadOptions) -> tuple[Track, str]:
             f"{path} has no list of poses with stamps: put poses.txt with rows of stamp tx ty tz qx qy qz qw into it"
         )
     stamps, _ = stamps_ns([repr(number) for number in listed.numbers], listed.path, "s", options.stamp_unit)
-    shift_ns = round((options.stamp_offset_s or 0.0) * 1e9)
-    order = (3, 4, 5, 6) if options.quaternion != "wxyz" else (4, 5, 6, 3)
-    samples = [
-        Stamped(stamp + shift_ns, "world", "body", tuple(options.position_scale_m * row[:3]), tuple(row[list(order)]))
-        for stamp, row in zip(stamps, listed.rows, strict=True)
-        if stamp is not None
-    ]
-    track = Track(samples)
-    if not len(track.stamps_ns):
-        raise SourceError(f"{listed.path} has no pose that can be used")
-    return track, listed.path.name
+    return pose_lists.track_of(listed.path, stamps, listed.rows, options), listed.path.name
 
 
 def _motion(path: Path, said: dict, name: str) -> np.ndarray:

@@ -46,7 +46,7 @@ def load(name: str, bag: Bag, topics: list[Topic], choice: Chosen, options: Read
     lidar = Lidar(index.stamps_ns, partial(_sweep, recorded, index), world_from_lidar)
     convention = Convention().changed(options)
     if alone:
-        camera, entries, note = view_entries(lidar, lambda pose: pose)
+        camera, entries, note = view_entries(lidar, options)
         notes = [f"depth of {choice.depth.name}, {said}", note]
     else:
         camera, entries = _drawn(recorded, lidar, convention)
@@ -75,7 +75,12 @@ def _drawn(recorded: Recorded, lidar: Lidar, convention: Convention) -> tuple[Ca
 
     drawing, stamps_ns = Drawing.of(lidar, bent, world_from_camera), recorded.colors.stamps_ns
     entries = [
-        Entry(number, stamps_ns[i], partial(world_from_camera, stamps_ns[i]), partial(_images, recorded, drawing, i, j))
+        Entry(
+            number,
+            recorded.options.told_ns(number, stamps_ns[i]),
+            partial(world_from_camera, stamps_ns[i]),
+            partial(_images, recorded, drawing, i, j),
+        )
         for number, (i, j) in enumerate(lidar.partners(stamps_ns))
     ]
     if not entries:

@@ -11,6 +11,7 @@ from prior_sg.services.geometry import inverse, transform
 from prior_sg.services.ingest.core.clouds.sweep import CloudError, Sweep, in_world
 from prior_sg.services.ingest.core.clouds.upsampling import upsampled
 from prior_sg.services.ingest.core.clouds.views import VIEW, lidar_from_views, looked_at, seen
+from prior_sg.services.ingest.core.options import ReadOptions
 from prior_sg.services.ingest.core.pairing import associate
 from prior_sg.services.ingest.core.pixels import encoded
 from prior_sg.services.ingest.core.poses import PoseError
@@ -79,19 +80,16 @@ class Drawing:
         return Images(file, upsampled(points_camera, of, picture))
 
 
-def view_entries(lidar: Lidar, of_matrix: Callable[[np.ndarray], np.ndarray]) -> tuple[Camera, list[Entry], str]:
-    """Frames without colour for a lidar without a camera, and a note on them. Raises SourceError.
-
-    `of_matrix` makes source_from_view of world_from_view.
-    """
+def view_entries(lidar: Lidar, options: ReadOptions) -> tuple[Camera, list[Entry], str]:
+    """Frames without colour for a lidar without a camera, and a note on them. Raises SourceError."""
     poses = [_posed(lidar, stamp_ns) for stamp_ns in lidar.stamps_ns]
     chosen = looked_at(lidar.stamps_ns, poses)
     views = _used_views(lidar, chosen)
     entries: list[Entry] = []
     for position in chosen:
         for number, lidar_from_view in enumerate(views):
-            stamp_ns = lidar.stamps_ns[position] + number * VIEW_STEP_NS
-            pose = partial(_pose, lidar, position, lidar_from_view, of_matrix)
+            stamp_ns = options.told_ns(len(entries), lidar.stamps_ns[position] + number * VIEW_STEP_NS)
+            pose = partial(_pose, lidar, position, lidar_from_view)
             entries.append(Entry(len(entries), stamp_ns, pose, partial(_images, lidar, position, lidar_from_view)))
     note = (
         f"there is no camera: {len(chosen)} of {len(poses)} sweeps are looked at in {len(views)} views of 90 degrees, "
@@ -122,13 +120,11 @@ def _posed(lidar: Lidar, stamp_ns: int) -> np.ndarray | None:
         return None
 
 
-def _pose(
-    lidar: Lidar, position: int, lidar_from_view: np.ndarray, of_matrix: Callable[[np.ndarray], np.ndarray]
-) -> np.ndarray:
-    return of_matrix(lidar.world_from_lidar(lidar.stamps_ns[position]) @ lidar_from_view)
+def _pose(lidar: Lidar, position: int, lidar_from_view: np.ndarray) -> np.ndarray:
+    return lidar.world_from_lidar(lidar.stamps_ns[position]) @ lidar_from_view
 
 
 def _images(lidar: Lidar, position: int, lidar_from_view: np.ndarray) -> Images:
-    world_from_view = lidar.world_from_lidar(lidar.stamps_ns[position]) @ lidar_from_view
+    world_from_view = _pose(lidar, position, lidar_from_view)
     points_view = transform(inverse(world_from_view), lidar.points_world(position))
     return Images(None, upsampled(points_view, VIEW, None))

@@ -21,11 +21,11 @@ import numpy as np
 from prior_sg.schemas.frames import Intrinsics
 from prior_sg.services.geometry import inverse
 from prior_sg.services.ingest.core import stereo
-from prior_sg.services.ingest.core.options import ReadOptions
+from prior_sg.services.ingest.core.options import ReadOptions, check_lens
 from prior_sg.services.ingest.core.pixels import encoded
 from prior_sg.services.ingest.core.poses import PoseError, rigid
-from prior_sg.services.ingest.core.ros.transforms import Stamped, Track
-from prior_sg.services.ingest.sources import base, depth_models
+from prior_sg.services.ingest.core.ros.transforms import Track
+from prior_sg.services.ingest.sources import base, depth_models, pose_lists
 from prior_sg.services.ingest.sources.base import (
     LENS_NAMES,
     MILLIMETRE,
@@ -56,8 +56,6 @@ def fits(path: Path) -> bool:
 
 def load(path: Path, options: ReadOptions) -> Found:
     """A sequence of EuRoC. Raises SourceError."""
-    if options.poses or options.camera_axes:
-        raise SourceError("EuRoC has poses of its body: leave out --poses and --axes")
     lefts, rights = (numbered(path / "mav0" / name / "data", r"(\d+)\.(?:png|jpg)") for name in ("cam0", "cam1"))
     if not lefts or not rights:
         raise SourceError(
@@ -74,9 +72,16 @@ def load(path: Path, options: ReadOptions) -> Found:
     matcher, said = depth_models.matcher_of(options)
     body_from_camera = body_from_left @ pair.left_from_rectified
     entries = [
-        Entry(number, stamp, partial(_pose, track, stamp, body_from_camera), partial(_images, pair, matcher, *files))
+        Entry(
+            number,
+            options.told_ns(number, stamp),
+            partial(_pose, track, stamp, body_from_camera),
+            partial(_images, pair, matcher, *files),
+        )
         for number, (stamp, files) in enumerate(_both(lefts, rights))
     ]
+    if not entries:
+        raise SourceError(f"{path} has no picture of cam0 with one of cam1 within 1 ms: name both by the same stamps")
     return Found(
         NAME,
         path,
@@ -123,9 +128,13 @@ def _sensor(path: Path) -> tuple[stereo.Lens, np.ndarray]:
     try:
         body_from_sensor = rigid(np.array(_numbers(text, r"T_BS:.*?data", 16)).reshape(4, 4))
         size, focal = _numbers(text, "resolution", 2), _numbers(text, "intrinsics", 4)
-        bent = tuple(_numbers(text, "distortion_coefficients", 0)) if lens != "pinhole" else ()
+        written = tuple(_numbers(text, "distortion_coefficients", 0))
         if not lens:
             raise ValueError(f"its distortion_model {word} is not known")
+        if any(written) and not word:
+            raise ValueError("it has distortion_coefficients and no distortion_model")
+        bent = written if lens != "pinhole" else ()
+        check_lens(lens, bent)
         return stereo.Lens(Intrinsics(int(size[0]), int(size[1]), *focal), lens, bent), body_from_sensor
     except (ValueError, PoseError) as error:
         raise SourceError(f"{path} is not a camera: {error}") from error
@@ -145,21 +154,11 @@ def _track(path: Path, options: ReadOptions) -> tuple[Track, Path]:
     file = next((path / name for name in POSES if (path / name).is_file()), None)
     if file is None:
         raise SourceError(f"{path} has no poses: looked for {', '.join(POSES)}")
-    rows = [words_of(line)[:8] for line in lines_of(file)]
+    words = [words_of(line)[:8] for line in lines_of(file)]
     try:
-        table = np.array([row[1:] for row in rows], np.float64).reshape(-1, 7)
-        stamps = [round(float(row[0]) * 1e9) if "." in row[0] else int(row[0]) for row in rows]
+        table = np.array([row[1:] for row in words], np.float64).reshape(-1, 7)
+        stamps = [round(float(row[0]) * 1e9) if "." in row[0] else int(row[0]) for row in words]
     except (ValueError, IndexError, OverflowError) as error:
         raise SourceError(f"{file} is no list of poses with stamps: {error}") from error
-    order = options.quaternion or ("wxyz" if file.suffix == ".csv" else "xyzw")
-    columns = (4, 5, 6, 3) if order == "wxyz" else (3, 4, 5, 6)
-    shift_ns = round((options.stamp_offset_s or 0.0) * 1e9)
-    track = Track(
-        [
-            Stamped(stamp + shift_ns, "world", "body", tuple(row[:3].tolist()), tuple(row[list(columns)].tolist()))
-            for stamp, row in zip(stamps, table, strict=True)
-        ]
-    )
-    if not len(track.stamps_ns):
-        raise SourceError(f"{file} has no pose that can be used")
-    return track, file
+    rows = table[:, (0, 1, 2, 4, 5, 6, 3)] if file.suffix == ".csv" else table
+    return pose_lists.track_of(file, stamps, rows, options), file

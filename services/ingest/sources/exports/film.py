@@ -9,6 +9,7 @@ import numpy as np
 from prior_sg.services.ingest.sources.base import FrameError
 from prior_sg.services.ingest.sources.tables import SourceError
 
+UNKNOWN = 1 << 62  # where a film is that could not be read: it is jumped in before the next picture
 NEAR = 30  # pictures ahead that are passed over rather than jumped to
 
 
@@ -39,7 +40,7 @@ class Film:
         while self._next < number and self._film.grab():
             self._next += 1
         held, picture = self._film.read() if self._next == number else (False, None)
-        self._next += 1
+        self._next = number + 1 if held else UNKNOWN
         if not held or picture is None:
             raise FrameError(f"{self.path.name} ends before picture {number}, or is damaged there")
         return picture

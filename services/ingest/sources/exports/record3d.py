@@ -59,13 +59,14 @@ def load(path: Path, options: ReadOptions) -> Found:
         poses = np.array(said["poses"], np.float64).reshape(-1, 7)
         depth_shape = int(said["dh"]), int(said["dw"])
         camera = base.camera_of(path, {"width": said["w"], "height": said["h"], **_lens(said)})
-    except (FrameError, KeyError, TypeError, ValueError, IndexError, RecursionError) as error:
+        stamps = _stamps(said, len(poses), options)
+    except (FrameError, KeyError, TypeError, ValueError, IndexError, OverflowError, RecursionError) as error:
         lacks = f"it lacks {error}" if isinstance(error, KeyError) else str(error)[:200]
         raise SourceError(f"{path} has no metadata of Record3D: {lacks}; export it again as .r3d") from error
     convention = Convention(axes="opengl").changed(options)
     entries = [
         Entry(number, stamp, partial(_pose, pose, convention), partial(_images, read, number, depth_shape))
-        for number, (pose, stamp) in enumerate(zip(poses, _stamps(said, len(poses), options), strict=True))
+        for number, (pose, stamp) in enumerate(zip(poses, stamps, strict=True))
     ]
     return Found(
         NAME,

@@ -62,7 +62,7 @@ def load(path: Path, options: ReadOptions) -> Found:
     entries = [
         Entry(
             number,
-            round(float(stem) * 1e9) if stamped else round(number * options.frame_ns(1.0)),
+            options.told_ns(number, round(float(stem) * 1e9)) if stamped else round(number * options.frame_ns(1.0)),
             partial(_pose, poses, stem, convention),
             partial(_images, colors, depths, stem),
         )

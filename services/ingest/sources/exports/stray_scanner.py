@@ -54,7 +54,12 @@ def load(path: Path, options: ReadOptions) -> Found:
     stamps, note = stamps_ns([row["timestamp"] for row in rows], path / ODOMETRY, "s", options.stamp_unit)
     convention = Convention().changed(options)
     entries = [
-        Entry(number, stamp, partial(_pose, row, convention), partial(_images, film, depths, confidences, number))
+        Entry(
+            number,
+            options.told_ns(number, stamp),
+            partial(_pose, row, convention),
+            partial(_images, film, depths, confidences, number),
+        )
         for row, stamp in zip(rows, stamps, strict=True)
         if stamp is not None and (number := _number(row)) is not None
     ]

@@ -3,7 +3,8 @@
 import weakref
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -86,8 +87,7 @@ class Bag:
 
     def topics(self) -> list[Topic]:
         """All topics by name; of images and cameras with what their first message says. Raises SourceError."""
-        with readable(self.path):
-            return [self._topic(name) for name in sorted(self._connections)]
+        return [self._topic(name) for name in sorted(self._connections)]
 
     def messages(self, names: Sequence[str]) -> Iterator[tuple[str, int, bytes]]:
         """Topic, time of arrival (ns) and data of all messages of some topics, by arrival. Raises SourceError."""
@@ -136,14 +136,13 @@ class Bag:
 
     def _looked_at(self, topic: Topic) -> Topic:
         """With what the first message says that can be read."""
-        for _, data in zip(range(3), self._reader.messages(connections=self._connections[topic.name]), strict=False):
+        for _, _, data in islice(self.messages([topic.name]), 3):
             try:
-                message = self.decode(topic.name, data[2])
+                message = self.decode(topic.name, data)
             except FrameError:
                 continue
             frame = frame_name(message.header.frame_id)
             if topic.type in (ros_topics.CAMERA_INFO, ros_topics.POINT_CLOUD):
-                return Topic(topic.name, topic.type, topic.count, topic.rate_hz, frame=frame)
-            said = encoding_of(message), frame, shown_by(message)
-            return Topic(topic.name, topic.type, topic.count, topic.rate_hz, *said)
+                return replace(topic, frame=frame)
+            return replace(topic, encoding=encoding_of(message), frame=frame, shows=shown_by(message))
         return topic

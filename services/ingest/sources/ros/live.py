@@ -157,7 +157,7 @@ def _found(path: Path, options: ReadOptions) -> Robot:
                 if look.settled or late:
                     try:
                         return robot_of(look, types, path, options)
-                    except (SourceError, PoseError, ValueError) as error:
+                    except (SourceError, WireError, *UNUSABLE) as error:
                         if late:
                             raise SourceError(_what_is_there(path, look, options, str(error))) from error
     except (BusError, WireError) as error:
@@ -174,9 +174,12 @@ def _what_is_there(path: Path, look: Look, options: ReadOptions, said: str) -> s
 
 
 def robot_of(look: Look, types: Types, path: Path, options: ReadOptions) -> Robot:
-    """What is to be read, of what was heard. Raises SourceError, ValueError and PoseError, each with one sentence."""
+    """What is to be read, of what was heard. Raises SourceError, WireError and UNUSABLE, each with one sentence."""
     topics = look.topics()
-    choice, posing = chosen(topics, options), pose_topics(topics, options)
+    try:
+        choice, posing, graph = chosen(topics, options), pose_topics(topics, options), graph_topic(topics, options)
+    except ValueError as error:
+        raise SourceError(f"{path}: {error}") from error
     by_name = {topic.name: topic for topic in topics}
     reader = Reader(types, options, by_name)
     within_ns = round(options.sync_tolerance_s * 1e9)
@@ -188,7 +191,7 @@ def robot_of(look: Look, types: Types, path: Path, options: ReadOptions) -> Robo
     transforms, poses = _motions(messages, reader, by_name)
     tree = transforms.tree(stamp_ns, transforms.frames)
     way = way_of(choice.color.frame, tree, options, posing, poses)
-    graph, camera_frame = graph_topic(topics, options), choice.color.frame
+    camera_frame = choice.color.frame
     camera, images, how = pictures(Rig(path, choice, options, look.infos(), tree, stamp_ns, within_ns))
     listened = (*_listened(topics, choice, way), *([graph] if graph else []))
     convention = Convention().changed(options)

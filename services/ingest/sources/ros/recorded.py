@@ -12,15 +12,16 @@ from prior_sg.services.ingest.core.ros.topics import (
     Topic,
 )
 from prior_sg.services.ingest.core.ros.transforms import Stamped, TransformTree, transforms_of
-from prior_sg.services.ingest.sources.base import (
-    FrameError,
-)
+from prior_sg.services.ingest.sources.base import FrameError, SourceError
 from prior_sg.services.ingest.sources.ros.bag import Bag, Index
 from prior_sg.services.ingest.sources.ros.pictures import Rig
 
 
 class Recorded:
-    """What is read of a recording when it is opened: one pass over the stamps of images and over all transforms."""
+    """What is read of a recording when it is opened: one pass over the stamps of images and over all transforms.
+
+    Raises SourceError.
+    """
 
     def __init__(
         self, bag: Bag, options: ReadOptions, topics: Sequence[Topic], choice: Chosen, posing: Sequence[Topic]
@@ -44,6 +45,9 @@ class Recorded:
                 self._unread[name] = self._unread.get(name, 0) + 1
         self.tree = TransformTree(self._transforms[False], self._transforms[True])
         self.colors, self.depths = _sorted(self.colors), _sorted(self.depths)
+        for name, index in ((choice.color.name, self.colors), (choice.depth.name, self.depths)):
+            if index.stamps_ns and not any(index.stamps_ns):
+                raise SourceError(f"{bag.path}: the headers of {name} have no stamps; give --clock received")
 
     def messages(self, color: int, depth: int) -> tuple[Any, Any]:
         """The two images of a frame, by their places. Raises FrameError."""

@@ -71,11 +71,10 @@ def load(path: Path, options: ReadOptions) -> Found:
     entries = []
     for number, (color, depth) in enumerate(pairs):
         stamp_ns = recorded.colors.stamps_ns[color]
-        shown_ns = round(number * options.frame_ns(1)) if options.rate_hz else stamp_ns
         entries.append(
             Entry(
                 number,
-                shown_ns,
+                options.told_ns(number, stamp_ns),
                 partial(_pose, recorded, way, track, convention, stamp_ns),
                 partial(_images, recorded, images, color, depth),
             )
@@ -96,9 +95,6 @@ def load(path: Path, options: ReadOptions) -> Found:
 def _pairs(recorded: Recorded) -> tuple[list[tuple[int, int]], list[str]]:
     """Indices of colour and depth images that belong together, and notes on those that do not. Raises SourceError."""
     bag, colors, depths = recorded.bag, recorded.colors, recorded.depths
-    for name, index in ((recorded.choice.color.name, colors), (recorded.choice.depth.name, depths)):
-        if index.stamps_ns and not any(index.stamps_ns):
-            raise SourceError(f"{bag.path}: the headers of {name} have no stamps; give --clock received")
     partner = associate(colors.stamps_ns, depths.stamps_ns, recorded.within_ns)
     pairs = sorted(partner.items())
     within = f"{recorded.within_ns / 1e6:g} ms"
