@@ -76,6 +76,7 @@ class Keyframe(Message, frozen=True, kw_only=True):
     mask: bytes = b""  # a PNG file, 8 bit, not 0 = something that moves, kept out of the map; empty = nothing does
     space: str = ""  # of an encoding job: the embedding space wanted; empty = every space that has workers
     origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # where this world has its zero in the source's, levelled
+    camera: str = ""  # which of a robot's cameras took it; empty = its only one
 
     def check(self) -> None:
         check_pose(self.world_from_camera)

@@ -74,6 +74,12 @@ OPTIONS = (
     Option("--origin", "origin", "keep|auto|X,Y,Z", "new zero of the world; auto: recentred when kilometres away"),
     Option("--up", "world_up", "X,Y,Z", "direction that points up in the source's world", listed=True),
     Option("--floor", "floor_m", "METRES", "height of the floor in the source's world, along up"),
+    Option(
+        "--cameras",
+        "cameras",
+        "all|TOPIC,…",
+        "read several RGB-D cameras of a robot of ROS at once: all, or their colour topics (default: one camera)",
+    ),
     Option("--color-topic", "color_topic", "TOPIC", "colour images of a ROS recording (see `prior-sg ros topics`)"),
     Option("--depth-topic", "depth_topic", "TOPIC", "its depth images"),
     Option("--info-topic", "info_topic", "TOPIC", "camera info of its colour images"),

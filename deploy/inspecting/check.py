@@ -139,6 +139,7 @@ def summary(source: Source, recording: Recording) -> str:
 
 def _remember(recording: Recording, frame: RawFrame) -> None:
     recording.frame_ids.append(frame.frame_id)
+    recording.cameras.append(frame.camera)
     recording.stamps_ns.append(frame.stamp_ns)
     recording.world_from_camera.append(np.array(frame.world_from_camera))
 
@@ -165,7 +166,7 @@ def _decode(recording: Recording, frame: RawFrame, *, with_color: bool) -> None:
     if with_color and grey is None:
         recording.damaged["the colour image is damaged"] += 1
     pose = recording.world_from_camera[-1]
-    recording.shots.append(Shot(frame.index, frame.intrinsics, pose, depth, frame.depth_scale_m, grey))
+    recording.shots.append(Shot(frame.index, frame.intrinsics, pose, depth, frame.depth_scale_m, grey, frame.camera))
 
 
 def _image(data: bytes, flags: int) -> np.ndarray | None:

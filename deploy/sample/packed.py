@@ -34,6 +34,7 @@ def keyframe_of(frame: RawFrame, robot: str, color: bytes, depth: bytes) -> Keyf
         depth_scale_m=frame.depth_scale_m,
         mask=frame.mask,
         origin_m=frame.origin_m,
+        camera=frame.camera,
     )
 
 

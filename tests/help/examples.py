@@ -38,6 +38,7 @@ KEYFRAME = frames.Keyframe(
     mask=b"m",
     space="s",
     origin_m=(512e3, 5.4e6, 312.0),
+    camera="left",
 )
 TASK = priors.Task(robot="r", stamp_ns=2**60, environment="home", task="tidy up", regions=["kitchen", "Küche"])
 PRIOR = priors.Prior(

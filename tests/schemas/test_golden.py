@@ -69,6 +69,13 @@ def test_what_was_written_before_the_store_kept_history_means_the_present(name, 
     assert decode(type(message), msgpack.packb(fields)) == msgspec.structs.replace(message, **defaults)
 
 
+def test_what_was_written_before_robots_had_several_cameras_is_of_the_only_one():
+    message = next(example for example in EXAMPLES if by_name(example) == "Keyframe")
+    fields = msgpack.unpackb(encode(message), ext_hook=msgpack.ExtType)
+    del fields["camera"]
+    assert decode(type(message), msgpack.packb(fields)) == msgspec.structs.replace(message, camera="")
+
+
 def test_what_was_written_before_a_long_step_was_told_has_none():
     message = next(example for example in EXAMPLES if by_name(example) == "ServiceStatus")
     fields = msgpack.unpackb(encode(message), ext_hook=msgpack.ExtType)

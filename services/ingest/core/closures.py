@@ -12,14 +12,18 @@ from scipy.spatial.transform import Rotation
 from prior_sg.services.ingest.core.frames import View
 
 
-def spread(trail: Sequence[View], camera_m: np.ndarray, after_from_before: np.ndarray) -> list[np.ndarray]:
+def spread(trail: Sequence[View], now: View, after_from_before: np.ndarray) -> list[np.ndarray]:
     """Corrected world_from_camera (4, 4) of keyframes since the last jump, oldest first.
 
-    `camera_m` (3,) is where the camera is now, before the jump: what is there moves by all of it, the first keyframe
-    by nothing.
+    `now` is the newest frame, before the jump: what is there moves by all of it, the first keyframe by nothing. From one
+    of a robot's cameras to another is no way travelled.
     """
-    places_m = np.array([view.world_from_camera[:3, 3] for view in trail] + [camera_m])
-    travelled_m = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(places_m, axis=0), axis=1))))
+    camera_m, steps_m, last = now.world_from_camera[:3, 3], [], dict[str, np.ndarray]()
+    for view in (*trail, now):
+        here_m = view.world_from_camera[:3, 3]
+        steps_m.append(float(np.linalg.norm(here_m - last.get(view.camera, here_m))))
+        last[view.camera] = here_m
+    travelled_m = np.cumsum(steps_m)
     shares = travelled_m[:-1] / travelled_m[-1] if travelled_m[-1] > 0 else np.ones(len(trail))
     return [
         _part(share, camera_m, after_from_before) @ view.world_from_camera

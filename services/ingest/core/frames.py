@@ -24,6 +24,7 @@ class RawFrame(Message, frozen=True, kw_only=True):
     mask: bytes = b""
     origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     pose_only: bool = False  # of a live source, which decodes images only where a keyframe is due
+    camera: str = ""  # as in Keyframe
 
     def check(self) -> None:
         check_pose(self.world_from_camera)
@@ -78,13 +79,14 @@ class EndOfSource(Message, frozen=True, kw_only=True):
 
 @dataclass(frozen=True)
 class View:
-    """What is remembered of a frame: its number, stamp and pose."""
+    """What is remembered of a frame: its number, stamp and pose, and which camera took it."""
 
     frame_id: int
     stamp_ns: int
     world_from_camera: np.ndarray
+    camera: str = ""
 
     @staticmethod
     def of(frame: RawFrame) -> "View":
         """A view with a pose of its own."""
-        return View(frame.frame_id, frame.stamp_ns, np.array(frame.world_from_camera))
+        return View(frame.frame_id, frame.stamp_ns, np.array(frame.world_from_camera), frame.camera)

@@ -18,6 +18,7 @@ LensModel = Literal["pinhole", "opencv", "fisheye"]
 COEFFICIENTS: dict[str, tuple[int, ...]] = {"pinhole": (0,), "opencv": (4, 5, 8), "fisheye": (4,)}
 LIVE = "ros2:"
 ORIGIN_KEPT, ORIGIN_AUTO = "keep", "auto"
+ALL_CAMERAS = "all"
 
 
 class ReadOptions(msgspec.Struct, frozen=True, kw_only=True):
@@ -43,6 +44,7 @@ class ReadOptions(msgspec.Struct, frozen=True, kw_only=True):
     intrinsics: list[float] = msgspec.field(default_factory=list)  # fx fy cx cy, pixels; then width height, if other
     camera_model: Literal["", LensModel] = ""  # of the lens; opencv = radial and tangential, fisheye = Kannala-Brandt
     distortion: list[float] = msgspec.field(default_factory=list)  # its coefficients, as OpenCV orders them
+    cameras: str = ""  # of a robot of ROS: all, or colour topics separated by commas; empty = one camera
     color_topic: str = ""  # of a ROS recording; empty = chosen by type, frame and name, as are the next three
     depth_topic: str = ""
     info_topic: str = ""  # the colour camera's info
@@ -73,8 +75,21 @@ class ReadOptions(msgspec.Struct, frozen=True, kw_only=True):
             len(self.intrinsics) in (4, 6) and all(math.isfinite(v) and v > 0 for v in self.intrinsics)
         ):
             raise ValueError("intrinsics must be fx fy cx cy, or fx fy cx cy width height, in pixels")
+        of_one = (self.color_topic, self.depth_topic, self.info_topic, self.intrinsics, self.distortion, self.rate_hz)
+        if self.cameras and any(of_one):
+            raise ValueError(
+                "several cameras have their own topics, intrinsics, lenses and stamps: with --cameras leave out "
+                "--color-topic, --depth-topic, --info-topic, --intrinsics, --distortion and --rate"
+            )
         check_lens(self.camera_model, self.distortion)
         offset_of(self.origin)
+
+    @property
+    def named_cameras(self) -> tuple[str, ...]:
+        """Colour topics of the cameras that are asked for, without their first slashes; empty = all, or one."""
+        if self.cameras == ALL_CAMERAS:
+            return ()
+        return tuple(filter(None, (name.strip().lstrip("/") for name in self.cameras.split(","))))
 
     def frame_ns(self, published_hz: float) -> float:
         """Nanoseconds between frames of a layout without stamps."""

@@ -45,8 +45,7 @@ class State:
     robot: str
     epoch: int = 0
     last: View | None = None  # newest frame believed
-    jumped: View | None = None  # frame refused because its pose jumped, if that was the newest frame
-    keyframe: View | None = None  # newest keyframe
+    cameras: dict[str, "Camera"] = field(default_factory=dict)  # of the robot, by name
     read: int = 0
     total: int = 0
     rejected: int = 0
@@ -60,6 +59,15 @@ class State:
     continuity: Continuity = field(default_factory=Continuity)
     losses: Losses = field(default_factory=Losses)
     archive: KeyframeArchive = field(default_factory=KeyframeArchive)
+
+
+@dataclass
+class Camera:
+    """What is remembered of one of a robot's cameras, each of which goes its own way."""
+
+    last: View | None = None  # newest frame believed
+    jumped: View | None = None  # frame refused because its pose jumped, if that was the newest frame
+    keyframe: View | None = None  # newest keyframe
 
 
 @dataclass(frozen=True)
@@ -79,7 +87,7 @@ def judge(state: State, frame: RawFrame, cfg: Config) -> Verdict:
     refusal = None if last is None else line.out_of_line(last, shifted)
     if last is None or refusal is None:
         waiting = line.release()
-        if last is not None and (jump := _jump(state, last, shifted, cfg)) is not None:
+        if (jump := _jump(_camera(state, shifted.camera), shifted, cfg)) is not None:
             return Verdict(refused=[*waiting, Held(shifted, jump)])
         line.interval_ns = 0 if last is None else shifted.stamp_ns - last.stamp_ns
         return Verdict([shifted], waiting)
@@ -94,7 +102,7 @@ def judge(state: State, frame: RawFrame, cfg: Config) -> Verdict:
 def refuse(state: State, held: Held) -> Iterator[Written]:
     """Count a frame that `judge` refused."""
     if held.refusal.kind == POSES_JUMP:
-        state.jumped = View.of(held.frame)
+        _camera(state, held.frame.camera).jumped = View.of(held.frame)
     _count_refused(state.losses, held)
     yield from _lose(state, held.frame.total)
 
@@ -114,13 +122,15 @@ def pass_over(state: State, unused: Unused) -> Iterator[Written]:
 def accept(state: State, frame: RawFrame, cfg: Config) -> Iterator[Written]:
     """Report the camera, and make the frame a keyframe when it is due."""
     state.read, state.total = state.read + 1, frame.total
-    state.last, state.jumped = View.of(frame), None
+    camera = _camera(state, frame.camera)
+    state.last = camera.last = View.of(frame)
+    camera.jumped = None
     yield (
         CAMERA_STATE,
         CameraState(robot=state.robot, stamp_ns=frame.stamp_ns, world_from_camera=frame.world_from_camera),
     )
-    if not frame.pose_only and due(state.keyframe, frame, cfg):
-        state.keyframe = state.last
+    if not frame.pose_only and due(camera.keyframe, frame, cfg):
+        camera.keyframe = state.last
         state.trail.append(state.last)
         keyframe = _keyframe(state, frame)
         state.archive.put(keyframe, cfg.archive_mb * 1e6)
@@ -175,10 +185,13 @@ def close_loop(state: State, closure: Closure) -> Iterator[Written]:
     if state.last is None or not state.trail:
         return
     moved = np.array(closure.after_from_before)
-    poses = spread(state.trail, state.last.world_from_camera[:3, 3], moved)
+    poses = spread(state.trail, state.last, moved)
     trail, state.trail = state.trail, []
-    state.last = replace(state.last, world_from_camera=moved @ state.last.world_from_camera)
-    state.keyframe = replace(trail[-1], world_from_camera=poses[-1])
+    state.last = _moved(state.last, moved)
+    for camera in state.cameras.values():
+        camera.last = _moved(camera.last, moved) if camera.last is not None else None
+    for view, pose in zip(trail, poses, strict=True):
+        _camera(state, view.camera).keyframe = replace(view, world_from_camera=pose)
     ids = np.array([view.frame_id for view in trail], np.int64)
     yield from _update(state, closure.stamp_ns, ids, np.stack(poses))
 
@@ -245,9 +258,18 @@ def _update(state: State, stamp_ns: int, frame_ids: np.ndarray, world_from_camer
     state.corrections += 1
 
 
-def _jump(state: State, last: View, frame: RawFrame, cfg: Config) -> Refusal | None:
+def _camera(state: State, name: str) -> Camera:
+    return state.cameras.setdefault(name, Camera())
+
+
+def _moved(view: View, motion: np.ndarray) -> View:
+    return replace(view, world_from_camera=motion @ view.world_from_camera)
+
+
+def _jump(camera: Camera, frame: RawFrame, cfg: Config) -> Refusal | None:
     """Why the pose cannot follow; a tracker that stays where it jumped to has found its place again."""
-    if reachable(last, frame, cfg) or (state.jumped is not None and reachable(state.jumped, frame, cfg)):
+    last, jumped = camera.last, camera.jumped
+    if last is None or reachable(last, frame, cfg) or (jumped is not None and reachable(jumped, frame, cfg)):
         return None
     distance_m = np.linalg.norm(frame.world_from_camera[:3, 3] - last.world_from_camera[:3, 3])
     text = f"its pose jumps by {distance_m:.2f} m in {(frame.stamp_ns - last.stamp_ns) / 1e9:.3f} s"
@@ -275,4 +297,5 @@ def _keyframe(state: State, frame: RawFrame) -> Keyframe:
         depth_scale_m=frame.depth_scale_m,
         mask=frame.mask,
         origin_m=frame.origin_m,
+        camera=frame.camera,
     )

@@ -121,6 +121,8 @@ class Found:
     why: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     assumed_hz: float = 0.0  # frames per second where the layout has no stamps and nobody told; 0 = stamps are real
+    name: str = ""  # of the camera, where the robot has several
+    beside: "tuple[Found, ...]" = ()  # its other cameras, in the same world and with real stamps
 
 
 def truth_beside(path: Path) -> dict[str, Any] | None:

@@ -33,6 +33,7 @@ from prior_sg.services.ingest.sources.cameras import Sizes, camera_of_images, st
 from prior_sg.services.ingest.sources.tables import FEW, SourceError
 
 UNUSABLE = (FrameError, PoseError, ImageError)
+Samples = Sequence[tuple[np.ndarray, Images]]  # source_from_camera and pictures of a few frames
 LOOKED_AT, TRIED = 8, 64  # frames that are decoded when a source is opened, and how many may be bad before them
 FAR_M, HIGH_M = 1000.0, 50.0  # coordinates beyond are of a map's grid, or above the sea
 EYE_LEVEL_M = 1.5
@@ -64,6 +65,7 @@ class Normaliser:
     maps: tuple[np.ndarray, np.ndarray] | None  # where the pixels of a straight image lie in a bent one
     world_from_source: np.ndarray | None  # None = nothing to be done, so that poses pass unchanged
     origin_m: tuple[float, float, float]  # where the frames' world has its zero in the source's, levelled
+    camera: str = ""  # its name, where the robot has several
 
     def frame(  # noqa: PLR0917
         self, index: int, total: int, frame_id: int, stamp_ns: int, source_from_camera: np.ndarray, images: Images
@@ -83,6 +85,7 @@ class Normaliser:
                 index=index,
                 total=total,
                 origin_m=self.origin_m,
+                camera=self.camera,
             )
         except UNUSABLE:
             raise
@@ -108,6 +111,7 @@ class Normaliser:
             depth_scale_m=self.depth.scale_m,
             index=index,
             total=total,
+            camera=self.camera,
         )
 
     def pose(self, source_from_camera: np.ndarray) -> np.ndarray:
@@ -204,28 +208,58 @@ def finish(found: Found, options: ReadOptions) -> Source:
         raise SourceError(f"none of the frames of {found.path} can be read: {_most_common(reasons)}")
     poses = [pose for pose, _ in samples]
     normaliser, notes = prepare(found, options, samples)
+    others = [_beside(other, normaliser, options) for other in found.beside]
     corrections = [
         msgspec.structs.replace(correction, world_from_camera=normaliser.pose(correction.world_from_camera))
         for correction in found.corrections
     ]
     entries, paced = _paced(found, options)
-    total = len(entries)
+    rolls = _interleaved([(normaliser, entries), *((one, other.entries) for one, other, _ in others)])
+    total = len(rolls)
     return Source(
         layout=found.layout,
         path=found.path,
         intrinsics=normaliser.intrinsics,
         total=total,
-        frames=lambda: _frames(normaliser, entries),
+        frames=lambda: _frames(rolls),
         ground_truth=shifted_truth(found.ground_truth, normaliser.origin_m),
         corrections=lambda: iter(corrections),
         why=found.why,
-        notes=(*found.notes, *paced, *_rounded(poses), *notes),
+        notes=(*found.notes, *paced, *_rounded(poses), *notes, *(note for _, _, told in others for note in told)),
         origin_m=normaliser.origin_m,
         convention=found.convention,
         depth_unit_m=normaliser.depth.unit_m,
         world_from_source=normaliser.world_from_source,
-        thinned=lambda wanted: _frames(normaliser, entries, wanted),
+        thinned=lambda wanted: _frames(rolls, wanted),
     )
+
+
+def beside(found: Found, first: Normaliser, options: ReadOptions, samples: Samples) -> tuple[Normaliser, list[str]]:
+    """What is to be done to the frames of a robot's further camera, which is in the first one's world, and notes on it.
+
+    Raises SourceError.
+    """
+    own, notes = prepare(found, msgspec.structs.replace(options, origin=ORIGIN_KEPT), samples)
+    own = replace(own, world_from_source=first.world_from_source, origin_m=first.origin_m, camera=found.name)
+    return own, [f"{found.name}: {note}" for note in notes]
+
+
+def _beside(found: Found, first: Normaliser, options: ReadOptions) -> tuple[Normaliser, Found, list[str]]:
+    """The same, of a recording's. Raises SourceError."""
+    samples, reasons = _look(found.entries)
+    if not samples and len(found.entries) >= FEW:
+        raise SourceError(f"none of the frames of {found.name} can be read: {_most_common(reasons)}")
+    own, notes = beside(found, first, options, samples)
+    return own, found, [*(f"{found.name}: {note}" for note in found.notes), *notes]
+
+
+def _interleaved(cameras: Sequence[tuple[Normaliser, Sequence[Entry]]]) -> list[tuple[Normaliser, Entry]]:
+    """Frames of all cameras by stamp, numbered anew where there are several; one camera's stay as they are."""
+    rolls = [(normaliser, entry) for normaliser, entries in cameras for entry in entries]
+    if len(cameras) == 1:
+        return rolls
+    rolls.sort(key=lambda roll: roll[1].stamp_ns)
+    return [(normaliser, replace(entry, frame_id=number)) for number, (normaliser, entry) in enumerate(rolls)]
 
 
 def _check_applicable(found: Found, options: ReadOptions) -> None:
@@ -242,10 +276,10 @@ def _check_applicable(found: Found, options: ReadOptions) -> None:
 
 
 def _frames(
-    normaliser: Normaliser, entries: Sequence[Entry], wanted: Wanted | None = None
+    rolls: Sequence[tuple[Normaliser, Entry]], wanted: Wanted | None = None
 ) -> Iterator[RawFrame | BadFrame]:
-    total = len(entries)
-    for index, entry in enumerate(entries):
+    total = len(rolls)
+    for index, (normaliser, entry) in enumerate(rolls):
         try:
             pose = entry.pose()
             whole = wanted is None or wanted(index, normaliser.pose(pose))
@@ -321,7 +355,7 @@ def _rounded(poses: Sequence[np.ndarray]) -> tuple[str, ...]:
 
 
 def prepare(
-    found: Found, options: ReadOptions, samples: Sequence[tuple[np.ndarray, Images]]
+    found: Found, options: ReadOptions, samples: Samples
 ) -> tuple[Normaliser, tuple[str, ...]]:
     """What is to be done to the frames of a source, and the notes on it. Raises SourceError."""
     notes: list[str] = []
@@ -334,7 +368,8 @@ def prepare(
     if any(origin_m):
         world_from_source = np.eye(4) if world_from_source is None else world_from_source
         world_from_source[:3, 3] -= origin_m
-    normaliser = Normaliser(camera.intrinsics, sizes, depth, straight_maps(camera), world_from_source, origin_m)
+    maps = straight_maps(camera)
+    normaliser = Normaliser(camera.intrinsics, sizes, depth, maps, world_from_source, origin_m, found.name)
     _check_frames(normaliser, found.path, samples)
     return normaliser, tuple(notes)
 
@@ -446,7 +481,7 @@ def _place(origin_m: Sequence[float]) -> str:
     return " ".join(f"{value:.10g}" for value in origin_m) + " m"
 
 
-def _check_frames(normaliser: Normaliser, path: Path, samples: Sequence[tuple[np.ndarray, Images]]) -> None:
+def _check_frames(normaliser: Normaliser, path: Path, samples: Samples) -> None:
     """Raise SourceError when not one of the frames looked at can be used."""
     reasons = []
     for pose, images in samples:

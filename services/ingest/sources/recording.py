@@ -144,7 +144,8 @@ def _frames(
             frame_id = keyframe.frame_id
             stamp_ns = options.told_ns(index, keyframe.stamp_ns)
             pose = convention.of_matrix(np.array(keyframe.world_from_camera))
-            normaliser = normaliser_of((keyframe.intrinsics, keyframe.depth_scale_m))
+            rig = keyframe.intrinsics, keyframe.depth_scale_m
+            normaliser = replace(normaliser_of(rig), camera=keyframe.camera)
             make = normaliser.frame if wanted is None or wanted(index, normaliser.pose(pose)) else normaliser.bare
             yield make(index, total, frame_id, stamp_ns, pose, _images(keyframe))
         except (DecodeError, SourceError, *UNUSABLE) as error:

@@ -28,6 +28,10 @@ class SourceError(ServiceError):
     """A source cannot be opened; the text is one sentence for the user."""
 
 
+class LastingError(SourceError):
+    """The same, of a fault of a running robot that waiting does not mend."""
+
+
 def text_of(path: Path) -> str:
     """A text file's content without its byte-order mark. Raises SourceError."""
     try:

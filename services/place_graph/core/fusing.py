@@ -27,9 +27,9 @@ def fuse_and_keep(state: State, keyframe: Keyframe, depth_m: np.ndarray, cfg: Co
     return fuse(state, keyframe, depth_m, cfg)
 
 
-def fuse_doubted(state: State, cfg: Config) -> Iterator[np.ndarray]:
-    """Fuse the keyframes of a jump that has turned out to be right."""
-    for frame_id in state.trajectory.astray_ids():
+def fuse_doubted(state: State, latest: Keyframe, cfg: Config) -> Iterator[np.ndarray]:
+    """Fuse the keyframes of a jump that has turned out to be right with the latest one of their camera."""
+    for frame_id in state.trajectory.astray_ids(latest):
         kept = state.archive.get(frame_id)
         if kept is not None and not kept.fused:
             state.trajectory.correct(kept.keyframe)

@@ -30,7 +30,7 @@ def distrust(state: State, keyframe: Keyframe, depth_m: np.ndarray, jump_m: floa
     reason = f"its pose jumps by {jump_m:.2f} m"
     view = tsdf.View(depth_m, keyframe.intrinsics, keyframe.world_from_camera)
     state.trajectory.doubt(keyframe, cfg.bounds, tsdf.contradiction(state.grid, view, cfg.fusion))
-    latest = state.trajectory.contradictions[-cfg.relocalised_after :]
+    latest = state.trajectory.way_of(keyframe).contradictions[-cfg.relocalised_after :]
     if len(latest) < cfg.relocalised_after:
         return reason
     share = float(np.mean(latest))

@@ -1,6 +1,6 @@
 """Whether a keyframe's pose can follow those before it (pure).
 
-A camera moves at bounded speed. A keyframe that lies farther away than that is refused: the tracker has jumped. If the
+A camera moves at bounded speed; each of a robot's cameras is followed by itself. A keyframe that lies farther away than that is refused: the tracker has jumped. If the
 following ones move on smoothly from there, the tracker may have found its place again; they are believed once a few of
 them in a row have done so and they do not contradict the map.
 """
@@ -35,50 +35,61 @@ class Bounds:
 
 
 @dataclass
-class Trajectory:
-    """Stamps and camera centres believed so far, and those of a jump that goes on."""
+class Way:
+    """Stamps and centres of one camera believed so far, and those of a jump that goes on."""
 
     believed: list[Point] = field(default_factory=list)  # by stamp
     astray: list[Point] = field(default_factory=list)
     contradictions: list[float] = field(default_factory=list)  # of these with the map, as shares of their depth
 
-    @property
-    def newest_ns(self) -> int:
-        """The newest stamp believed."""
-        return self.believed[-1].stamp_ns if self.believed else -(2**63)
-
-    def jump_m(self, keyframe: Keyframe, bounds: Bounds) -> float:
-        """How far a keyframe lies from its neighbour in time, if that cannot be true; else 0."""
-        return _leap_m(self.believed, keyframe, bounds)
-
-    def goes_on(self, keyframe: Keyframe, bounds: Bounds) -> bool:
-        """Whether it moves on smoothly from the jump before it."""
-        return bool(self.astray) and not _leap_m(self.astray[-1:], keyframe, bounds)
-
-    def astray_ids(self) -> list[int]:
-        """The keyframes of the jump that goes on."""
-        return [point.frame_id for point in self.astray]
-
-    def believe(self, keyframe: Keyframe) -> None:
-        """The keyframe is where it says."""
-        insort(self.believed, _point(keyframe))
-        self._forget()
-
-    def doubt(self, keyframe: Keyframe, bounds: Bounds, contradiction: float) -> None:
-        """The keyframe may not be where it says."""
-        if not self.goes_on(keyframe, bounds):
-            self._forget()
-        self.astray.append(_point(keyframe))
-        self.contradictions.append(contradiction)
-
-    def _forget(self) -> None:
+    def forget(self) -> None:
+        """The jump is over."""
         self.astray.clear()
         self.contradictions.clear()
 
+
+@dataclass
+class Trajectory:
+    """The ways of a robot's cameras."""
+
+    ways: dict[str, Way] = field(default_factory=dict)  # by the camera's name
+
+    @property
+    def newest_ns(self) -> int:
+        """The newest stamp believed."""
+        return max((way.believed[-1].stamp_ns for way in self.ways.values() if way.believed), default=-(2**63))
+
+    def jump_m(self, keyframe: Keyframe, bounds: Bounds) -> float:
+        """How far a keyframe lies from its camera's neighbour in time, if that cannot be true; else 0."""
+        return _leap_m(self.way_of(keyframe).believed, keyframe, bounds)
+
+    def astray_ids(self, keyframe: Keyframe) -> list[int]:
+        """The keyframes of the jump that goes on, of its camera."""
+        return [point.frame_id for point in self.way_of(keyframe).astray]
+
+    def believe(self, keyframe: Keyframe) -> None:
+        """The keyframe is where it says."""
+        way = self.way_of(keyframe)
+        insort(way.believed, _point(keyframe))
+        way.forget()
+
+    def doubt(self, keyframe: Keyframe, bounds: Bounds, contradiction: float) -> None:
+        """The keyframe may not be where it says."""
+        way = self.way_of(keyframe)
+        if not way.astray or _leap_m(way.astray[-1:], keyframe, bounds):
+            way.forget()
+        way.astray.append(_point(keyframe))
+        way.contradictions.append(contradiction)
+
     def correct(self, keyframe: Keyframe) -> None:
         """The keyframe is here, wherever it was believed to be before."""
-        self.believed = [point for point in self.believed if point.frame_id != keyframe.frame_id]
-        insort(self.believed, _point(keyframe))
+        way = self.way_of(keyframe)
+        way.believed = [point for point in way.believed if point.frame_id != keyframe.frame_id]
+        insort(way.believed, _point(keyframe))
+
+    def way_of(self, keyframe: Keyframe) -> Way:
+        """That of its camera."""
+        return self.ways.setdefault(keyframe.camera, Way())
 
 
 def _point(keyframe: Keyframe) -> Point:

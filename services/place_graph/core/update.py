@@ -40,7 +40,7 @@ def integrate(state: State, keyframe: Keyframe, cfg: Config) -> PlaceDelta:
     changed = [fuse_and_keep(state, keyframe, depth_m, cfg)]
     if jump_m:
         event = f"believed again at keyframe {keyframe.frame_id}: the pose stays where it jumped to and fits the map"
-        changed += fuse_doubted(state, cfg)
+        changed += fuse_doubted(state, keyframe, cfg)
     state.trajectory.believe(keyframe)
     changes = renew(state, np.concatenate(changed), cfg)
     leave_behind(state, keyframe, cfg)

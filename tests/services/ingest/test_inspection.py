@@ -33,6 +33,7 @@ def recording(
         total=len(poses),
         read=len(poses),
         frame_ids=list(range(len(poses))),
+        cameras=[""] * len(poses),
         stamps_ns=stamps_ns or [index * SPACING_NS for index in range(len(poses))],
         world_from_camera=list(poses),
         keyframes=len(poses),

@@ -22,17 +22,20 @@ from prior_sg.services.ingest.core.config import Config
 from prior_sg.services.ingest.core.frames import BadFrame, Closure, Correction, RawFrame, Unused
 from prior_sg.services.ingest.core.options import ReadOptions
 from prior_sg.services.ingest.core.poses import PoseError
-from prior_sg.services.ingest.core.ros.assembly import Assembly, Shot
+from prior_sg.services.ingest.core.ros.assembly import Assembly, Rules, Shot
+from prior_sg.services.ingest.core.ros.motions import Motions
 from prior_sg.services.ingest.core.ros.posing import Way
 from prior_sg.services.ingest.core.ros.topics import Topic
 from prior_sg.services.ingest.core.ros.transforms import Stamped
 from prior_sg.services.ingest.core.selection import State
 from prior_sg.services.ingest.service import step
 from prior_sg.services.ingest.sources import Source, SourceError, open_source
-from prior_sg.services.ingest.sources.ros.live import Due, Stream, robot_of
+from prior_sg.services.ingest.sources.ros.eyes import robot_of
+from prior_sg.services.ingest.sources.ros.live import Due
 from prior_sg.services.ingest.sources.ros.look import Look
+from prior_sg.services.ingest.sources.ros.reader import robot_types
+from prior_sg.services.ingest.sources.ros.stream import Stream
 from prior_sg.services.runtime.ros.session import Received
-from prior_sg.services.runtime.ros.types import shared_types
 from prior_sg.services.runtime.ros.wire import PUBLISHER, Attachment, Channel, Entity
 from tests.help.bags import COLOR, DEPTH, INFO, OPTICAL, Maker
 from tests.help.robot import Robot, shifted
@@ -83,7 +86,7 @@ def received(maker, shift_s=0):
 
 def robot_heard(maker, **options):
     """What a look at a robot that plays this finds."""
-    session, types = Wire(maker), shared_types()
+    session, types = Wire(maker), robot_types()
     look = Look(session, types)
     look.listen(0)
     session.deliver(received(maker))
@@ -118,8 +121,9 @@ def test_the_frames_of_the_bag_come_out_whatever_the_order_on_the_way(walked, tm
 
 
 def test_a_colour_image_waits_for_the_closest_depth_image():
-    assembly = Assembly(Way("camera", topic="/pose", body="camera"), 20 * MS)
-    assembly.motion(Topic("/pose", "geometry_msgs/msg/PoseStamped", 1, 0), [pose_at(0), pose_at(1000)])
+    motions = Motions()
+    assembly = Assembly(Rules.of_images(Way("camera", topic="/pose", body="camera"), 20 * MS), motions)
+    motions.take(Topic("/pose", "geometry_msgs/msg/PoseStamped", 1, 0), [pose_at(0), pose_at(1000)])
     colors = [Shot(at_ms * MS, 0, b"color") for at_ms in (100, 150, 200)]
     depths = [Shot(at_ms * MS, 0, b"depth") for at_ms in (85, 102, 149, 185, 240)]
     for shot in (depths[0], colors[0]):
@@ -282,7 +286,7 @@ def test_mutated_messages_cost_themselves_and_one_sentence(walked, rng):
 
 
 def test_a_look_at_mutated_messages_ends_with_a_robot_or_one_sentence(walked, rng):
-    messages, types, found = received(walked), shared_types(), 0
+    messages, types, found = received(walked), robot_types(), 0
     for _ in range(max(12, MUTATIONS // 200)):
         session = Wire(walked)
         look = Look(session, types)

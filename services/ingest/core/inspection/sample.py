@@ -26,6 +26,7 @@ class Shot:
     depth: np.ndarray  # (h, w), units of depth_scale_m, 0 = no measurement
     depth_scale_m: float
     grey: np.ndarray | None = None  # (h, w) uint8, the colour image; None = not decoded
+    camera: str = ""  # of several that a robot has
 
     def view(self, factor: float = 1.0) -> DepthView:
         """Its depth in metres, times a factor; the largest value of 16 bits is no measurement."""
@@ -41,7 +42,8 @@ class Recording:
     total: int  # frames in the source, 0 = unknown
     depth_unit_m: float = 0.0  # metres per unit of depth as the files hold it; 0 = as the shots say
     read: int = 0
-    frame_ids: list[int] = field(default_factory=list)  # of readable frames, as the next two
+    frame_ids: list[int] = field(default_factory=list)  # of readable frames, as the next three
+    cameras: list[str] = field(default_factory=list)
     stamps_ns: list[int] = field(default_factory=list)
     world_from_camera: list[np.ndarray] = field(default_factory=list)
     unreadable: Counter[str] = field(default_factory=Counter)  # by reason
@@ -82,5 +84,6 @@ class Picker:
 
 
 def pairs_of(shots: Sequence[Shot]) -> list[tuple[int, int]]:
-    """Pairs of neighbours in a sample that lie close in the recording."""
-    return [(i, i + 1) for i, (one, other) in enumerate(pairwise(shots)) if other.index - one.index <= REACH]
+    """Pairs of one camera's neighbours in a sample that lie close in the recording."""
+    near = ((i, one, other) for i, (one, other) in enumerate(pairwise(shots)) if other.index - one.index <= REACH)
+    return [(i, i + 1) for i, one, other in near if one.camera == other.camera]

@@ -1,6 +1,6 @@
 """Frames, stamps and motion of a whole recording (pure)."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -72,8 +72,9 @@ def _stamps(recording: Recording) -> list[Finding]:
     stamps_s = np.array(recording.stamps_ns, float) / 1e9
     if len(stamps_s) < 2:
         return []
+    others = np.array([one != other for one, other in pairwise(recording.cameras)], bool)
     steps_s = np.diff(stamps_s)
-    back, same = int((steps_s < 0).sum()), int((steps_s == 0).sum())
+    back, same = int((steps_s < 0).sum()), int(((steps_s == 0) & ~others).sum())
     rising_s = steps_s[steps_s > 0]
     if not len(rising_s):
         return [problem("stamps", "they do not rise", "--rate HZ gives the frames stamps of their own")]
@@ -91,14 +92,16 @@ def _stamps(recording: Recording) -> list[Finding]:
 
 
 def _motion(recording: Recording) -> list[Finding]:
-    poses, stamps_s = recording.world_from_camera, np.array(recording.stamps_ns, float) / 1e9
-    if len(poses) < 2:
+    poses, pairs = recording.world_from_camera, _neighbours(recording.cameras)
+    if not pairs:
         return []
+    before, after = map(list, zip(*pairs, strict=True))
+    stamps_s = np.array(recording.stamps_ns, float) / 1e9
     positions_m = np.stack([pose[:3, 3] for pose in poses])
-    steps_m = np.linalg.norm(np.diff(positions_m, axis=0), axis=1)
-    turns_deg = np.degrees([rotation_angle_rad(inverse(a) @ b) for a, b in pairwise(poses)])
-    spacing_s = np.maximum(np.diff(stamps_s), 1e-9)
-    forward = np.diff(stamps_s) > 0
+    steps_m = np.linalg.norm(positions_m[after] - positions_m[before], axis=1)
+    turns_deg = np.degrees([rotation_angle_rad(inverse(poses[a]) @ poses[b]) for a, b in pairs])
+    gone_s = stamps_s[after] - stamps_s[before]
+    spacing_s, forward = np.maximum(gone_s, 1e-9), gone_s > 0
     speeds, turn_speeds = (steps_m / spacing_s)[forward], (turns_deg / spacing_s)[forward]
     said = f"{steps_m.sum():.1f} m, median {_median(speeds):.2f} m/s and {_median(turn_speeds):.0f} degrees/s"
     if steps_m.sum() < 1e-3 and turns_deg.sum() < 0.1:
@@ -110,6 +113,17 @@ def _motion(recording: Recording) -> list[Finding]:
     if jumps:
         return [note("motion", f"{said}; it jumps {jumps} times, at most {steps_m.max():.2f} m")]
     return [ok("motion", said)]
+
+
+def _neighbours(cameras: Sequence[str]) -> list[tuple[int, int]]:
+    """Positions of each frame and the next one of its camera."""
+    last: dict[str, int] = {}
+    pairs = []
+    for position, camera in enumerate(cameras):
+        if camera in last:
+            pairs.append((last[camera], position))
+        last[camera] = position
+    return pairs
 
 
 def _place(recording: Recording) -> list[Finding]:

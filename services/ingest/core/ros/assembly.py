@@ -1,7 +1,7 @@
 """Messages of a robot, as they come in, to posed frames: what `pairing` and `posing` do of a recording (pure).
 
 A colour image waits until no depth image can come that is closer, and a pair until the transforms reach its stamp, but
-not longer than PATIENCE_NS.
+not longer than PATIENCE_NS. Frames of several cameras wait as long for earlier ones of each other.
 """
 
 from bisect import insort
@@ -11,19 +11,15 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from prior_sg.services.geometry import inverse, rotation_angle_rad
 from prior_sg.services.ingest.core.pairing import associate
 from prior_sg.services.ingest.core.poses import PoseError
+from prior_sg.services.ingest.core.ros.motions import Fault, Jump, Motions
 from prior_sg.services.ingest.core.ros.posing import Way
-from prior_sg.services.ingest.core.ros.recent import NOT_MOTION, Recent, RecentTransforms
-from prior_sg.services.ingest.core.ros.topics import FIXED_TRANSFORMS, TF_TYPES, Topic
-from prior_sg.services.ingest.core.ros.transforms import Stamped
 
 PATIENCE_NS = 1_200_000_000  # of a pair for its pose, by the time of arrival; longer than is interpolated over
 WAITING = 64  # images of a stream that wait for a partner, pairs that wait for a pose
 NEVER_NS = -(1 << 62)
 BACK_NS = 1_000_000_000  # a stream whose stamp is farther back has begun anew
-JUMP_M, JUMP_DEG = 0.05, 1.0  # more than this at once is no drift that is followed
 CLOCK_BACK = "the clock of its topic went back"
 NO_POSE, NO_DEPTH, NO_COLOR, TWICE = "no pose", "no depth image", "no colour image", "two images of one stamp"
 
@@ -47,35 +43,34 @@ class Posed:
 
 
 @dataclass(frozen=True)
-class Fault:
-    """Something that cannot be used: of what, in whose words, and of what kind (empty = as it says)."""
+class Rules:
+    """How images of one camera find each other and their pose."""
 
-    what: str
-    text: str
-    kind: str = ""
+    way: Way
+    within_ns: int  # between two images that belong together
+    pose_within_ns: int  # between a pose and a stamp before the first or after the last
+    cloud_way: Way | None = None  # of the lidar that gives depth; None = a camera's depth image
+    sweep_ns: int = 0  # after the stamp of its cloud, until which it measures
 
-
-@dataclass(frozen=True)
-class Jump:
-    """The world was moved under the robot, as its SLAM does when it closes a loop."""
-
-    stamp_ns: int
-    after_from_before: np.ndarray  # (4, 4), in the world
+    @staticmethod
+    def of_images(way: Way, within_ns: int) -> "Rules":
+        """Of an RGB-D camera."""
+        return Rules(way, within_ns, within_ns)
 
 
 class Assembly:
     """Of one camera."""
 
-    def __init__(self, way: Way, within_ns: int) -> None:
-        self.way, self.within_ns = way, within_ns
-        self.transforms, self.poses = RecentTransforms(), Recent()
+    def __init__(self, rules: Rules, motions: Motions) -> None:
+        self.rules, self.motions, self.within_ns = rules, motions, rules.within_ns
+        for way in filter(None, (rules.way, rules.cloud_way)):
+            motions.follow(way)
         self._colors: list[Shot] = []
         self._depths: list[Shot] = []
         self._newest_ns = [NEVER_NS, NEVER_NS]  # stamps of colour and depth
+        self._heard_ns = NEVER_NS  # when the newest image came
         self._pairs: deque[tuple[Shot, Shot]] = deque()
         self._faults: list[Fault] = []
-        self._drift: Stamped | None = None  # the newest transform that a SLAM corrects
-        self._jumps: deque[Jump] = deque()
 
     def color(self, shot: Shot) -> None:
         """Take a colour image."""
@@ -85,65 +80,51 @@ class Assembly:
         """Take a depth image."""
         self._image(1, self._depths, shot, NO_COLOR)
 
-    def motion(self, topic: Topic, samples: list[Stamped]) -> None:
-        """Take the transforms or poses of a message."""
-        if topic.type not in TF_TYPES and topic.name != self.way.topic:
-            return
-        for sample in samples:
-            if topic.type in TF_TYPES:
-                self._follow(sample)
-                fault = self.transforms.add(sample, topic.taken_for == FIXED_TRANSFORMS)
-            elif sample.is_motion():
-                fault = self.poses.add(sample)
-            else:
-                fault = NOT_MOTION
-            if fault:
-                self._faults.append(Fault(f"messages of {topic.name}", fault))
+    def cloud(self, shot: Shot) -> None:
+        """Take a cloud of a lidar that has no camera."""
+        if shot.stamp_ns < self._newest_ns[0] - BACK_NS:
+            said = f"{CLOCK_BACK} by {(self._newest_ns[0] - shot.stamp_ns) / 1e9:.3f} s"
+            self._faults.append(Fault("clouds", said, CLOCK_BACK))
+            self._begin_anew()
+        self._newest_ns[0], self._heard_ns = max(self._newest_ns[0], shot.stamp_ns), shot.received_ns
+        self._queue(shot, shot)
 
     def faults(self) -> list[Fault]:
         """What could not be used since the last time."""
         faults, self._faults = self._faults, []
         return faults
 
-    def ready(self, now_ns: int, ended: bool = False) -> Iterator[Posed | Jump]:
-        """Frames that are complete, oldest first, each jump before the first frame after it; of a stream that has ended
-        all that can be."""
+    def ready(self, now_ns: int, ended: bool = False) -> Iterator[Posed]:
+        """Frames that are complete, oldest first; of a stream that has ended all that can be."""
         self._pair(ended)
         while self._pairs:
             color, depth = self._pairs[0]
             waited_ns = now_ns - max(color.received_ns, depth.received_ns)
-            if not (ended or waited_ns > PATIENCE_NS or self._known(color.stamp_ns)):
+            if not (ended or waited_ns > PATIENCE_NS or self._known(color, depth)):
                 return
             self._pairs.popleft()
-            frames = (self.way.camera, self.way.fixed, self.way.body)
             try:
-                tree = self.transforms.tree(color.stamp_ns, frames)
-                pose = self.way.at(tree, self.poses.track(color.stamp_ns), color.stamp_ns, self.within_ns)
+                pose = self.motions.at(self.rules.way, color.stamp_ns, self.rules.pose_within_ns)
             except PoseError as error:
                 self._faults.append(Fault("frames", str(error), NO_POSE))
                 continue
-            while self._jumps and self._jumps[0].stamp_ns <= color.stamp_ns:
-                yield self._jumps.popleft()
             yield Posed(color, depth, pose)
 
-    def _follow(self, sample: Stamped) -> None:
-        """See whether the transform that a SLAM corrects has jumped."""
-        if (sample.parent, sample.child) != (self.way.fixed, self.way.drifting) or not sample.is_motion():
-            return
-        before, self._drift = self._drift, sample
-        if before is None or sample.stamp_ns <= before.stamp_ns:
-            return
-        moved = sample.matrix() @ inverse(before.matrix())
-        shift_m = np.linalg.norm(np.subtract(sample.position_m, before.position_m))
-        if shift_m > JUMP_M or np.degrees(rotation_angle_rad(moved)) > JUMP_DEG:
-            self._jumps.append(Jump(sample.stamp_ns, moved))
-
-    def _known(self, stamp_ns: int) -> bool:
-        """Whether nothing can come any more that changes the pose at a stamp."""
-        if not self.way.fixed and not (self.poses.samples and self.poses.newest_ns >= stamp_ns):
+    def may_have_before(self, stamp_ns: int, now_ns: int) -> bool:
+        """Whether a frame before a stamp can still come of it; of a camera that has fallen silent none does."""
+        if now_ns - self._heard_ns > PATIENCE_NS:
             return False
-        until_ns = self.transforms.known_until_ns((self.way.camera, self.way.body), self.way.fixed)
-        return not self.way.fixed if until_ns is None else until_ns >= stamp_ns
+        waiting = [color.stamp_ns for color, _ in self._pairs]
+        waiting += [shot.stamp_ns for shot in self._colors]
+        return min(waiting, default=self._newest_ns[0] + 1) < stamp_ns
+
+    def _known(self, color: Shot, depth: Shot) -> bool:
+        """Whether nothing can come any more that changes where the sensors were."""
+        cloud_way, until_ns = self.rules.cloud_way, color.stamp_ns
+        if cloud_way is None:
+            return self.motions.known(self.rules.way, until_ns)
+        until_ns = max(until_ns, depth.stamp_ns + self.rules.sweep_ns)
+        return all(self.motions.known(way, until_ns) for way in (self.rules.way, cloud_way))
 
     def _image(self, stream: int, waiting: list[Shot], shot: Shot, lacks: str) -> None:
         what = ("colour images", "depth images")[stream]
@@ -155,6 +136,7 @@ class Assembly:
             self._faults.append(Fault(what, TWICE))
             return
         self._newest_ns[stream] = max(self._newest_ns[stream], shot.stamp_ns)
+        self._heard_ns = max(self._heard_ns, shot.received_ns)
         insort(waiting, shot)
         while len(waiting) > WAITING:
             del waiting[0]
@@ -210,3 +192,41 @@ class Assembly:
 
     def _lacking(self, lacks: str) -> str:
         return f"{lacks} lies within {self.within_ns / 1e6:g} ms of it"
+
+
+class Together:
+    """Frames of a robot's cameras, in the order of their stamps, and the jumps between them."""
+
+    def __init__(self, motions: Motions) -> None:
+        self.motions = motions
+        self.cameras: list[Assembly] = []
+        self._complete: list[deque[Posed]] = []
+
+    def add(self, rules: Rules) -> None:
+        """A further camera."""
+        self.cameras.append(Assembly(rules, self.motions))
+        self._complete.append(deque())
+
+    def faults(self) -> list[Fault]:
+        """What could not be used since the last time."""
+        return [fault for one in (self.motions, *self.cameras) for fault in one.faults()]
+
+    def ready(self, now_ns: int, ended: bool = False) -> Iterator[tuple[int, Posed] | Jump]:
+        """Frames with the position of their camera; each jump comes before the first frame after it."""
+        for camera, complete in zip(self.cameras, self._complete, strict=True):
+            complete.extend(camera.ready(now_ns, ended))
+        while any(self._complete):
+            heads = [(complete[0].color.stamp_ns, i) for i, complete in enumerate(self._complete) if complete]
+            stamp_ns, first = min(heads)
+            if not ended and self._is_early(first, stamp_ns, now_ns):
+                return
+            yield from self.motions.jumps_until(stamp_ns)
+            yield first, self._complete[first].popleft()
+
+    def _is_early(self, position: int, stamp_ns: int, now_ns: int) -> bool:
+        """Whether another camera may still have an earlier frame, and is worth waiting for."""
+        complete = self._complete[position]
+        if len(complete) > WAITING or now_ns - complete[0].color.received_ns > 2 * PATIENCE_NS:
+            return False
+        others = (camera for i, camera in enumerate(self.cameras) if i != position and not self._complete[i])
+        return any(camera.may_have_before(stamp_ns, now_ns) for camera in others)

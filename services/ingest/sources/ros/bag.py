@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from prior_sg.services.ingest.core.ros import topics as ros_topics
+from prior_sg.services.ingest.core.ros.clouds import LIVOX_DEFINITIONS
 from prior_sg.services.ingest.core.ros.images import encoding_of, shown_by
 from prior_sg.services.ingest.core.ros.topics import Topic
 from prior_sg.services.ingest.core.ros.transforms import frame_name, written_stamp_ns
@@ -77,6 +78,8 @@ class Bag:
         if self.is_ros1:
             for name in ros_topics.TF_TYPES:
                 self._store.register(get_types_from_msg(TRANSFORMS, name))
+        for name, text in LIVOX_DEFINITIONS.items():
+            self._store.register(get_types_from_msg(text, name))
         with readable(path):
             self._reader: Any = Reader1(path) if self.is_ros1 else Reader2(path)
             self._reader.open()
@@ -129,7 +132,7 @@ class Bag:
         count = sum(connection.msgcount for connection in connections)
         kind, duration_s = connections[0].msgtype, self._reader.duration / 1e9
         topic = Topic(name, kind, count, count / duration_s if count > 1 and duration_s > 0 else 0.0)
-        looked_at = (ros_topics.IMAGE, ros_topics.COMPRESSED, ros_topics.CAMERA_INFO, ros_topics.POINT_CLOUD)
+        looked_at = (ros_topics.IMAGE, ros_topics.COMPRESSED, ros_topics.CAMERA_INFO, *ros_topics.CLOUDS)
         if kind not in looked_at or not count:
             return topic
         return self._looked_at(topic)
@@ -142,7 +145,7 @@ class Bag:
             except FrameError:
                 continue
             frame = frame_name(message.header.frame_id)
-            if topic.type in (ros_topics.CAMERA_INFO, ros_topics.POINT_CLOUD):
+            if topic.type in (ros_topics.CAMERA_INFO, *ros_topics.CLOUDS):
                 return replace(topic, frame=frame)
             return replace(topic, encoding=encoding_of(message), frame=frame, shows=shown_by(message))
         return topic

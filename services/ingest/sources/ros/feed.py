@@ -6,14 +6,14 @@ from collections import deque
 from collections.abc import Iterator
 
 from prior_sg.services.ingest.core.frames import Unused
-from prior_sg.services.ingest.core.ros.assembly import Fault
-from prior_sg.services.ingest.core.ros.topics import CAMERA_INFO, COMPRESSED, FIXED_TRANSFORMS, IMAGE, Topic
+from prior_sg.services.ingest.core.ros.motions import Fault
+from prior_sg.services.ingest.core.ros.topics import CAMERA_INFO, CLOUDS, COMPRESSED, FIXED_TRANSFORMS, IMAGE, Topic
 from prior_sg.services.losses import kind_of
 from prior_sg.services.runtime.ros.session import Received, RosSession
 from prior_sg.services.runtime.ros.types import Types
 from prior_sg.services.runtime.ros.wire import Channel, Quality
 
-WAITING = {IMAGE: 32, COMPRESSED: 64, CAMERA_INFO: 4}  # messages of a topic, by its type
+WAITING = {IMAGE: 32, COMPRESSED: 64, CAMERA_INFO: 4} | dict.fromkeys(CLOUDS, 16)  # messages of a topic, by its type
 OTHERS_WAITING = 4096  # transforms and poses: they are small, and a frame needs them
 MOST_BYTES = 64 << 20
 LATCHED_DEPTH = 100  # one message of /tf_static of each node of a large robot

@@ -5,9 +5,9 @@ from collections import deque
 from dataclasses import dataclass, field
 from typing import Any
 
-from prior_sg.services.ingest.core.ros.assembly import Fault
 from prior_sg.services.ingest.core.ros.images import encoding_of, shown_by
-from prior_sg.services.ingest.core.ros.topics import CAMERA_INFO, COMPRESSED, IMAGE, READ_TYPES, Topic
+from prior_sg.services.ingest.core.ros.motions import Fault
+from prior_sg.services.ingest.core.ros.topics import CAMERA_INFO, CLOUDS, COMPRESSED, IMAGE, READ_TYPES, Topic
 from prior_sg.services.ingest.core.ros.transforms import frame_name
 from prior_sg.services.ingest.sources.ros.feed import Feed, Tally
 from prior_sg.services.runtime.ros import wire
@@ -16,7 +16,9 @@ from prior_sg.services.runtime.ros.types import Types
 from prior_sg.services.runtime.ros.wire import WireError
 
 MOST_TOPICS = 500
-CAMERA_TYPES = (IMAGE, COMPRESSED, CAMERA_INFO)
+HEAVY_TYPES = (IMAGE, COMPRESSED, *CLOUDS)
+CAMERA_TYPES = (CAMERA_INFO, *HEAVY_TYPES)
+MOMENT_S = 0.1
 IMAGES_KEPT, OTHERS_KEPT = 8, 4000
 SETTLED_S = 1.5  # after the first publisher was seen, all that publishes steadily has been heard
 PATIENCE_S = 4.0  # for images that are announced and do not come
@@ -93,7 +95,7 @@ class Look:
                 continue
             if channel.type not in READ_TYPES or not self._types.knows(channel.type) or len(self.heard) >= MOST_TOPICS:
                 continue
-            most = IMAGES_KEPT if channel.type in (IMAGE, COMPRESSED) else OTHERS_KEPT
+            most = IMAGES_KEPT if channel.type in HEAVY_TYPES else OTHERS_KEPT
             self.heard[channel.name] = Heard(channel.type, kept=deque(maxlen=most))
             self._feed.open(self._session, Topic(channel.name, channel.type, 0, 0.0), self._types)
             self._found_s = self._found_s or time.monotonic()
@@ -115,5 +117,5 @@ class Look:
         heard.frame = frame_name(message.header.frame_id)
         if heard.type == CAMERA_INFO:
             heard.message = message
-        else:
+        elif heard.type not in CLOUDS:
             heard.encoding, heard.shows = encoding_of(message), shown_by(message)

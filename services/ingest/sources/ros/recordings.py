@@ -16,6 +16,7 @@ is drawn into the colour camera through the transform between the two, and colou
 transform it is taken as registered where both cameras are the same. Region truth: regions.json in a rosbag2 folder.
 """
 
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -25,7 +26,7 @@ from prior_sg.services.ingest.core.options import ReadOptions
 from prior_sg.services.ingest.core.pairing import associate
 from prior_sg.services.ingest.core.poses import Convention, PoseError
 from prior_sg.services.ingest.core.ros.posing import Way, way_of
-from prior_sg.services.ingest.core.ros.topics import NAMED, Chosen, chosen, cloud_chosen, pose_topics
+from prior_sg.services.ingest.core.ros.topics import chosen, chosen_cameras, cloud_chosen, pose_topics
 from prior_sg.services.ingest.core.ros.transforms import Track
 from prior_sg.services.ingest.sources.base import (
     MILLIMETRE,
@@ -57,12 +58,19 @@ def load(path: Path, options: ReadOptions) -> Found:
     bag = Bag(path)
     topics = bag.topics()
     try:
-        if (clouds := cloud_chosen(topics, options)) is not None:
+        if not options.cameras and (clouds := cloud_chosen(topics, options)) is not None:
             return clouds_ros.load(NAME, bag, topics, clouds, options)
-        choice, posing = chosen(topics, options), pose_topics(topics, options)
+        choices = chosen_cameras(topics, options) if options.cameras else [chosen(topics, options)]
+        posing = pose_topics(topics, options)
     except ValueError as error:
         raise SourceError(f"{path}: {error}") from error
-    recorded = Recorded(bag, options, topics, choice, posing)
+    first, *others = [_found(Recorded(bag, options, topics, choice, posing)) for choice in choices]
+    return replace(first, name=choices[0].color.image_name if options.cameras else "", beside=tuple(others))
+
+
+def _found(recorded: Recorded) -> Found:
+    """One camera. Raises SourceError."""
+    bag, choice, options = recorded.bag, recorded.choice, recorded.options
     camera, images, how = pictures(recorded.rig())
     way = _way(recorded)
     track = Track(recorded.poses.get(way.topic, ()))
@@ -81,14 +89,15 @@ def load(path: Path, options: ReadOptions) -> Found:
         )
     return Found(
         NAME,
-        path,
+        bag.path,
         camera,
         MILLIMETRE,
         entries,
-        ground_truth=truth_beside(path) if path.is_dir() else None,
+        ground_truth=truth_beside(bag.path) if bag.path.is_dir() else None,
         convention=convention,
         why=(f"it is a recording of ROS {1 if bag.is_ros1 else 2}",),
-        notes=tuple(filter(None, (f"{choice.said()}, {way.said}", _others(choice), how, *left_out))),
+        notes=tuple(filter(None, (f"{choice.said()}, {way.said}", choice.unread, how, *left_out))),
+        name=choice.color.image_name,
     )
 
 
@@ -113,12 +122,6 @@ def _pairs(recorded: Recorded) -> tuple[list[tuple[int, int]], list[str]]:
             f"within {within}: the others are left out{mend}"
         )
     return pairs, notes
-
-
-def _others(choice: Chosen) -> str:
-    if not choice.others:
-        return ""
-    return f"further images are not read: {', '.join(choice.others[:NAMED])} (--color-topic, --depth-topic)"
 
 
 def _pose(recorded: Recorded, way: Way, track: Track, convention: Convention, stamp_ns: int) -> np.ndarray:
