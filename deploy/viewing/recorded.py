@@ -142,7 +142,8 @@ def robot_of(message: Message) -> str:
 def camera_of(frame: Keyframe) -> Camera:
     """What the page shows of a keyframe. Raises ImageFault."""
     image = small_image(frame, IMAGE_PX)
-    return Camera(frame.frame_id, frame.stamp_ns, frame.intrinsics, frame.world_from_camera, image)
+    depth = msgspec.structs.replace(frame, color=b"", depth=bytes(frame.depth))
+    return Camera(frame.frame_id, frame.stamp_ns, frame.intrinsics, frame.world_from_camera, image, depth)
 
 
 def open_recorded(place: str, robot: str) -> Recorded:

@@ -8,7 +8,7 @@ import numpy as np
 
 from prior_sg.deploy.api.client import Health
 from prior_sg.deploy.viewing.cloud import Cloud
-from prior_sg.schemas.frames import Intrinsics
+from prior_sg.schemas.frames import Intrinsics, Keyframe
 from prior_sg.schemas.priors import Prior
 from prior_sg.schemas.regions import PosteriorReply
 from prior_sg.schemas.scene import Scene
@@ -25,6 +25,7 @@ class Camera:
     intrinsics: Intrinsics
     world_from_camera: np.ndarray  # (4, 4)
     image: np.ndarray  # (row, column, 3) uint8, made smaller
+    depth: Keyframe | None = None  # the keyframe without its colour, to decode its depth of; none = there is none
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from prior_sg.services.ingest.core.config import Config
 from prior_sg.services.ingest.core.continuity import AHEAD_NS, Held
 from prior_sg.services.ingest.core.frames import BadFrame, Closure, Correction, EndOfSource, RawFrame, Unused
 from prior_sg.services.ingest.core.options import is_live
-from prior_sg.services.ingest.sources import Source, SourceError, open_source
+from prior_sg.services.ingest.sources import LastingError, Source, SourceError, open_source
 from prior_sg.services.ingest.sources.base import Event
 from prior_sg.services.runtime.service import Identity, Output, Service
 
@@ -109,12 +109,15 @@ async def drive(port: Port, cfg: Config) -> None:
 
 
 async def _opened(port: Port, cfg: Config) -> Source | None:
-    """The source; a robot that is not there is waited for, until the host wishes to stop. Raises SourceError."""
+    """The source; a robot that is not there is waited for, until the host wishes to stop.
+
+    Raises SourceError; of a robot LastingError, for what waiting does not mend.
+    """
     while not port.stopping.is_set():
         try:
             return await asyncio.to_thread(_open, cfg)
         except SourceError as error:
-            if not is_live(cfg.source):
+            if isinstance(error, LastingError) or not is_live(cfg.source):
                 raise
             log.warning("no robot yet", extra={"reason": str(error)})
             await _stopped_while(port, asyncio.sleep(SEARCH_S))

@@ -5,8 +5,8 @@ import threading
 import time
 from contextlib import contextmanager
 
+from prior_sg.services.ingest.sources.ros.reader import robot_types
 from prior_sg.services.runtime.ros.session import RosSession
-from prior_sg.services.runtime.ros.types import shared_types
 from prior_sg.services.runtime.ros.wire import SUBSCRIPTION, Channel, Quality
 
 BEFORE_S, ROUND_S = 50_000, 20  # how far before the recording a rehearsal's stamps lie, and its rounds from each other
@@ -29,7 +29,7 @@ class Robot:
             for topic, _, message in sorted(maker.messages, key=lambda entry: entry[1])
         ]
         self.publishers, self.heard = {}, []
-        types = shared_types()
+        types = robot_types()
         for topic, _, message in maker.messages:
             if topic not in self.publishers:
                 quality = Quality(10, latched=topic == "/tf_static")

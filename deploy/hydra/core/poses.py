@@ -13,6 +13,7 @@ from prior_sg.deploy.hydra.core.graph import HydraGraph
 from prior_sg.services.geometry import inverse, rotation_angle_rad
 
 PAIRED_WITHIN_NS = 500_000_000
+MOST_WAITING = 1024  # keyframes that wait for Hydra's agent to come to their stamps; the oldest are forgotten
 FEWEST = 3  # pairs before their distance says something
 SAME = 1e-6  # entries of two poses that differ by no more
 
@@ -37,6 +38,8 @@ class Poses:
         """A keyframe has come."""
         if frame_id not in self.pairs:
             self._waiting[frame_id] = stamp_ns, np.array(world_from_camera)
+            while len(self._waiting) > MOST_WAITING:
+                del self._waiting[next(iter(self._waiting))]
 
     def follow(self, graph: HydraGraph, min_change_m: float, min_turn_rad: float) -> dict[int, np.ndarray]:
         """Pair the keyframes that wait, and return the poses (4, 4) of those that Hydra has moved since."""

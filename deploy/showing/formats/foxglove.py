@@ -1,4 +1,4 @@
-"""The run as a recording that Foxglove opens: images, lens and pose of each keyframe, the map as it grew.
+"""The run as a recording that Foxglove opens: images, depth, lens and pose of each keyframe, the map as it grew.
 
 Our own log keeps our own messages, which replays need; this is another file, with Foxglove's message types. Beside it
 lies a layout to import.
@@ -16,19 +16,22 @@ from prior_sg.schemas.codec import DecodeError, decode
 from prior_sg.schemas.frames import Intrinsics, Keyframe, PoseUpdate
 from prior_sg.schemas.topics import KEYFRAME, POSE_UPDATE
 from prior_sg.services.deltas import PoseCorrections
+from prior_sg.services.images import ImageFault, depth_of
 from prior_sg.services.refusals import InputRefused
 from prior_sg.services.runtime.record import read_log
 
 LAYOUT = "{}-layout.json"  # beside a recording of that name
 SURFACE_M = 0.03  # of a point
+ANY_CENTRE = float("inf")  # share of the image by which a principal point may lie off: what is shown is not mapped
 
 
 class _Image(NamedTuple):
-    """What one keyframe shows; its depth stays in the log."""
+    """What one keyframe shows."""
 
     file: bytes
     lens: Intrinsics
     world_from_camera: np.ndarray  # (4, 4)
+    frame: Keyframe  # whose depth is decoded when it is its turn
 
 
 Told = tuple[int, int, Moment | _Image]  # when, its order among the like, what
@@ -56,7 +59,9 @@ def write_foxglove(material: Material, path: Path) -> None:
                 case Moment():
                     stream.show(what.scene, stamp_ns)
                 case _Image():
-                    stream.camera(*what, stamp_ns=stamp_ns)
+                    stream.camera(what.file, what.lens, what.world_from_camera, stamp_ns)
+                    with contextlib.suppress(ImageFault):  # the map did not take it either
+                        stream.depth(depth_of(what.frame, ANY_CENTRE), stamp_ns)
     save_layout(path.with_name(LAYOUT.format(path.stem)))
 
 
@@ -80,4 +85,4 @@ def _images(material: Material) -> Iterator[Told]:
             frame = decode(Keyframe, logged.payload)
             if frame.robot == robot and frame.color:  # a lidar without a camera has no picture
                 pose = poses.pose(frame.frame_id, frame.world_from_camera)
-                yield max(frame.stamp_ns, 0), 0, _Image(bytes(frame.color), frame.intrinsics, pose)
+                yield max(frame.stamp_ns, 0), 0, _Image(bytes(frame.color), frame.intrinsics, pose, frame)

@@ -1,4 +1,4 @@
-"""A layout of Foxglove's panels that opens with our topics: the map, the camera, regions as a table, notes, counts."""
+"""A layout of Foxglove's panels that opens with our topics: map, camera, depth, regions as a table, notes, counts."""
 
 from pathlib import Path
 
@@ -6,7 +6,7 @@ from foxglove import layouts as fl
 
 from prior_sg.deploy.viewing.drawing import DARK
 from prior_sg.deploy.viewing.foxglove.shapes import WORLD
-from prior_sg.deploy.viewing.foxglove.stream import CALIBRATION, IMAGE, LAYERS, MAP, NOTES, PLACES, SCENE
+from prior_sg.deploy.viewing.foxglove.stream import CALIBRATION, DEPTH, IMAGE, LAYERS, MAP, NOTES, PLACES, SCENE
 
 HIDDEN = ("unnamed", "frontiers")  # as on the live page
 PLACE_PX, SURFACE_PX = 7.0, 2.0
@@ -16,6 +16,7 @@ def layout() -> fl.Layout:
     """The map on the left; camera, regions and notes on the right."""
     beside = [
         fl.SplitItem(proportion=4, content=_camera()),
+        fl.SplitItem(proportion=3, content=_depth()),
         fl.SplitItem(proportion=3, content=_table()),
         fl.SplitItem(proportion=2, content=_counts()),
         fl.SplitItem(proportion=1, content=fl.LogPanel(title="Notes", config=fl.LogConfig(topic_to_render=NOTES))),
@@ -61,6 +62,11 @@ def _camera() -> fl.ImagePanel:
     mode = fl.ImageModeConfig(image_topic=IMAGE, calibration_topic=CALIBRATION)
     names = {"/map/objects": fl.BaseRendererSceneUpdateTopicSettings(visible=True)}
     return fl.ImagePanel(title="Camera", config=fl.ImageConfig(image_mode=mode, topics=dict(names)))
+
+
+def _depth() -> fl.ImagePanel:
+    mode = fl.ImageModeConfig(image_topic=DEPTH, calibration_topic=CALIBRATION)
+    return fl.ImagePanel(title="Depth", config=fl.ImageConfig(image_mode=mode))
 
 
 def _table() -> fl.TablePanel:

@@ -15,9 +15,14 @@ from prior_sg.deploy.viewing.foxglove.stream import Stream
 from prior_sg.deploy.viewing.sources import Camera, Source
 from prior_sg.schemas.frames import Intrinsics
 from prior_sg.services.errors import PriorSgError
+from prior_sg.services.images import ImageFault, depth_of
 
 LOOPBACK = "127.0.0.1"  # Foxglove's protocol knows no login
+AGAIN_S = (
+    1.0  # after somebody has subscribed all is sent once more: the first time may have been before they were heard
+)
 SURFACE_S = 2.0  # at least, between sendings of the coloured points
+ANY_CENTRE = float("inf")  # share of the image by which a principal point may lie off: what is shown is not mapped
 BACKLOG = 256  # messages that wait for a slow client before the oldest goes
 
 
@@ -51,6 +56,7 @@ class Broadcast:
             )
         except RuntimeError as error:
             raise UserError(f"nothing can be served on port {port} ({error}); choose another with --port") from error
+        self._again_s: float | None = None
         self._points, self._surface_s, self._frame = -1, 0.0, -1
         self._stamp_ns, self._fault = 0, ""
 
@@ -62,8 +68,7 @@ class Broadcast:
     def follow(self, wait_s: float) -> None:
         """Wait so long for something new, and send what there is of it; what fails is noted, and tried again."""
         news = self._source.wait(wait_s)
-        if self._newcomers.came.is_set():
-            self._newcomers.came.clear()
+        if self._is_to_tell_all(time.monotonic()):
             self._stream.forget()
             self._points, self._surface_s, self._frame, news = -1, 0.0, -1, True
         try:
@@ -79,11 +84,24 @@ class Broadcast:
                 self._stream.note(str(error), self._stamp_ns)
             self._fault = str(error)
 
+    def _is_to_tell_all(self, now_s: float) -> bool:
+        """Once when somebody has subscribed, and once more when their subscription surely stands."""
+        if self._newcomers.came.is_set():
+            self._newcomers.came.clear()
+            self._again_s = now_s + AGAIN_S
+            return True
+        if self._again_s is not None and now_s >= self._again_s:
+            self._again_s = None
+            return True
+        return False
+
     def _send_camera(self) -> None:
         camera = self._source.camera()
         if camera is not None and camera.frame_id != self._frame:
             self._frame = camera.frame_id
             self._stream.camera(jpeg_of(camera), lens_of(camera), camera.world_from_camera, camera.stamp_ns)
+            if (depth_m := depth_m_of(camera)) is not None:
+                self._stream.depth(depth_m, camera.stamp_ns)
 
     def _send_surface(self) -> None:
         points, now_s = len(self._source.cloud), time.monotonic()
@@ -111,6 +129,17 @@ def serve(source: Source, port: int, say: Callable[[str], None], wait_s: float, 
 def jpeg_of(camera: Camera) -> bytes:
     """The image as a file."""
     return bytes(cv2.imencode(".jpg", np.ascontiguousarray(camera.image[:, :, ::-1]))[1].tobytes())
+
+
+def depth_m_of(camera: Camera) -> np.ndarray | None:
+    """Depth (h, w), metres, of the image's pixels; None where there is none that can be read."""
+    if camera.depth is None:
+        return None
+    try:
+        depth_m = depth_of(camera.depth, ANY_CENTRE)
+    except ImageFault:
+        return None
+    return cv2.resize(depth_m, camera.image.shape[1::-1], interpolation=cv2.INTER_NEAREST)
 
 
 def lens_of(camera: Camera) -> Intrinsics:

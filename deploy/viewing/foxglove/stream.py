@@ -15,6 +15,7 @@ from foxglove.channels import (
     FrameTransformChannel,
     LogChannel,
     PointCloudChannel,
+    RawImageChannel,
     SceneUpdateChannel,
 )
 from foxglove.messages import (
@@ -24,6 +25,7 @@ from foxglove.messages import (
     KeyValuePair,
     Log,
     LogLevel,
+    RawImage,
     SceneEntity,
     SceneEntityDeletion,
     SceneEntityDeletionType,
@@ -40,6 +42,7 @@ from prior_sg.schemas.scene import Scene
 
 LAYERS = ("regions", "edges", "objects", "unnamed", "frontiers", "trajectory")  # of entities; the rest are points
 PLACES, MAP, IMAGE, CALIBRATION = "/map/places", "/map/surface", "/camera/image", "/camera/calibration"
+DEPTH = "/camera/depth"
 TRANSFORMS, SCENE, NOTES = "/tf", "/scene", "/notes"
 MAGIC = {b"\xff\xd8\xff": "jpeg", b"\x89PN": "png"}
 SCENE_SCHEMA = {
@@ -75,6 +78,7 @@ class Stream:
         self._layers = {name: SceneUpdateChannel(f"/map/{name}", context=context) for name in LAYERS}
         self._points = {topic: PointCloudChannel(topic, context=context) for topic in (PLACES, MAP)}
         self._image = CompressedImageChannel(IMAGE, context=context)
+        self._depth = RawImageChannel(DEPTH, context=context)
         self._calibration = CameraCalibrationChannel(CALIBRATION, context=context)
         self._transforms = FrameTransformChannel(TRANSFORMS, context=context)
         self._scene = Channel(SCENE, schema=SCENE_SCHEMA, context=context)
@@ -124,6 +128,21 @@ class Stream:
         self._calibration.log(calibration_of(lens, stamp_ns), log_time=stamp_ns)
         form = next((name for magic, name in MAGIC.items() if image.startswith(magic)), "")
         self._image.log(CompressedImage(timestamp=when, frame_id=CAMERA, data=image, format=form), log_time=stamp_ns)
+
+    def depth(self, depth_m: np.ndarray, stamp_ns: int) -> None:
+        """Send the depth (h, w) of the image sent last, metres, 0 = no measurement, as millimetres of 16 bits."""
+        units = np.minimum(np.rint(depth_m * 1000.0), np.iinfo(np.uint16).max).astype("<u2")
+        height, width = units.shape
+        message = RawImage(
+            timestamp=stamp_of(stamp_ns),
+            frame_id=CAMERA,
+            width=width,
+            height=height,
+            encoding="16UC1",
+            step=width * units.itemsize,
+            data=units.tobytes(),
+        )
+        self._depth.log(message, log_time=stamp_ns)
 
     def note(self, text: str, stamp_ns: int) -> None:
         """One line of the log panel."""

@@ -15,8 +15,8 @@ from prior_sg.services.ingest.core.frames import View
 def spread(trail: Sequence[View], now: View, after_from_before: np.ndarray) -> list[np.ndarray]:
     """Corrected world_from_camera (4, 4) of keyframes since the last jump, oldest first.
 
-    `now` is the newest frame, before the jump: what is there moves by all of it, the first keyframe by nothing. From one
-    of a robot's cameras to another is no way travelled.
+    `now` is the newest frame, before the jump: what is there moves by all of it, the first keyframe by nothing. From
+    one of a robot's cameras to another is no way travelled.
     """
     camera_m, steps_m, last = now.world_from_camera[:3, 3], [], dict[str, np.ndarray]()
     for view in (*trail, now):

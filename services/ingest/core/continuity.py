@@ -68,7 +68,7 @@ class Continuity:
     def believe(self, last: View) -> tuple[list[RawFrame], str]:
         """The held frames, so that they go on from the last one, and how the clock or the count jumped."""
         frames = [held.frame for held in self.release()]
-        first, interval_ns = frames[0], max(1, frames[1].stamp_ns - frames[0].stamp_ns)
+        first, interval_ns = frames[0], frames[1].stamp_ns - frames[0].stamp_ns
         told = []
         jump_ns = first.stamp_ns + self.offset_ns - last.stamp_ns
         if jump_ns <= 0 or self._far(jump_ns):
@@ -84,7 +84,7 @@ class Continuity:
     def out_of_line(self, last: View, frame: RawFrame) -> Refusal | None:
         """Why stamp or number of a shifted frame cannot follow the last one's."""
         step_ns = frame.stamp_ns - last.stamp_ns
-        if step_ns < 0 or (step_ns == 0 and frame.camera == last.camera):
+        if step_ns <= 0:
             return Refusal(STAMPS_BACK, f"its stamp is {-step_ns / 1e9:.3f} s before the previous frame's")
         if frame.frame_id <= last.frame_id:
             return Refusal(NUMBERS_BACK, f"its number does not rise: frame {last.frame_id} came before")
@@ -97,9 +97,8 @@ class Continuity:
 
     def _goes_on(self, one: RawFrame, other: RawFrame, cfg: Config) -> bool:
         step_ns = other.stamp_ns - one.stamp_ns
-        same = one.camera == other.camera
-        rises = step_ns >= (1 if same else 0) and other.frame_id > one.frame_id and not self._far(step_ns)
-        return rises and (not same or reachable(View.of(one), other, cfg))
+        rises = step_ns > 0 and other.frame_id > one.frame_id and not self._far(step_ns)
+        return rises and (one.camera != other.camera or reachable(View.of(one), other, cfg))
 
 
 def reachable(view: View, frame: RawFrame, cfg: Config) -> bool:

@@ -4,6 +4,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+AT_ONCE_NS = 1000  # stamps of several cameras that go off together
+
 
 def associate(first_ns: Sequence[int], second_ns: Sequence[int], within_ns: int) -> dict[int, int]:
     """Index in `second_ns` (rising) of each index in `first_ns` that finds one: closest first, each used once."""
@@ -23,3 +25,9 @@ def associate(first_ns: Sequence[int], second_ns: Sequence[int], within_ns: int)
             partner[i] = j
             used.add(j)
     return partner
+
+
+def risen(stamp_ns: int, newest_ns: int | None) -> int:
+    """The stamp, or a nanosecond after the newest, where another camera went off at once: readers count on a rise."""
+    at_once = newest_ns is not None and 0 <= newest_ns - stamp_ns < AT_ONCE_NS
+    return newest_ns + 1 if newest_ns is not None and at_once else stamp_ns

@@ -27,8 +27,9 @@ from prior_sg.services.ingest.sources.hints import hint
 from prior_sg.services.ingest.sources.normalise import finish
 from prior_sg.services.ingest.sources.ros import live as ros_live
 from prior_sg.services.ingest.sources.ros import recordings as ros_recordings
+from prior_sg.services.ingest.sources.tables import LastingError
 
-__all__ = ["LAYOUT_NAMES", "ReadOptions", "Source", "SourceError", "open_source"]
+__all__ = ["LAYOUT_NAMES", "LastingError", "ReadOptions", "Source", "SourceError", "open_source"]
 
 LAYOUTS = (
     dataset,

@@ -13,7 +13,8 @@ from prior_sg.schemas.frames import Intrinsics
 from prior_sg.services.headers import JPEG_MAGIC, ImageError, is_sized, trimmed
 from prior_sg.services.ingest.core.detection import likely_unit_m
 from prior_sg.services.ingest.core.frames import BadFrame, RawFrame
-from prior_sg.services.ingest.core.options import ORIGIN_AUTO, ReadOptions, offset_of
+from prior_sg.services.ingest.core.options import ORIGIN_AUTO, ORIGIN_KEPT, ReadOptions, offset_of
+from prior_sg.services.ingest.core.pairing import risen
 from prior_sg.services.ingest.core.pixels import encoded, measured, millimetres, stored
 from prior_sg.services.ingest.core.poses import EXACT, PoseError, rigid, stretch
 from prior_sg.services.ingest.sources.base import (
@@ -258,8 +259,12 @@ def _interleaved(cameras: Sequence[tuple[Normaliser, Sequence[Entry]]]) -> list[
     rolls = [(normaliser, entry) for normaliser, entries in cameras for entry in entries]
     if len(cameras) == 1:
         return rolls
-    rolls.sort(key=lambda roll: roll[1].stamp_ns)
-    return [(normaliser, replace(entry, frame_id=number)) for number, (normaliser, entry) in enumerate(rolls)]
+    told = []
+    newest_ns: int | None = None
+    for number, (normaliser, entry) in enumerate(sorted(rolls, key=lambda roll: roll[1].stamp_ns)):
+        newest_ns = risen(entry.stamp_ns, newest_ns)
+        told.append((normaliser, replace(entry, frame_id=number, stamp_ns=newest_ns)))
+    return told
 
 
 def _check_applicable(found: Found, options: ReadOptions) -> None:
@@ -275,9 +280,7 @@ def _check_applicable(found: Found, options: ReadOptions) -> None:
         raise SourceError(f"poses of the layout {found.layout} are read in one way only: leave out {flags}")
 
 
-def _frames(
-    rolls: Sequence[tuple[Normaliser, Entry]], wanted: Wanted | None = None
-) -> Iterator[RawFrame | BadFrame]:
+def _frames(rolls: Sequence[tuple[Normaliser, Entry]], wanted: Wanted | None = None) -> Iterator[RawFrame | BadFrame]:
     total = len(rolls)
     for index, (normaliser, entry) in enumerate(rolls):
         try:
@@ -354,9 +357,7 @@ def _rounded(poses: Sequence[np.ndarray]) -> tuple[str, ...]:
     return (f"rotations are made orthonormal again (off by up to {worst:.2%})",) if worst > EXACT else ()
 
 
-def prepare(
-    found: Found, options: ReadOptions, samples: Samples
-) -> tuple[Normaliser, tuple[str, ...]]:
+def prepare(found: Found, options: ReadOptions, samples: Samples) -> tuple[Normaliser, tuple[str, ...]]:
     """What is to be done to the frames of a source, and the notes on it. Raises SourceError."""
     notes: list[str] = []
     images = [images for _, images in samples]

@@ -1,6 +1,7 @@
 """Whether a keyframe's pose can follow those before it (pure).
 
-A camera moves at bounded speed; each of a robot's cameras is followed by itself. A keyframe that lies farther away than that is refused: the tracker has jumped. If the
+A camera moves at bounded speed; each of a robot's cameras is followed by itself. A keyframe that lies farther away than
+that is refused: the tracker has jumped. If the
 following ones move on smoothly from there, the tracker may have found its place again; they are believed once a few of
 them in a row have done so and they do not contradict the map.
 """

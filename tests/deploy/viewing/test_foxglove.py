@@ -19,10 +19,11 @@ from prior_sg.deploy.showing.formats import ExportError, save
 from prior_sg.deploy.showing.material import Material, Moment
 from prior_sg.deploy.viewing.drawing import Painter
 from prior_sg.deploy.viewing.foxglove.layout import layout
-from prior_sg.deploy.viewing.foxglove.server import Broadcast, jpeg_of, lens_of
+from prior_sg.deploy.viewing.foxglove.server import AGAIN_S, Broadcast, jpeg_of, lens_of
 from prior_sg.deploy.viewing.foxglove.stream import LAYERS
 from prior_sg.deploy.viewing.held import Held
 from prior_sg.deploy.viewing.recorded import camera_of
+from prior_sg.services.images import depth_of
 from prior_sg.services.runtime.bus import BusError
 from tests.deploy.viewing.test_recorded import log as recorded_log
 from tests.help.homes import home, keyframe, region
@@ -33,6 +34,7 @@ SCHEMAS = {
     "/map/regions": "foxglove.SceneUpdate",
     "/map/edges": "foxglove.SceneUpdate",
     "/camera/image": "foxglove.CompressedImage",
+    "/camera/depth": "foxglove.RawImage",
     "/camera/calibration": "foxglove.CameraCalibration",
     "/tf": "foxglove.FrameTransform",
     "/notes": "foxglove.Log",
@@ -89,6 +91,16 @@ def test_the_image_is_the_cameras_file_where_it_was_taken(exported):
     x, y, z, w = (getattr(pose.rotation, axis) for axis in "xyzw")
     forward = (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y))
     assert forward == pytest.approx(frame.world_from_camera[:3, 2])
+
+
+def test_depth_is_in_millimetres_beside_the_image(exported):
+    _, messages = told(exported)
+    ((when, image),) = messages["/camera/depth"]
+    depth_m = depth_of(keyframe(), 0.5)
+    assert (image.encoding, image.frame_id, image.width, image.height) == ("16UC1", "camera", 64, 48)
+    assert when == messages["/camera/image"][0][0]
+    shown = np.frombuffer(image.data, "<u2").reshape(48, image.step // 2)
+    assert depth_m.any() and np.abs(shown / 1000 - depth_m).max() <= 0.0005
 
 
 def test_regions_have_the_colours_of_the_page_and_say_what_they_are(exported):
@@ -220,7 +232,7 @@ def test_a_client_that_comes_late_gets_everything():
     serving = threading.Thread(target=follow)
     serving.start()
     try:
-        topics = {"/map/regions", "/map/places", "/camera/image", "/scene"}
+        topics = {"/map/regions", "/map/places", "/camera/image", "/camera/depth", "/scene"}
         for _ in range(2):  # the second finds all sent already
             found = asyncio.run(subscribed(broadcast.address, topics, ready))
             assert {topic: schema for topic, (schema, _) in found.items()} == {t: SCHEMAS[t] for t in topics}
@@ -233,6 +245,22 @@ def test_a_client_that_comes_late_gets_everything():
         stop.set()
         serving.join()
         broadcast.close()
+
+
+def test_all_is_told_again_once_a_subscription_stands(monkeypatch):
+    """What is sent before the server hears a client's subscription goes to nobody."""
+    source, shown, now_s = Held(home()), [], [100.0]
+    broadcast = Broadcast(source, 0)
+    monkeypatch.setattr(broadcast._stream, "show", lambda scene, stamp_ns: shown.append(stamp_ns))
+    monkeypatch.setattr("prior_sg.deploy.viewing.foxglove.server.time.monotonic", lambda: now_s[0])
+    broadcast.follow(0.0)
+    shown.clear()
+    broadcast._newcomers.on_subscribe(None, None)
+    for expected, later_s in ((1, 0.1), (1, AGAIN_S), (2, 5.0), (2, 0.0)):
+        broadcast.follow(0.0)
+        assert len(shown) == expected
+        now_s[0] += later_s
+    broadcast.close()
 
 
 class Gone(Held):

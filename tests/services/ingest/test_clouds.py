@@ -7,6 +7,7 @@ import shutil
 import cv2
 import numpy as np
 import pytest
+from rosbags.typesys import get_types_from_msg
 from scipy.spatial.transform import Rotation
 
 from prior_sg.schemas.frames import Intrinsics
@@ -19,7 +20,7 @@ from prior_sg.services.ingest.core.clouds.upsampling import upsampled
 from prior_sg.services.ingest.core.config import Config
 from prior_sg.services.ingest.core.frames import RawFrame
 from prior_sg.services.ingest.core.options import ReadOptions
-from prior_sg.services.ingest.core.ros.clouds import columns_of_message
+from prior_sg.services.ingest.core.ros.clouds import LIVOX_TEXTS, columns_of_message
 from prior_sg.services.ingest.sources import SourceError, open_source
 from prior_sg.services.registry import BY_NAME
 from prior_sg.services.runtime.runner import Runner
@@ -366,13 +367,30 @@ def cloud(maker, stamp_ns, rows, frame="lidar"):
     )
 
 
-def bag(path, kind="sqlite3", pictures=True, depth=False, change=lambda rows: rows):
+def livox(maker, stamp_ns, rows, frame="lidar"):
+    """Livox' own message of a structured array."""
+    package = "livox_ros_driver" if maker.kind == "bag" else "livox_ros_driver2"
+    for name in ("CustomPoint", "CustomMsg"):
+        if f"{package}/msg/{name}" not in maker.types:
+            maker.store.register(get_types_from_msg(LIVOX_TEXTS[name], f"{package}/msg/{name}"))
+    point = maker.types[f"{package}/msg/CustomPoint"]
+    points = [point(int(r["t"]), float(r["x"]), float(r["y"]), float(r["z"]), 9, 16, 1) for r in rows]
+    made, reserved = maker.types[f"{package}/msg/CustomMsg"], np.zeros(3, np.uint8)
+    return made(maker.header(stamp_ns, frame), stamp_ns, len(points), 1, reserved, points)
+
+
+def bag(path, kind="sqlite3", **how):
+    return driven(kind, **how).write(path)
+
+
+def driven(kind="sqlite3", pictures=True, depth=False, change=lambda rows: rows, message=cloud):
     """The robot of the folder, as its drivers publish it."""
     maker = Maker(kind)
     for index in range(4):
         stamp = START_NS + index * PERIOD_NS
         points, offsets = spin(stamp)
-        maker.add("/points", stamp, cloud(maker, stamp, change(structured(points, t=offsets.astype(np.uint32)))), 10**8)
+        rows = change(structured(points, t=offsets.astype(np.uint32)))
+        maker.add("/points", stamp, message(maker, stamp, rows), 10**8)
     for stamp in range(START_NS - PERIOD_NS, START_NS + 5 * PERIOD_NS, PERIOD_NS // 5):
         maker.add("/tf", stamp, maker.tf(maker.transform(stamp, "map", "lidar", moving(stamp))))
     lidar_from_camera = maker.transform(START_NS, "lidar", "camera", inverse(CAMERA_FROM_LIDAR))
@@ -388,12 +406,21 @@ def bag(path, kind="sqlite3", pictures=True, depth=False, change=lambda rows: ro
         if depth:
             units = np.rint(depth_m * 1000).astype(np.uint16)
             maker.add("/camera/depth", stamp, maker.image(stamp, units, "16UC1", "camera"))
-    return maker.write(path)
+    return maker
 
 
-@pytest.mark.parametrize(("kind", "pictures"), [("sqlite3", True), ("bag", True), ("mcap", False)])
-def test_clouds_of_a_recording_are_depth_on_the_walls(tmp_path, kind, pictures):
-    source = open_source(bag(tmp_path, kind, pictures))
+@pytest.mark.parametrize(
+    ("kind", "pictures", "message"),
+    [
+        ("sqlite3", True, cloud),
+        ("bag", True, cloud),
+        ("mcap", False, cloud),
+        ("bag", False, livox),
+        ("sqlite3", True, livox),
+    ],
+)
+def test_clouds_of_a_recording_are_depth_on_the_walls(tmp_path, kind, pictures, message):
+    source = open_source(bag(tmp_path, kind, pictures=pictures, message=message))
     frames = [frame for frame in source if isinstance(frame, RawFrame)]
     assert source.layout == "ros"
     assert any("depth of /points" in note for note in source.notes), source.notes

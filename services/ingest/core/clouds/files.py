@@ -1,11 +1,13 @@
-"""Clouds of points in files: .npy, .pcd, .ply, and .bin as KITTI has it (pure)."""
+"""Clouds of points in files: .npy, .pcd, .ply, and .bin as KITTI and nuScenes have it (pure)."""
 
 import io
 import math
 import re
+import struct
 
 import numpy as np
 
+from prior_sg.services.ingest.core.clouds.lzf import decompressed
 from prior_sg.services.ingest.core.clouds.sweep import MOST_POINTS, CloudError
 from prior_sg.services.ingest.core.pixels import NPY_FAULTS
 
@@ -18,6 +20,9 @@ PLY_TYPES = {
 }  # fmt: skip
 PLY_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
 KITTI_COLUMNS = ("x", "y", "z", "intensity")
+NUSCENES_COLUMNS = (*KITTI_COLUMNS, "ring")
+MOST_RINGS = 256
+PCD_SIZES = struct.Struct("<II")  # of compressed data: as it is, and as it was
 HEADER_BYTES = 1 << 16
 
 
@@ -28,7 +33,7 @@ def columns_of(data: bytes, ending: str) -> dict[str, np.ndarray]:
         return read(data)
     except CloudError:
         raise
-    except (*NPY_FAULTS, KeyError, IndexError, StopIteration) as error:
+    except (*NPY_FAULTS, KeyError, IndexError, StopIteration, struct.error) as error:
         raise CloudError(f"it is damaged: {str(error)[:100]}") from error
 
 
@@ -43,8 +48,15 @@ def _npy(data: bytes) -> dict[str, np.ndarray]:
 
 
 def _kitti(data: bytes) -> dict[str, np.ndarray]:
-    rows = np.frombuffer(data, "<f4").reshape(-1, len(KITTI_COLUMNS))
-    return {name: rows[:, i] for i, name in enumerate(KITTI_COLUMNS)}
+    """Rows of four numbers, or of five where the fifth can be a ring."""
+    numbers, columns = np.frombuffer(data, "<f4"), KITTI_COLUMNS
+    if len(numbers) and len(numbers) % len(NUSCENES_COLUMNS) == 0:
+        rings = numbers[len(KITTI_COLUMNS) :: len(NUSCENES_COLUMNS)]
+        with np.errstate(invalid="ignore"):
+            whole = bool((rings == np.floor(rings)).all() and (rings >= 0).all() and (rings < MOST_RINGS).all())
+        columns = NUSCENES_COLUMNS if whole and (rings.any() or len(numbers) % len(columns)) else columns
+    rows = numbers.reshape(-1, len(columns))
+    return {name: rows[:, i] for i, name in enumerate(columns)}
 
 
 def _pcd(data: bytes) -> dict[str, np.ndarray]:
@@ -66,7 +78,25 @@ def _pcd(data: bytes) -> dict[str, np.ndarray]:
         return _named(_rows(body, np.dtype(fields), points))
     if form == "ascii":
         return _named(_table(body, np.dtype(fields), points))
-    raise CloudError(f"its data is {form}: save it as binary (pcl_convert_pcd_ascii_binary IN.pcd OUT.pcd 1)")
+    if form == "binary_compressed":
+        return _columns(body, np.dtype(fields), points)
+    raise CloudError(f"its data is {form[:20]}: save it as binary (pcl_convert_pcd_ascii_binary IN.pcd OUT.pcd 1)")
+
+
+def _columns(body: bytes, row: np.dtype, points: int) -> dict[str, np.ndarray]:
+    """Fields that follow each other, compressed. Raises CloudError."""
+    _check_count(points)
+    compressed, size = PCD_SIZES.unpack_from(body)
+    held = body[PCD_SIZES.size : PCD_SIZES.size + compressed]
+    if len(held) < compressed or size != points * row.itemsize:
+        raise CloudError(f"its compressed data is cut off, or not of {points} points of {row.itemsize} bytes")
+    data, at, found = decompressed(held, size), 0, {}
+    for name in row.names or ():
+        kind = row[name]
+        if not kind.shape:
+            found[name] = np.frombuffer(data, kind, points, at)
+        at += points * kind.itemsize
+    return found
 
 
 def _ply(data: bytes) -> dict[str, np.ndarray]:

@@ -8,6 +8,7 @@ import numpy as np
 
 from prior_sg.services.headers import ImageError, is_sized, trimmed
 from prior_sg.services.ingest.core.pixels import encoded, stored
+from prior_sg.services.ingest.core.ros.rvl import unrolled
 
 COLOR, GREY, DEPTH = "colour", "grey", "depth"  # what an image shows
 LAYOUTS = {  # of sensor_msgs/Image: what it shows, type and number of channels, and OpenCV's way to blue, green, red
@@ -96,17 +97,15 @@ def metres(depth: bytes | np.ndarray, unit_m: float) -> np.ndarray:
 
 def _compressed_depth(message: Any) -> bytes | np.ndarray:
     encoding, data = encoding_of(message), bytes(message.data)
-    if "rvl" in encoding.lower():
-        raise ImageError("its depth is compressed with RVL: republish it with format png")
     if COMPRESSED_DEPTH not in encoding:
         return trimmed(data)
-    if len(data) <= DEPTH_HEADER.size or not is_sized(data[DEPTH_HEADER.size :]):
+    held, rolled = data[DEPTH_HEADER.size :], "rvl" in encoding.lower()
+    if len(data) <= DEPTH_HEADER.size or not (rolled or is_sized(held)):
         raise ImageError(f"no PNG file follows the {DEPTH_HEADER.size} bytes of its compressedDepth header")
     _, a, b = DEPTH_HEADER.unpack_from(data)
-    file = trimmed(data[DEPTH_HEADER.size :])
     if not encoding.startswith("32FC1"):
-        return file
-    inverse = stored(file)
+        return encoded(unrolled(held, MOST_PX), ".png") if rolled else trimmed(held)
+    inverse = unrolled(held, MOST_PX) if rolled else stored(trimmed(held))
     if inverse.ndim != 2 or inverse.dtype != np.uint16 or not (np.isfinite(a) and np.isfinite(b) and a > 0):
         raise ImageError("its quantised depth is none")
     with np.errstate(divide="ignore"):

@@ -1,4 +1,4 @@
-"""Where a robot's frames are, as its transforms and poses come in, and the jumps that its SLAM makes of the world (pure)."""
+"""Where a robot's frames are, as its transforms and poses come in, and how its SLAM makes the world jump (pure)."""
 
 from collections import deque
 from collections.abc import Iterator, Sequence

@@ -139,7 +139,9 @@ def chosen_cameras(topics: Sequence[Topic], options: ReadOptions, heard: bool = 
     infos = [topic for topic in topics if topic.type == CAMERA_INFO and topic.count]
     found: dict[str, Chosen] = {}
     taken: set[str] = set()
-    for color, depth in sorted(((c, d) for c in colors for d in depths), key=lambda pair: _fitness(*pair), reverse=True):
+    for color, depth in sorted(
+        ((c, d) for c in colors for d in depths), key=lambda pair: _fitness(*pair), reverse=True
+    ):
         info = _info_of(color, infos, alone=False)
         used = color.image_name in found or depth.image_name in taken
         if not used and info is not None and _of_one_camera(color, depth):

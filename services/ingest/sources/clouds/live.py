@@ -86,7 +86,9 @@ class Around:
 
         def shown(posed: Posed) -> Iterator[Shown]:
             pair = [*last, posed]
-            if looked_at([one.color.stamp_ns for one in pair], [one.source_from_camera for one in pair])[-1] != len(last):
+            if looked_at([one.color.stamp_ns for one in pair], [one.source_from_camera for one in pair])[-1] != len(
+                last
+            ):
                 return
             last[:] = [posed]
             lidar = lidar_of(self.reader, self.choice, self.rules, motions, posed.depth)

@@ -4,7 +4,9 @@ import weakref
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from heapq import merge
 from itertools import islice
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -25,15 +27,22 @@ TRANSFORMS = "geometry_msgs/TransformStamped[] transforms"  # rosbags brings no 
 
 
 def is_recording(path: Path) -> bool:
-    """Whether a path is a ROS 1 bag, a folder of rosbag2, or one of its files; logs of ours are not."""
+    """Whether a path is a ROS 1 bag, a folder of such, one of rosbag2, or one of its files; logs of ours are not."""
     if path.is_dir():
-        return (path / METADATA).is_file() and BAGFILE in (path / METADATA).read_bytes()[:4096]
+        if (path / METADATA).is_file():
+            return BAGFILE in (path / METADATA).read_bytes()[:4096]
+        return bool(_split(path))
     if path.suffix == ".mcap":
         try:
             return holds_ros(path)
         except LogError:
             return False
     return path.suffix in (BAG, *STORAGES)
+
+
+def _split(folder: Path) -> list[Path]:
+    """The files of ROS 1 in a folder."""
+    return sorted(file for file in folder.glob(f"*{BAG}") if file.is_file() and not file.name.startswith("."))
 
 
 @contextmanager
@@ -63,17 +72,49 @@ class Index:
     headers_ns: list[int] = field(default_factory=list)
 
 
+class Files1:
+    """The files into which a recording of ROS 1 was split, as rosbags' reader of one; raises what that does."""
+
+    def __init__(self, files: Sequence[Path]) -> None:
+        from rosbags.rosbag1 import Reader
+
+        self._readers = [Reader(file) for file in files]
+        self._of: dict[int, Any] = {}  # reader of a connection, by identity
+
+    def open(self) -> None:
+        for reader in self._readers:
+            reader.open()
+            self._of |= {id(connection): reader for connection in reader.connections}
+
+    def close(self) -> None:
+        for reader in self._readers:
+            reader.close()
+
+    @property
+    def connections(self) -> list[Any]:
+        return [connection for reader in self._readers for connection in reader.connections]
+
+    @property
+    def duration(self) -> int:
+        held = [reader for reader in self._readers if reader.message_count]
+        return max(r.end_time for r in held) - min(r.start_time for r in held) if held else 0
+
+    def messages(self, connections: Sequence[Any], **span: int) -> Iterator[tuple[Any, int, bytes]]:
+        wanted = [(r, [c for c in connections if self._of[id(c)] is r]) for r in self._readers]
+        return merge(*(r.messages(connections=own, **span) for r, own in wanted if own), key=itemgetter(1))
+
+
 class Bag:
     """A recording that stays open as long as somebody holds it."""
 
     def __init__(self, path: Path) -> None:
         """Raises SourceError, and ExtraMissing where rosbags is not installed."""
         extras.require("ros", f"{path}, a recording of ROS,")
-        from rosbags.rosbag1 import Reader as Reader1
         from rosbags.rosbag2 import Reader as Reader2
         from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-        self.path, self.is_ros1 = path, path.suffix == BAG
+        files = _split(path) if path.is_dir() and not (path / METADATA).is_file() else [path]
+        self.path, self.is_ros1 = path, all(file.suffix == BAG for file in files)
         self._store = get_typestore(Stores.ROS1_NOETIC if self.is_ros1 else Stores.ROS2_JAZZY)
         if self.is_ros1:
             for name in ros_topics.TF_TYPES:
@@ -81,7 +122,7 @@ class Bag:
         for name, text in LIVOX_DEFINITIONS.items():
             self._store.register(get_types_from_msg(text, name))
         with readable(path):
-            self._reader: Any = Reader1(path) if self.is_ros1 else Reader2(path)
+            self._reader: Any = Files1(files) if self.is_ros1 else Reader2(path)
             self._reader.open()
             self._close = weakref.finalize(self, self._reader.close)
             self._connections: dict[str, list[Any]] = {}

@@ -27,6 +27,7 @@ from prior_sg.services.ingest.sources.base import (
     color_pixels,
 )
 from prior_sg.services.ingest.sources.cameras import straight_maps
+from prior_sg.services.ingest.sources.tables import LastingError
 
 NEARLY = 1e-3  # difference of focal lengths that is none
 
@@ -125,7 +126,7 @@ def _camera(rig: Rig, image: Topic, info: Topic | None) -> Camera | None:
     try:
         return camera_of(where, camera_fields(rig.infos[info.name], image.is_rectified))
     except (ValueError, AttributeError) as error:
-        raise SourceError(f"{where} is not a camera: {error}; give --intrinsics FX,FY,CX,CY,WIDTH,HEIGHT") from error
+        raise LastingError(f"{where} is not a camera: {error}; give --intrinsics FX,FY,CX,CY,WIDTH,HEIGHT") from error
 
 
 def _told_camera(path: Path, options: ReadOptions) -> Camera:

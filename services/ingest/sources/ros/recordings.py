@@ -1,4 +1,5 @@
-"""Recordings of ROS: rosbag2 folders and their files (.db3, .mcap), and bags of ROS 1 (.bag).
+"""Recordings of ROS: rosbag2 folders and their files (.db3, .mcap), and bags of ROS 1 (.bag, or a
+folder of those into which one was split).
 
 sensor_msgs/Image, CompressedImage    colour (raw, JPEG, PNG) and depth (16UC1 in millimetres, 32FC1 in metres, raw or
                                       compressedDepth with PNG)
@@ -42,7 +43,7 @@ from prior_sg.services.ingest.sources.ros.pictures import Pictures, pictures
 from prior_sg.services.ingest.sources.ros.recorded import Recorded
 
 NAME = "ros"
-LOOKS = "a recording of ROS (a rosbag2 folder with metadata.yaml, .db3, .mcap or .bag)"
+LOOKS = "a recording of ROS (a rosbag2 folder with metadata.yaml, .db3, .mcap, .bag, or a folder of .bag files)"
 MOST = 0.9  # share of the images of the slower stream that normally find a partner
 
 

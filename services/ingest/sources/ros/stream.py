@@ -11,6 +11,7 @@ import msgspec
 import numpy as np
 
 from prior_sg.services.ingest.core.frames import BadFrame, Closure, Correction, RawFrame, View
+from prior_sg.services.ingest.core.pairing import risen
 from prior_sg.services.ingest.core.poses import PoseError
 from prior_sg.services.ingest.core.ros.assembly import Posed, Together
 from prior_sg.services.ingest.core.ros.graph import corrected
@@ -62,6 +63,7 @@ class Stream:
         self._robot, self._wanted, self._stop, self._clock_ns = robot, wanted, stop, clock_ns
         self._open_session, self._again = open_session, again
         self._types, self._tally, self._frames = robot_types(), Tally(), 0
+        self._newest_ns: int | None = None  # stamp of a frame, where there are several cameras
         self._trail: deque[Placed] = deque(maxlen=MOST_FRAMES)
         self._told: tuple[np.ndarray, np.ndarray] | None = None  # numbers and poses of the last correction
         self._reader = Reader(self._types, robot.options, {topic.name: topic for topic in robot.topics})
@@ -154,6 +156,8 @@ class Stream:
     def _frame(self, eye: Eye, shown: Shown) -> RawFrame | BadFrame:
         """A frame, its images only where it may become a keyframe."""
         number, stamp_ns = self._frames, shown.stamp_ns
+        if len(self._eyes) > 1:
+            stamp_ns = self._newest_ns = risen(stamp_ns, self._newest_ns)
         self._frames += 1
         try:
             pose = shown.placed(shown.source_from_sensor)
