@@ -3,6 +3,7 @@
 import functools
 import json
 import shutil
+import struct
 
 import cv2
 import numpy as np
@@ -116,6 +117,61 @@ def test_a_cloud_of_no_points_and_whole_numbers_that_are_none_are_told():
         columns_of(head.format(0, "").encode(), ".pcd")
     with pytest.raises(CloudError, match="its t is a whole number by its header"):
         columns_of(head.format(1, "1 2 3 nan\n").encode(), ".pcd")
+
+
+def lzf(data):
+    """LibLZF's form: what was seen in the last 8192 bytes as a reference, else as it is; each of up to 32 bytes."""
+    out, literal, at = bytearray(), bytearray(), 0
+
+    def flush():
+        for start in range(0, len(literal), 32):
+            part = literal[start : start + 32]
+            out.extend((len(part) - 1, *part))
+        literal.clear()
+
+    while at < len(data):
+        best, begin = 0, 0
+        for start in range(max(0, at - 300), at):
+            length = 0
+            while at + length < len(data) and length < 264 and data[start + length] == data[at + length]:
+                length += 1
+            best, begin = max((best, begin), (length, start))
+        if best < 3:
+            literal.append(data[at])
+            at += 1
+            continue
+        flush()
+        back, more = at - begin - 1, best - 2
+        out.extend(((min(more, 7) << 5) | back >> 8, *([more - 7] if more >= 7 else []), back & 255))
+        at += best
+    flush()
+    return bytes(out)
+
+
+def test_a_compressed_pcd_file_has_the_points_that_were_written():
+    rows = structured(np.repeat(np.random.default_rng(4).normal(size=(6, 3)), 9, 0), t=np.arange(54, dtype=np.uint32))
+    body = b"".join(np.ascontiguousarray(rows[name]).tobytes() for name in rows.dtype.names)
+    held = lzf(body)
+    head = pcd(rows[:0], "binary_compressed").replace(b"POINTS 0", b"POINTS 54").split(b"DATA")[0]
+    whole = head + b"DATA binary_compressed\n" + struct.pack("<II", len(held), len(body)) + held
+    columns = columns_of(whole, ".pcd")
+    assert len(held) < 0.7 * len(body)
+    assert all(np.array_equal(columns[name], rows[name]) for name in rows.dtype.names)
+    random = np.random.default_rng(3)
+    for _ in range(100):
+        with pytest.raises(CloudError):
+            columns_of(whole[: random.integers(0, len(whole))], ".pcd")
+
+
+def test_rows_of_nuscenes_have_a_ring_and_those_of_kitti_none():
+    random = np.random.default_rng(6)
+    rows = random.normal(size=(40, 5)).astype("<f4")
+    rows[:, 4] = np.arange(40) % 32
+    nuscenes = columns_of(rows.tobytes(), ".bin")
+    assert np.array_equal(nuscenes["z"], rows[:, 2]) and np.array_equal(nuscenes["ring"], rows[:, 4])
+    kitti = columns_of(random.normal(size=(40, 4)).astype("<f4").tobytes(), ".bin")
+    assert list(kitti) == ["x", "y", "z", "intensity"] and len(kitti["x"]) == 40
+    assert len(columns_of(bytes(320), ".bin")["x"]) == 20
 
 
 @pytest.mark.parametrize("form", ["binary", "ascii"])

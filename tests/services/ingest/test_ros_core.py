@@ -85,10 +85,53 @@ def test_compressed_depth_by_hand():
     assert np.isnan(depth_image(bent)[1, 2])
 
 
+def rolled(pixels):
+    """RVL as its paper's C code writes it, a nibble at a time, after the size that image_transport puts before it."""
+    nibbles, values = [], pixels.reshape(-1).astype(int).tolist()
+
+    def write(value):
+        while True:
+            value, nibble = value >> 3, value & 7
+            nibbles.append(nibble | (8 if value else 0))
+            if not value:
+                return
+
+    at, last = 0, 0
+    while at < len(values):
+        for zero in (True, False):
+            end = next((i for i in range(at, len(values)) if (values[i] == 0) is not zero), len(values))
+            write(end - at)
+            for value in [] if zero else values[at:end]:
+                delta = value - last
+                write((delta << 1) ^ (delta >> 31))
+                last = value
+            at = end
+    nibbles += [0] * (-len(nibbles) % 8)
+    words = [int("".join(f"{n:x}" for n in nibbles[i : i + 8]), 16) for i in range(0, len(nibbles), 8)]
+    height, width = pixels.shape
+    return struct.pack(f"<II{len(words)}I", width, height, *words)
+
+
+MM = np.array(((0, 0, 500, 501), (499, 65535, 1, 0), (0, 700, 0, 9000)), np.uint16)
+
+
+@pytest.mark.parametrize("pixels", [MM, np.zeros((5, 7), np.uint16), np.full((2, 3), 800, np.uint16)])
+def test_depth_of_rvl_is_unrolled(pixels):
+    header = struct.pack("<iff", 0, 0.0, 0.0)
+    read = depth_image(Message(format="16UC1; compressedDepth rvl", data=header + rolled(pixels)))
+    assert np.array_equal(stored(read), pixels)
+    bent = struct.pack("<iff", 0, 10100.0, -1009.0)
+    metres = depth_image(Message(format="32FC1; compressedDepth rvl", data=bent + rolled(np.array(((9091, 0),), "u2"))))
+    assert metres[0, 0] == pytest.approx(1.0) and np.isnan(metres[0, 1])
+
+
 @pytest.mark.parametrize(
     ("message", "reason"),
     [
-        (Message(format="16UC1; compressedDepth rvl", data=b"0" * 40), "RVL"),
+        (Message(format="16UC1; compressedDepth rvl", data=b"0" * 40), "808464432 x 808464432"),
+        (Message(format="16UC1; compressedDepth rvl", data=b"0" * 15), "RVL data has no size"),
+        (Message(format="16UC1; compressedDepth rvl", data=bytes(12) + rolled(MM)[:12]), "RVL data"),
+        (Message(format="16UC1; compressedDepth rvl", data=bytes(12) + rolled(MM)[:8] + b"\xff" * 8), "RVL data"),
         (Message(format="16UC1; compressedDepth", data=b"0" * 12), "12 bytes"),
         (Message(format="16UC1; compressedDepth png", data=b"0" * 12 + encoded(BGR, ".png")[:40]), "cut off"),
         (image(BGR, "rgb8"), "not one of depth"),

@@ -268,6 +268,36 @@ def test_optimised_poses_of_a_graph_correct_every_frame(walked, body):
         assert np.abs(pose - after @ walk_pose).max() < 1e-6
 
 
+def test_of_a_long_run_the_newest_frames_are_corrected(walked, monkeypatch):
+    monkeypatch.setattr("prior_sg.services.ingest.sources.ros.stream.MOST_FRAMES", 4)
+    maker, after = Maker("mcap"), motion(0.4, 0.2, 0.0, 25, 0, 0)
+    nodes = [
+        maker.pose(stamp_ns, "map", after @ base) for stamp_ns, base in zip(STAMPS_NS, WORLD_FROM_BASE, strict=True)
+    ]
+    path = maker.types["nav_msgs/msg/Path"](maker.header(STAMPS_NS[-1], "map"), nodes)
+    maker.messages = [*walked.messages, ("/graph", STAMPS_NS[-1] + 500 * MS, path)]
+    messages, robot = received(maker), robot_heard(maker, graph_topic="/graph", pose_frame="base")
+    (update,) = [event for event in streamed(robot, [*messages, messages[-1]]) if isinstance(event, Correction)]
+    assert update.frame_ids.tolist() == list(range(len(WALK) - 4, len(WALK)))
+    assert np.abs(update.world_from_camera[-1] - after @ WALK[-1]).max() < 1e-6
+
+
+def test_a_graph_of_poses_that_nobody_publishes_yet_is_listened_to(walked):
+    robot = robot_heard(walked, graph_topic="graph/late")
+    assert [(topic.name, topic.type) for topic in robot.topics][-1] == ("/graph/late", "nav_msgs/msg/Path")
+    names = {topic.name for topic in robot_heard(two_without_tf_static(walked)).topics}
+    assert {"/tf", "/tf_static"} <= names
+
+
+def two_without_tf_static(walked):
+    """The camera's own frame moves in /tf, and nobody has published on /tf_static yet."""
+    maker = Maker("mcap")
+    maker.messages = [message for message in walked.messages if not message[0].startswith("/tf")]
+    for stamp_ns, pose in zip(STAMPS_NS, WALK, strict=True):
+        maker.add("/tf", stamp_ns, maker.tf(maker.transform(stamp_ns, "map", OPTICAL, pose)))
+    return maker
+
+
 def test_mutated_messages_cost_themselves_and_one_sentence(walked, rng):
     """PSG_TEST_MUTATIONS=50000 for the long proof."""
     robot = robot_heard(walked)

@@ -297,6 +297,18 @@ def test_our_own_logs_stay_ours_and_files_alone_are_read(bags):
         assert (source.layout, source.total) == ("ros", len(WALK))
 
 
+def test_a_bag_of_ros_1_that_was_split_is_read_as_one(tmp_path):
+    maker = whole("bag")
+    ordered = sorted(maker.messages, key=lambda entry: entry[1])
+    for part, begin in enumerate(range(0, len(ordered), 17)):
+        maker.messages = ordered[begin : begin + 17]
+        maker.write(tmp_path / str(part)).rename(tmp_path / f"walk_{part}.bag")
+        (tmp_path / str(part)).rmdir()
+    source = open_source(tmp_path)
+    assert (source.layout, len(list(tmp_path.iterdir()))) == ("ros", 3)
+    assert_the_walk(source)
+
+
 def test_a_folder_that_lost_its_metadata_is_told_what_to_give(bags, tmp_path):
     shutil.copytree(bags["sqlite3"], tmp_path / "cut")
     (tmp_path / "cut/metadata.yaml").unlink()

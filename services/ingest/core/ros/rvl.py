@@ -1,8 +1,8 @@
 """Depth images as compressedDepth's RVL has them: runs of zeros and of differences, in nibbles (pure).
 
 A. Wilson, Fast Lossless Depth Image Compression, ISS 2017. A number is nibbles of three bits, the lowest first, each
-but the last with its fourth bit set; nibbles stand in little-endian words of 32 bits from the highest. Zeros, others, then
-each of the others as its difference to the one before, with the sign in the lowest bit.
+but the last with its fourth bit set; nibbles stand in little-endian words of 32 bits from the highest. How many zeros,
+how many others, then each of these as its difference to the one before, with the sign in the lowest bit.
 """
 
 import struct

@@ -50,7 +50,7 @@ class Placed:
 class Stream:
     """The frames of a robot, once, until it falls silent or the source is closed."""
 
-    def __init__(
+    def __init__(  # noqa: PLR0917
         self,
         robot: Robot,
         wanted: Callable[[View], bool],
