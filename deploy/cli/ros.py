@@ -51,13 +51,14 @@ def cmd_topics(arguments: argparse.Namespace) -> int:
 
 def _recorded(path: Path) -> "list[Topic]":
     """Topics of a recording. Raises UserError and SourceError."""
-    from prior_sg.services.ingest.sources.ros.bag import Bag, is_recording
+    from prior_sg.services.ingest.sources.ros.bag import is_recording
+    from prior_sg.services.ingest.sources.ros.foreign import open_bag
 
     if not path.exists() or not is_recording(path):
         raise UserError(
             f"{path} is no recording of ROS: give a rosbag2 folder, a file ending in .mcap, .db3 or .bag, or ros2:/"
         )
-    return Bag(path).topics()
+    return open_bag(path).topics()
 
 
 def _heard(arguments: argparse.Namespace) -> "list[Topic]":

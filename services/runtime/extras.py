@@ -30,7 +30,7 @@ MODULES = {  # by extra; what the build file lists there, by the names that code
     "view": ("viser",),
     "rerun": ("rerun",),
     "foxglove": ("foxglove",),
-    "ros": ("rosbags",),
+    "ros": ("rosbags", "mcap_protobuf"),
     "record3d": ("lzfse",),
     "hydra": ("zmq", "spark_dsg"),
 }

@@ -219,6 +219,15 @@ def holds_ros(path: str | Path) -> bool:
     return head[:1] == bytes([Opcode.HEADER]) and head[9:] == len(ROS_PROFILE).to_bytes(4, "little") + ROS_PROFILE
 
 
+def holds_messages(path: str | Path) -> bool:
+    """Whether an MCAP file of another program has schemas of ROS 2 or Foxglove. Raises LogError."""
+    with _opened(path) as file:
+        index = _index(file)
+    if index is None or any("topic" in channel.metadata for channel in index.channels.values()):
+        return False
+    return any(schema.encoding == "ros2msg" or schema.name.startswith("foxglove.") for schema in index.schemas.values())
+
+
 def is_whole(path: str | Path) -> bool:
     """Whether a log was closed, and not cut off. Raises LogError."""
     with _opened(path) as file:

@@ -68,7 +68,7 @@ class Assembly:
         self._colors: list[Shot] = []
         self._depths: list[Shot] = []
         self._newest_ns = [NEVER_NS, NEVER_NS]  # stamps of colour and depth
-        self._heard_ns = NEVER_NS  # when the newest image came
+        self._heard_ns: int | None = None  # when the newest image came
         self._pairs: deque[tuple[Shot, Shot]] = deque()
         self._faults: list[Fault] = []
 
@@ -86,7 +86,8 @@ class Assembly:
             said = f"{CLOCK_BACK} by {(self._newest_ns[0] - shot.stamp_ns) / 1e9:.3f} s"
             self._faults.append(Fault("clouds", said, CLOCK_BACK))
             self._begin_anew()
-        self._newest_ns[0], self._heard_ns = max(self._newest_ns[0], shot.stamp_ns), shot.received_ns
+        self._newest_ns[0] = max(self._newest_ns[0], shot.stamp_ns)
+        self._heard_ns = shot.received_ns
         self._queue(shot, shot)
 
     def faults(self) -> list[Fault]:
@@ -110,9 +111,9 @@ class Assembly:
                 continue
             yield Posed(color, depth, pose)
 
-    def may_have_before(self, stamp_ns: int, now_ns: int) -> bool:
+    def may_have_before(self, stamp_ns: int, now_ns: int, begun_ns: int) -> bool:
         """Whether a frame before a stamp can still come of it; of a camera that has fallen silent none does."""
-        if now_ns - self._heard_ns > PATIENCE_NS:
+        if now_ns - (begun_ns if self._heard_ns is None else self._heard_ns) > PATIENCE_NS:
             return False
         waiting = [color.stamp_ns for color, _ in self._pairs]
         waiting += [shot.stamp_ns for shot in self._colors]
@@ -136,7 +137,7 @@ class Assembly:
             self._faults.append(Fault(what, TWICE))
             return
         self._newest_ns[stream] = max(self._newest_ns[stream], shot.stamp_ns)
-        self._heard_ns = max(self._heard_ns, shot.received_ns)
+        self._heard_ns = shot.received_ns
         insort(waiting, shot)
         while len(waiting) > WAITING:
             del waiting[0]
@@ -201,6 +202,7 @@ class Together:
         self.motions = motions
         self.cameras: list[Assembly] = []
         self._complete: list[deque[Posed]] = []
+        self._begun_ns: int | None = None
 
     def add(self, rules: Rules) -> None:
         """A further camera."""
@@ -213,20 +215,21 @@ class Together:
 
     def ready(self, now_ns: int, ended: bool = False) -> Iterator[tuple[int, Posed] | Jump]:
         """Frames with the position of their camera; each jump comes before the first frame after it."""
+        self._begun_ns = now_ns if self._begun_ns is None else self._begun_ns
         for camera, complete in zip(self.cameras, self._complete, strict=True):
             complete.extend(camera.ready(now_ns, ended))
         while any(self._complete):
             heads = [(complete[0].color.stamp_ns, i) for i, complete in enumerate(self._complete) if complete]
             stamp_ns, first = min(heads)
-            if not ended and self._is_early(first, stamp_ns, now_ns):
+            if not ended and self._is_early(first, stamp_ns, now_ns, self._begun_ns):
                 return
             yield from self.motions.jumps_until(stamp_ns)
             yield first, self._complete[first].popleft()
 
-    def _is_early(self, position: int, stamp_ns: int, now_ns: int) -> bool:
-        """Whether another camera may still have an earlier frame, and is worth waiting for."""
+    def _is_early(self, position: int, stamp_ns: int, now_ns: int, begun_ns: int) -> bool:
+        """Whether another camera may still have a frame that goes first, and is worth waiting for."""
         complete = self._complete[position]
         if len(complete) > WAITING or now_ns - complete[0].color.received_ns > 2 * PATIENCE_NS:
             return False
-        others = (camera for i, camera in enumerate(self.cameras) if i != position and not self._complete[i])
-        return any(camera.may_have_before(stamp_ns, now_ns) for camera in others)
+        others = ((i, camera) for i, camera in enumerate(self.cameras) if i != position and not self._complete[i])
+        return any(camera.may_have_before(stamp_ns + (i < position), now_ns, begun_ns) for i, camera in others)

@@ -29,13 +29,14 @@ from prior_sg.services.ingest.sources.base import (
 )
 from prior_sg.services.ingest.sources.clouds.swept import Drawing, Lidar, Posed, view_entries
 from prior_sg.services.ingest.sources.ros.bag import Bag, Index
+from prior_sg.services.ingest.sources.ros.foreign import ForeignBag
 from prior_sg.services.ingest.sources.ros.pictures import color_camera
 from prior_sg.services.ingest.sources.ros.recorded import Recorded
 
 EDGE_NS = 100_000_000  # a last sweep may end so long after the last pose
 
 
-def load(name: str, bag: Bag, topics: list[Topic], choice: Chosen, options: ReadOptions) -> Found:
+def load(name: str, bag: Bag | ForeignBag, topics: list[Topic], choice: Chosen, options: ReadOptions) -> Found:
     """The recording as a source of the layout `name`. Raises SourceError."""
     recorded = Recorded(bag, options, topics, choice, pose_topics(topics, options))
     alone = choice.color is choice.depth
@@ -60,7 +61,7 @@ def load(name: str, bag: Bag, topics: list[Topic], choice: Chosen, options: Read
         entries,
         ground_truth=truth_beside(bag.path) if bag.path.is_dir() else None,
         convention=convention,
-        why=(f"it is a recording of ROS {1 if bag.is_ros1 else 2}",),
+        why=(bag.why,),
         notes=(*notes, *recorded.lost()),
     )
 

@@ -8,7 +8,7 @@ from heapq import merge
 from itertools import islice
 from operator import itemgetter
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from prior_sg.services.ingest.core.ros import topics as ros_topics
 from prior_sg.services.ingest.core.ros.clouds import LIVOX_DEFINITIONS
@@ -18,7 +18,7 @@ from prior_sg.services.ingest.core.ros.transforms import frame_name, written_sta
 from prior_sg.services.ingest.sources.base import FrameError
 from prior_sg.services.ingest.sources.tables import SourceError
 from prior_sg.services.runtime import extras
-from prior_sg.services.runtime.record import LogError, holds_ros
+from prior_sg.services.runtime.record import LogError, holds_messages, holds_ros
 
 BAG, STORAGES, METADATA = ".bag", (".db3", ".mcap"), "metadata.yaml"
 MENDING = {BAG: "rosbag reindex", ".mcap": "mcap recover"}  # by ending; else a folder's
@@ -34,7 +34,7 @@ def is_recording(path: Path) -> bool:
         return bool(_split(path))
     if path.suffix == ".mcap":
         try:
-            return holds_ros(path)
+            return holds_ros(path) or holds_messages(path)
         except LogError:
             return False
     return path.suffix in (BAG, *STORAGES)
@@ -55,11 +55,12 @@ def readable(path: Path) -> Iterator[None]:
     except Exception as error:  # rosbags, its parsers and decompressors raise nearly everything
         mend = MENDING.get(path.suffix, "ros2 bag reindex")
         raise SourceError(
-            f"{path} cannot be read as a recording of ROS: {_said(error)}; `{mend}` may mend one that was cut off"
+            f"{path} cannot be read as a recording of ROS: {said(error)}; `{mend}` may mend one that was cut off"
         ) from error
 
 
-def _said(error: Exception) -> str:
+def said(error: Exception) -> str:
+    """What a library's error says, short and on one line."""
     return " ".join(str(error).split())[:200].rstrip(".") or type(error).__name__
 
 
@@ -129,6 +130,11 @@ class Bag:
             for connection in self._reader.connections:
                 self._connections.setdefault(connection.topic, []).append(connection)
 
+    @property
+    def why(self) -> str:
+        """How it was recognised."""
+        return f"it is a recording of ROS {1 if self.is_ros1 else 2}"
+
     def topics(self) -> list[Topic]:
         """All topics by name; of images and cameras with what their first message says. Raises SourceError."""
         return [self._topic(name) for name in sorted(self._connections)]
@@ -146,7 +152,7 @@ class Bag:
         try:
             return decode(data, self._connections[name][0].msgtype)
         except Exception as error:  # rosbags says nothing of what it raises for damaged data
-            raise FrameError(f"a message of {name} cannot be read: {_said(error)}") from error
+            raise FrameError(f"a message of {name} cannot be read: {said(error)}") from error
 
     def message(self, name: str, index: Index, position: int) -> Any:
         """The message of a topic at a place of its index. Raises FrameError."""
@@ -155,14 +161,14 @@ class Bag:
         try:
             found = [data for _, _, data in self._reader.messages(**span)]
         except Exception as error:
-            raise FrameError(f"a message of {name} cannot be read: {_said(error)}") from error
-        data = next((data for data in found if self.stamp_ns(data) == header_ns), None)
+            raise FrameError(f"a message of {name} cannot be read: {said(error)}") from error
+        data = next((data for data in found if self.stamp_ns(name, data) == header_ns), None)
         if data is None:
             raise FrameError(f"a message of {name} lies in a damaged part of the recording")
         return self.decode(name, data)
 
-    def stamp_ns(self, data: bytes) -> int:
-        """The stamp of a message that begins with a header. Raises FrameError."""
+    def stamp_ns(self, name: str, data: bytes) -> int:
+        """The stamp of a topic's message that begins with a header. Raises FrameError."""
         try:
             return written_stamp_ns(data, self.is_ros1)
         except ValueError as error:
@@ -173,20 +179,31 @@ class Bag:
         count = sum(connection.msgcount for connection in connections)
         kind, duration_s = connections[0].msgtype, self._reader.duration / 1e9
         topic = Topic(name, kind, count, count / duration_s if count > 1 and duration_s > 0 else 0.0)
-        looked_at = (ros_topics.IMAGE, ros_topics.COMPRESSED, ros_topics.CAMERA_INFO, *ros_topics.CLOUDS)
-        if kind not in looked_at or not count:
-            return topic
-        return self._looked_at(topic)
+        return looked_at(self, topic)
 
-    def _looked_at(self, topic: Topic) -> Topic:
-        """With what the first message says that can be read."""
-        for _, _, data in islice(self.messages([topic.name]), 3):
-            try:
-                message = self.decode(topic.name, data)
-            except FrameError:
-                continue
-            frame = frame_name(message.header.frame_id)
-            if topic.type in (ros_topics.CAMERA_INFO, *ros_topics.CLOUDS):
-                return replace(topic, frame=frame)
-            return replace(topic, encoding=encoding_of(message), frame=frame, shows=shown_by(message))
+
+class Messages(Protocol):
+    """What is asked of a recording for its topics."""
+
+    def messages(self, names: Sequence[str]) -> Iterator[tuple[str, int, bytes]]:
+        """As in Bag."""
+
+    def decode(self, name: str, data: bytes) -> Any:
+        """As in Bag."""
+
+
+def looked_at(bag: Messages, topic: Topic) -> Topic:
+    """A topic of images, cameras or clouds with what its first message says that can be read. Raises SourceError."""
+    kinds = (ros_topics.IMAGE, ros_topics.COMPRESSED, ros_topics.CAMERA_INFO, *ros_topics.CLOUDS)
+    if topic.type not in kinds or not topic.count:
         return topic
+    for _, _, data in islice(bag.messages([topic.name]), 3):
+        try:
+            message = bag.decode(topic.name, data)
+        except FrameError:
+            continue
+        frame = frame_name(message.header.frame_id)
+        if topic.type in (ros_topics.CAMERA_INFO, *ros_topics.CLOUDS):
+            return replace(topic, frame=frame)
+        return replace(topic, encoding=encoding_of(message), frame=frame, shows=shown_by(message))
+    return topic

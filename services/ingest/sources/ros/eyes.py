@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from prior_sg.services.ingest.core.options import ReadOptions
+from prior_sg.services.ingest.core.options import ALL_CAMERAS, ReadOptions
 from prior_sg.services.ingest.core.poses import Convention
 from prior_sg.services.ingest.core.ros.assembly import Assembly, Posed, Rules, Shot
 from prior_sg.services.ingest.core.ros.motions import Motions
@@ -126,9 +126,7 @@ def robot_of(look: Look, types: Types, path: Path, options: ReadOptions, first: 
     reader = Reader(types, options, {topic.name: topic for topic in (*topics, *tree)})
     messages = look.messages()
     heard = Heard(path, reader, messages, look.infos(), *_motions(messages, reader), posing, graph)
-    eyes: list[Eye] = []
-    for choice in choices:
-        eyes.append(_eye(heard, choice, first or (eyes[0].normaliser if eyes else None)))
+    eyes, unread = _eyes(heard, choices, first)
     names = {topic.name for eye in eyes for topic in (eye.choice.color, eye.choice.depth)}
     names |= {way.topic for eye in eyes for way in (eye.rules.way, eye.rules.cloud_way) if way is not None}
     listened = [topic for topic in topics if topic.name in names]
@@ -138,9 +136,9 @@ def robot_of(look: Look, types: Types, path: Path, options: ReadOptions, first: 
         options=options,
         eyes=tuple(eyes),
         topics=(*listened, *tree, *([graph] if graph else [])),
-        heard=frozenset(topic.name for topic in topics if topic.count),
+        heard=frozenset(topic.name for topic in topics if topic.count and topic.name not in unread),
         convention=Convention().changed(options),
-        notes=(*(note for eye in eyes for note in eye.notes), *([late] if late else [])),
+        notes=(*(note for eye in eyes for note in eye.notes), *unread.values(), *([late] if late else [])),
         graph=graph,
     )
 
@@ -150,6 +148,27 @@ def _chosen(topics: Sequence[Topic], options: ReadOptions) -> list[Chosen]:
     if options.cameras:
         return chosen_cameras(topics, options, heard=False)
     return [cloud_chosen(topics, options) or chosen(topics, options)]
+
+
+def _eyes(heard: Heard, choices: Sequence[Chosen], first: Normaliser | None) -> tuple[list[Eye], dict[str, str]]:
+    """The cameras, and by colour topic a note on those that cannot be read, where all are asked for.
+
+    Raises SourceError and UNUSABLE of a camera that is named, and where none can be read.
+    """
+    eyes: list[Eye] = []
+    faults: list[Exception] = []
+    unread: dict[str, str] = {}
+    for choice in choices:
+        try:
+            eyes.append(_eye(heard, choice, first or (eyes[0].normaliser if eyes else None)))
+        except (SourceError, *UNUSABLE) as error:
+            if heard.options.cameras != ALL_CAMERAS:
+                raise
+            faults.append(error)
+            unread[choice.color.name] = f"{choice.color.name} is not read: {error}"
+    if not eyes:
+        raise faults[0]
+    return eyes, unread
 
 
 def _eye(heard: Heard, choice: Chosen, first: Normaliser | None) -> Eye:

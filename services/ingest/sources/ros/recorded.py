@@ -14,6 +14,7 @@ from prior_sg.services.ingest.core.ros.topics import (
 from prior_sg.services.ingest.core.ros.transforms import Stamped, TransformTree, transforms_of
 from prior_sg.services.ingest.sources.base import FrameError, SourceError
 from prior_sg.services.ingest.sources.ros.bag import Bag, Index
+from prior_sg.services.ingest.sources.ros.foreign import ForeignBag
 from prior_sg.services.ingest.sources.ros.pictures import Rig
 
 
@@ -24,7 +25,12 @@ class Recorded:
     """
 
     def __init__(
-        self, bag: Bag, options: ReadOptions, topics: Sequence[Topic], choice: Chosen, posing: Sequence[Topic]
+        self,
+        bag: Bag | ForeignBag,
+        options: ReadOptions,
+        topics: Sequence[Topic],
+        choice: Chosen,
+        posing: Sequence[Topic],
     ) -> None:
         self.bag, self.options, self.choice = bag, options, choice
         self.within_ns = round(options.sync_tolerance_s * 1e9)
@@ -69,7 +75,7 @@ class Recorded:
     def _take(self, name: str, received_ns: int, data: bytes) -> None:
         for topic, index in ((self.choice.color, self.colors), (self.choice.depth, self.depths)):
             if topic.name == name:
-                header_ns = self.bag.stamp_ns(data)
+                header_ns = self.bag.stamp_ns(name, data)
                 index.stamps_ns.append(received_ns if self.options.clock == "received" else header_ns)
                 index.received_ns.append(received_ns)
                 index.headers_ns.append(header_ns)

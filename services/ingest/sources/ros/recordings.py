@@ -5,6 +5,7 @@ sensor_msgs/Image, CompressedImage    colour (raw, JPEG, PNG) and depth (16UC1 i
                                       compressedDepth with PNG)
 sensor_msgs/CameraInfo                the cameras; of images named …rect… the projection matrix counts
 sensor_msgs/PointCloud2               depth of a lidar, where there is none of a camera (clouds/ros.py)
+foxglove.RawImage and others          of MCAP files of other programs, as those of ROS (foreign.py)
 tf2_msgs/TFMessage                    /tf and /tf_static; or nav_msgs/Odometry, geometry_msgs/TransformStamped,
                                       PoseStamped, PoseWithCovarianceStamped
 
@@ -23,7 +24,7 @@ from pathlib import Path
 
 import numpy as np
 
-from prior_sg.services.ingest.core.options import ReadOptions
+from prior_sg.services.ingest.core.options import ALL_CAMERAS, ReadOptions
 from prior_sg.services.ingest.core.pairing import associate
 from prior_sg.services.ingest.core.poses import Convention, PoseError
 from prior_sg.services.ingest.core.ros.posing import Way, way_of
@@ -38,7 +39,8 @@ from prior_sg.services.ingest.sources.base import (
     truth_beside,
 )
 from prior_sg.services.ingest.sources.clouds import ros as clouds_ros
-from prior_sg.services.ingest.sources.ros.bag import Bag, is_recording
+from prior_sg.services.ingest.sources.ros.bag import is_recording
+from prior_sg.services.ingest.sources.ros.foreign import open_bag
 from prior_sg.services.ingest.sources.ros.pictures import Pictures, pictures
 from prior_sg.services.ingest.sources.ros.recorded import Recorded
 
@@ -56,7 +58,7 @@ def load(path: Path, options: ReadOptions) -> Found:
     """A recording of ROS. Raises SourceError, and ExtraMissing where rosbags is not installed."""
     if options.quaternion:
         raise SourceError("messages of ROS name the parts of a quaternion: leave out --quaternion")
-    bag = Bag(path)
+    bag = open_bag(path)
     topics = bag.topics()
     try:
         if not options.cameras and (clouds := cloud_chosen(topics, options)) is not None:
@@ -65,8 +67,19 @@ def load(path: Path, options: ReadOptions) -> Found:
         posing = pose_topics(topics, options)
     except ValueError as error:
         raise SourceError(f"{path}: {error}") from error
-    first, *others = [_found(Recorded(bag, options, topics, choice, posing)) for choice in choices]
-    return replace(first, name=choices[0].color.image_name if options.cameras else "", beside=tuple(others))
+    found, faults = list[Found](), list[SourceError]()
+    for choice in choices:
+        try:
+            found.append(_found(Recorded(bag, options, topics, choice, posing)))
+        except SourceError as error:
+            if options.cameras != ALL_CAMERAS:
+                raise
+            faults.append(error)
+    if not found:
+        raise faults[0]
+    first, *others = found
+    notes = (*first.notes, *(f"a camera is not read: {fault}" for fault in faults))
+    return replace(first, name=first.name if options.cameras else "", beside=tuple(others), notes=notes)
 
 
 def _found(recorded: Recorded) -> Found:
@@ -96,7 +109,7 @@ def _found(recorded: Recorded) -> Found:
         entries,
         ground_truth=truth_beside(bag.path) if bag.path.is_dir() else None,
         convention=convention,
-        why=(f"it is a recording of ROS {1 if bag.is_ros1 else 2}",),
+        why=(bag.why,),
         notes=tuple(filter(None, (f"{choice.said()}, {way.said}", choice.unread, how, *left_out))),
         name=choice.color.image_name,
     )

@@ -35,7 +35,7 @@ MOST_FRAMES = 65536  # that a graph of optimised poses can correct: 3.6 hours at
 TRAIL_NS = 200_000_000  # between two of them, but for those that may become keyframes
 CAMERA_TYPES = (IMAGE, COMPRESSED, CAMERA_INFO)
 CLOSE_S = 2.0
-LOOK_AGAIN_S = 10.0  # between two looks at topics that are announced and silent
+LOOK_AGAIN_S, LOOK_MOST_S = 10.0, 300.0  # between two looks at topics that are announced and silent
 
 
 @dataclass(frozen=True)
@@ -216,7 +216,10 @@ class Newcomers:
 
     def __init__(self, robot: Robot, session: RosSession, again: Callable[[], Robot] | None) -> None:
         self._known, self._again = set(robot.heard), again
+        self._lock = threading.Lock()
         self._there: set[str] = set()
+        self._looked_at: set[str] = set()  # new names, when the robot was last looked at
+        self._pause_s = LOOK_AGAIN_S
         self._found: list[Robot] = []
         self._search: threading.Thread | None = None
         self._searched_s = -LOOK_AGAIN_S
@@ -225,9 +228,7 @@ class Newcomers:
     def found(self) -> Robot | None:
         """The robot with what has come, once it was looked at; looks where there is something new."""
         if self._search is None:
-            waited = time.monotonic() - self._searched_s >= LOOK_AGAIN_S
-            if waited and self._again is not None and self._there - self._known:
-                self._searched_s = time.monotonic()
+            if self._again is not None and self._is_time(time.monotonic()):
                 self._search = threading.Thread(target=self._look, args=(self._again,), daemon=True)
                 self._search.start()
             return None
@@ -239,6 +240,16 @@ class Newcomers:
             self._known |= robot.heard
         return robot
 
+    def _is_time(self, now_s: float) -> bool:
+        """Whether there is something new; what stays silent is looked at less and less often."""
+        with self._lock:
+            new = self._there - self._known
+        if not new or now_s - self._searched_s < (self._pause_s if new == self._looked_at else LOOK_AGAIN_S):
+            return False
+        self._pause_s = min(2 * self._pause_s, LOOK_MOST_S) if new == self._looked_at else LOOK_AGAIN_S
+        self._looked_at, self._searched_s = new, now_s
+        return True
+
     def close(self) -> None:
         """Wait for the look that goes on; the source that was closed has ended it."""
         if self._search is not None:
@@ -247,7 +258,8 @@ class Newcomers:
     def _seen(self, entity: Entity, alive: bool) -> None:
         channel = entity.channel
         if alive and entity.kind == PUBLISHER and channel is not None and channel.type in CAMERA_TYPES:
-            self._there.add(channel.name)
+            with self._lock:
+                self._there.add(channel.name)
 
     def _look(self, again: Callable[[], Robot]) -> None:
         try:
