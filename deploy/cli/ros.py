@@ -34,7 +34,7 @@ def add_commands(commands: Commands) -> None:
 def cmd_topics(arguments: argparse.Namespace) -> int:
     """List topics by name, and mark those that a run would read. Raises UserError and SourceError."""
     from prior_sg.services.ingest.core.options import ReadOptions, is_live
-    from prior_sg.services.ingest.core.ros.topics import chosen
+    from prior_sg.services.ingest.core.ros.topics import chosen, cloud_chosen
 
     live = is_live(arguments.source)
     topics = _heard(arguments) if live else _recorded(Path(arguments.source))
@@ -43,7 +43,8 @@ def cmd_topics(arguments: argparse.Namespace) -> int:
         return 0
     console.print(_table(topics))
     try:
-        console.print(f"would read {chosen(topics, ReadOptions()).said()}", soft_wrap=True)
+        choice = cloud_chosen(topics, ReadOptions()) or chosen(topics, ReadOptions())
+        console.print(f"would read {choice.said()}", soft_wrap=True)
     except ValueError as error:
         console.print(f"would not be read: {error}", soft_wrap=True)
     return 0

@@ -55,7 +55,8 @@ def by_sdk(path, compressed):
             turn = Rotation.from_matrix(pose[:3, :3]).as_quat().tolist()
             moved = messages.FrameTransform(
                 timestamp=about["timestamp"], parent_frame_id="map", child_frame_id=OPTICAL,
-                translation=messages.Vector3(x=x, y=y, z=z), rotation=messages.Quaternion(**dict(zip("xyzw", turn, strict=True))),
+                translation=messages.Vector3(x=x, y=y, z=z),
+                rotation=messages.Quaternion(**dict(zip("xyzw", turn, strict=True))),
             )  # fmt: skip
             tf.log(moved, log_time=stamp_ns)
     return path
