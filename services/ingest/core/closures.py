@@ -18,7 +18,7 @@ def spread(trail: Sequence[View], now: View, after_from_before: np.ndarray) -> l
     `now` is the newest frame, before the jump: what is there moves by all of it, the first keyframe by nothing. From
     one of a robot's cameras to another is no way travelled.
     """
-    camera_m, steps_m, last = now.world_from_camera[:3, 3], [], dict[str, np.ndarray]()
+    camera_m, steps_m, last = now.world_from_camera[:3, 3], list[float](), dict[str, np.ndarray]()
     for view in (*trail, now):
         here_m = view.world_from_camera[:3, 3]
         steps_m.append(float(np.linalg.norm(here_m - last.get(view.camera, here_m))))

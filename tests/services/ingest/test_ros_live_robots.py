@@ -29,17 +29,21 @@ from tests.help.walked import STAMPS_NS, WORLD_FROM_BASE
 from tests.services.ingest.test_clouds import cloud, driven, livox
 
 
-def read(endpoint, maker, domain, **options):
-    """Frames of a robot that plays this, once it was looked at, and the source."""
+def read(endpoint, maker, domain, count, **options):
+    """So many frames of a robot that plays this, once it was looked at, and the source."""
     player = Robot(endpoint, maker, domain)
     try:
         with player.rehearsing():
-            told = Config(ros_domain=domain, end_after_s=2.0, every_frame=True, **options)
+            told = Config(ros_domain=domain, end_after_s=20.0, every_frame=True, **options)
             source = open_source(f"ros2:/{endpoint}", options=told)
         topics = {topic for topic, _, _ in maker.messages if topic.endswith(("tf", "points", "image_raw"))}
         playing = threading.Thread(target=lambda: (player.wait_for_reader(topics), player.play(statics=False)))
         playing.start()
-        frames = [frame for frame in source if isinstance(frame, RawFrame)]
+        frames = []
+        for frame in source:
+            frames += [frame] if isinstance(frame, RawFrame) else []
+            if len(frames) == count:
+                source.close()
         playing.join()
         return frames, source
     finally:
@@ -57,8 +61,8 @@ def assert_alike(frames, recorded):
 @pytest.mark.parametrize(("pictures", "message", "domain"), [(True, cloud, 21), (False, cloud, 22), (True, livox, 23)])
 def test_clouds_of_a_robot_give_the_frames_of_their_recording(endpoint, tmp_path, pictures, message, domain):
     maker = driven(pictures=pictures, message=message)
-    frames, source = read(endpoint, maker, domain)
     recorded = [frame for frame in open_source(maker.write(tmp_path)) if isinstance(frame, RawFrame)]
+    frames, source = read(endpoint, maker, domain, len(recorded))
     assert any("depth of /points" in note for note in source.notes), source.notes
     assert_alike(frames, recorded)
 
@@ -111,8 +115,8 @@ def test_a_packed_log_of_two_cameras_gives_the_same_frames(tmp_path):
 
 def test_two_cameras_of_a_robot_come_in_the_order_of_their_stamps(endpoint, tmp_path):
     maker = two_eyed()
-    frames, _ = read(endpoint, maker, 24, cameras="all")
     recorded = list(open_source(maker.write(tmp_path), options=ReadOptions(cameras="all")))
+    frames, _ = read(endpoint, maker, 24, len(recorded), cameras="all")
     assert_alike(frames, recorded)
 
 

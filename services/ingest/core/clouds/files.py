@@ -90,7 +90,7 @@ def _columns(body: bytes, row: np.dtype, points: int) -> dict[str, np.ndarray]:
     held = body[PCD_SIZES.size : PCD_SIZES.size + compressed]
     if len(held) < compressed or size != points * row.itemsize:
         raise CloudError(f"its compressed data is cut off, or not of {points} points of {row.itemsize} bytes")
-    data, at, found = decompressed(held, size), 0, {}
+    data, at, found = decompressed(held, size), 0, dict[str, np.ndarray]()
     for name in row.names or ():
         kind = row[name]
         if not kind.shape:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from prior_sg.services.ingest.core.clouds.views import VIEW
 from prior_sg.services.ingest.core.options import ALL_CAMERAS, ReadOptions
 from prior_sg.services.ingest.core.poses import Convention
 from prior_sg.services.ingest.core.ros.assembly import Assembly, Posed, Rules, Shot
@@ -27,8 +28,8 @@ from prior_sg.services.ingest.core.ros.topics import (
     tree_topics,
 )
 from prior_sg.services.ingest.core.ros.transforms import Stamped, TransformTree
-from prior_sg.services.ingest.sources.base import MILLIMETRE, Camera, Found, FrameError, SourceError
-from prior_sg.services.ingest.sources.clouds.live import VIEW, Around, Drawn, Shower, period_ns, used_views
+from prior_sg.services.ingest.sources.base import MILLIMETRE, Camera, Found, FrameError, Images, SourceError
+from prior_sg.services.ingest.sources.clouds.live import Around, Drawn, Shower, period_ns, used_views
 from prior_sg.services.ingest.sources.clouds.ros import EDGE_NS
 from prior_sg.services.ingest.sources.normalise import UNUSABLE, Normaliser, Samples, beside, prepare
 from prior_sg.services.ingest.sources.ros.look import Look
@@ -228,7 +229,7 @@ def _samples(heard: Heard, choice: Chosen, rules: Rules, begin: Begin) -> Sample
         faults = [*assembly.faults(), *motions.faults()]
         reasons = dict.fromkeys(fault.text for fault in faults) or ["none came"]
         raise SourceError(f"no frame is complete: {'; '.join(list(reasons)[:2])}")
-    shower, samples, faulty = begin(motions), [], []
+    shower, samples, faulty = begin(motions), list[tuple[np.ndarray, Images]](), list[Exception]()
     for shown in [shown for one in posed for shown in shower(one)][-SAMPLES:]:
         try:
             samples.append((shown.placed(shown.source_from_sensor), shown.images()))
