@@ -225,7 +225,10 @@ def holds_messages(path: str | Path) -> bool:
         index = _index(file)
     if index is None or any("topic" in channel.metadata for channel in index.channels.values()):
         return False
-    return any(schema.encoding == "ros2msg" or schema.name.startswith("foxglove.") for schema in index.schemas.values())
+    return any(
+        schema.name.startswith("foxglove.") or (schema.encoding == "ros2msg" and "/msg/" in schema.name)
+        for schema in index.schemas.values()
+    )
 
 
 def is_whole(path: str | Path) -> bool:
