@@ -49,7 +49,8 @@ def _npy(data: bytes) -> dict[str, np.ndarray]:
 
 def _kitti(data: bytes) -> dict[str, np.ndarray]:
     """Rows of four numbers, or of five where the fifth can be a ring."""
-    numbers, columns = np.frombuffer(data, "<f4"), KITTI_COLUMNS
+    numbers = np.frombuffer(data, "<f4")
+    columns: tuple[str, ...] = KITTI_COLUMNS
     if len(numbers) and len(numbers) % len(NUSCENES_COLUMNS) == 0:
         rings = numbers[len(KITTI_COLUMNS) :: len(NUSCENES_COLUMNS)]
         with np.errstate(invalid="ignore"):

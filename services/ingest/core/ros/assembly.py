@@ -211,7 +211,7 @@ class Together:
 
     def faults(self) -> list[Fault]:
         """What could not be used since the last time."""
-        return [fault for one in (self.motions, *self.cameras) for fault in one.faults()]
+        return [*self.motions.faults(), *(fault for camera in self.cameras for fault in camera.faults())]
 
     def ready(self, now_ns: int, ended: bool = False) -> Iterator[tuple[int, Posed] | Jump]:
         """Frames with the position of their camera; each jump comes before the first frame after it."""
