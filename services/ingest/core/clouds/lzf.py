@@ -34,7 +34,5 @@ def _repeat(out: bytearray, begin: int, length: int) -> None:
     """Append what stands from `begin` on, which may reach into what is appended. Raises ValueError."""
     if begin < 0:
         raise ValueError("it refers to what lies before it")
-    held = out[begin : begin + length]
-    while len(held) < length:
-        held += held
-    out += held[:length]
+    held = bytes(out[begin : begin + length])
+    out += (held * -(-length // len(held)))[:length]
