@@ -109,14 +109,14 @@ async def drive(port: Port, cfg: Config) -> None:
 
 
 async def _opened(port: Port, cfg: Config) -> Source | None:
-    """The source; a robot that is not there is waited for, until the host wishes to stop. Raises SourceError."""
+    """The source; a robot or camera that is not there is awaited, until the host wishes to stop. Raises SourceError."""
     while not port.stopping.is_set():
         try:
             return await asyncio.to_thread(_open, cfg)
         except SourceError as error:
             if not is_live(cfg.source):
                 raise
-            log.warning("no robot yet", extra={"reason": str(error)})
+            log.warning("it is not there yet", extra={"reason": str(error)})
             await _stopped_while(port, asyncio.sleep(SEARCH_S))
     return None
 

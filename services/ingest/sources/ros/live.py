@@ -18,10 +18,10 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from prior_sg.services.ingest.core import selection
 from prior_sg.services.ingest.core.config import Config
+from prior_sg.services.ingest.core.due import Due
 from prior_sg.services.ingest.core.frames import BadFrame, Closure, Correction, RawFrame, View
-from prior_sg.services.ingest.core.options import LIVE, ReadOptions
+from prior_sg.services.ingest.core.options import ROBOT, ReadOptions
 from prior_sg.services.ingest.core.poses import Convention, PoseError
 from prior_sg.services.ingest.core.ros.assembly import Assembly, Fault, Jump, Posed
 from prior_sg.services.ingest.core.ros.graph import corrected
@@ -81,7 +81,7 @@ class Robot:
 
 def endpoint_of(source: str) -> str:
     """The router that an address such as ros2:/tcp/HOST:PORT names."""
-    return source.removeprefix(LIVE).strip("/") or ENDPOINT
+    return source.removeprefix(ROBOT).strip("/") or ENDPOINT
 
 
 def load(path: Path, options: ReadOptions) -> Source:
@@ -128,20 +128,6 @@ def heard(source: str, domain: int, seconds: float) -> list[Topic]:
             return look.topics()
     except (BusError, WireError) as error:
         raise SourceError(f"{source}: {error}") from error
-
-
-class Due:
-    """Whether a frame may become a keyframe, so that its images are worth decoding."""
-
-    def __init__(self, cfg: Config) -> None:
-        self._cfg = cfg
-        self._newest: View | None = None
-
-    def __call__(self, view: View) -> bool:
-        if not selection.due(self._newest, view, self._cfg):
-            return False
-        self._newest = view
-        return True
 
 
 def _found(path: Path, options: ReadOptions) -> Robot:

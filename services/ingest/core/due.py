@@ -1,0 +1,24 @@
+"""Which frames of a stream are worth decoding (pure)."""
+
+from prior_sg.services.ingest.core import selection
+from prior_sg.services.ingest.core.config import Config
+from prior_sg.services.ingest.core.frames import View
+
+
+class Due:
+    """Whether a frame may become a keyframe, so that its images are worth decoding."""
+
+    def __init__(self, cfg: Config) -> None:
+        self._cfg = cfg
+        self._newest: View | None = None
+        self._before: View | None = None
+
+    def __call__(self, view: View) -> bool:
+        if not selection.due(self._newest, view, self._cfg):
+            return False
+        self._before, self._newest = self._newest, view
+        return True
+
+    def failed(self) -> None:
+        """The newest one that was due cannot become one: the next may."""
+        self._newest = self._before
