@@ -74,7 +74,7 @@ class Scaling:
         self._last: Fit | None = None
 
     def check(self, stamp_ns: int, inverse_depth: np.ndarray, sigma: np.ndarray) -> Fit | None:
-        """The last factors, where points (n,) do not tell new ones, else None. Raises ScaleError where there are none."""
+        """The last factors, where points (n,) tell no new ones, else None. Raises ScaleError where there are none."""
         count = int((sigma <= PARALLAX * inverse_depth).sum())
         if count >= FEWEST:
             return None

@@ -4,8 +4,8 @@ realsense:            the only camera, or any
 realsense:SERIAL      the camera with this serial number
 realsense:FILE        a recording of the RealSense Viewer or of `enable_record_to_file`, .bag or .db3
 
-Colour and depth of 640 x 480 pixels at 30 Hz (of a recording, as it was recorded); depth is drawn into the colour camera
-by `rs.align`, for frames that may become keyframes. Stamps are the library's, in the time of this computer where it
+Colour and depth of 640 x 480 pixels at 30 Hz (of a recording, as recorded); depth is drawn into the colour camera by
+`rs.align`, for frames that may become keyframes. Stamps are the library's, in the time of this computer where it
 gives that (global time), else that of the camera's clock, moved so that the first frame is stamped when it came; of a
 recording they are the recorded ones. Coefficients of the inverse Brown-Conrady model are read as OpenCV's, as the
 maker's ROS node does. Source: github.com/IntelRealSense/librealsense, doc/frame_lifetime.md, wrappers/python.
