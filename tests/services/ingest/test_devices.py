@@ -1,4 +1,4 @@
-"""Cameras at this computer: a fake one, RealSense's own library on a recording of drawn frames, depthai's own messages."""
+"""Cameras: a fake one, RealSense's own library on a recording of drawn frames, depthai's own messages."""
 
 import os
 import threading
@@ -215,6 +215,12 @@ def test_a_camera_that_is_unplugged_is_read_again_when_it_is_back(tmp_path, plug
     assert first.closed and second.closed
 
 
+def test_a_fault_of_our_own_in_the_thread_is_not_silent(tmp_path, plugged):
+    plugged(Fake([*map(capture, range(6)), ZeroDivisionError("ours")]))
+    with pytest.raises(ZeroDivisionError, match=r"^ours$"):
+        list(open_source("oak:", options=ReadOptions(pose_source=rows(tmp_path / "p.txt"))))
+
+
 def test_a_camera_that_stays_away_ends_the_source(tmp_path, plugged, monkeypatch):
     monkeypatch.setattr(feed, "AGAIN_S", 0.01)
     plugged(Fake([*map(capture, range(6)), DeviceGone("gone")], ends=False), SourceError("not there"))
@@ -257,7 +263,7 @@ def test_a_mount_stands_between_the_body_and_the_camera():
         ReadOptions(body_from_camera=[0, 0, 0, 0, 0, 0, 0])
 
 
-def test_poses_of_a_topic_of_a_running_robot(endpoint, tmp_path, plugged):
+def test_poses_of_a_topic_of_a_running_robot(endpoint, plugged, monkeypatch):
     pytest.importorskip("rosbags")
     from prior_sg.services.runtime.ros.session import RosSession
     from prior_sg.services.runtime.ros.types import shared_types
@@ -294,6 +300,7 @@ def test_poses_of_a_topic_of_a_running_robot(endpoint, tmp_path, plugged):
     assert any("/slam/pose (PoseStamped)" in note for note in source.notes)
     x_m = [frame.world_from_camera[0, 3] for frame in frames]
     assert x_m == pytest.approx([0.01 * number for number in range(10)], abs=1e-6)
+    monkeypatch.setattr("prior_sg.services.ingest.sources.devices.poses.SEARCH_S", 0.5)
     with pytest.raises(SourceError, match=r"nobody publishes poses there"):
         open_poses(ReadOptions(pose_source=f"ros2:/{endpoint}", ros_domain=24))
 

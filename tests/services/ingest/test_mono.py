@@ -204,9 +204,9 @@ def test_a_network_that_fits_half_of_the_points_is_refused():
 
 
 def test_the_same_everywhere_is_refused():
-    _, output, inverse_depth, sigma = points()
-    flat = np.full_like(output, 7.0)
-    with pytest.raises(ScaleError, match=r"the same everywhere|fits"):
+    _, _, inverse_depth, sigma = points()
+    flat = np.full_like(inverse_depth, 7.0)
+    with pytest.raises(ScaleError, match=r"the same everywhere|fits 0%"):
         scale.fitted(0, scale.rows_of(flat, INVERSE), np.full_like(inverse_depth, 0.5), sigma)
 
 

@@ -25,13 +25,16 @@ class CameraFeed:
         self._waiting: deque[Capture] = deque(maxlen=WAITING)
         self._faults: Counter[Fault] = Counter()
         self._stop, self._ended = threading.Event(), False
-        self._thread = threading.Thread(target=self._read, name="camera", daemon=True)
+        self._broken: Exception | None = None
+        self._thread = threading.Thread(target=self._run, name="camera", daemon=True)
         self._thread.start()
 
     def take(self, timeout_s: float) -> tuple[list[Capture], Counter[Fault], bool]:
         """All that waits, what was lost and how often, and whether nothing more comes; waits for a capture."""
         with self._arrived:
             self._arrived.wait_for(lambda: self._waiting or self._ended, timeout_s)
+            if self._broken is not None:
+                raise self._broken
             captures, faults = list(self._waiting), self._faults
             self._waiting.clear()
             self._faults = Counter()
@@ -41,6 +44,14 @@ class CameraFeed:
         """Let go of the camera."""
         self._stop.set()
         self._thread.join()
+
+    def _run(self) -> None:
+        try:
+            self._read()
+        except Exception as error:  # whatever it is, whoever takes captures raises it
+            with self._arrived:
+                self._broken, self._ended = error, True
+                self._arrived.notify()
 
     def _read(self) -> None:
         device: Device | None = self.device

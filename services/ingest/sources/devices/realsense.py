@@ -80,7 +80,10 @@ class RealSense:
 
     def capture(self, timeout_s: float) -> Capture | None:
         """See Device."""
-        there, frames = self._pipeline.try_wait_for_frames(round(timeout_s * 1000))
+        try:
+            there, frames = self._pipeline.try_wait_for_frames(round(timeout_s * 1000))
+        except RuntimeError as error:
+            raise DeviceGone(f"{self.name} is gone: {' '.join(str(error).split())[:150]}") from error
         if not there:
             if not self.ended and time.monotonic() - self._heard_s > GONE_S:
                 raise DeviceGone(f"{self.name} has given no picture for {GONE_S:g} s: is it unplugged?")
