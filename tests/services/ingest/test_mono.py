@@ -179,7 +179,16 @@ def test_a_source_with_depth_has_nothing_for_a_network_to_do(tmp_path):
         depth_mm = np.rint(1000 * true_depth(moving(index) @ LEFT)).astype(np.uint16)
         cv2.imwrite(str(path / f"depth/{index:04d}.png"), depth_mm)
     with pytest.raises(SourceError, match=r"leave out --depth-model"):
-        open_source(path, options=ReadOptions(depth_model=network(tmp_path / "n.onnx")))
+        open_source(
+            path,
+            options=ReadOptions(
+                depth_model=network(tmp_path / "n.onnx"),
+                poses="world_from_camera",
+                camera_axes="opencv",
+                quaternion="xyzw",
+                depth_scale_m=0.001,
+            ),
+        )
 
 
 def points(count=200, seed=1):
@@ -222,7 +231,7 @@ def test_the_last_scale_holds_for_three_seconds_without_parallax():
 
 
 def test_a_scale_follows_slowly_and_forgets():
-    _, output, inverse_depth, sigma = points()
+    _, _, inverse_depth, sigma = points()
     scaling = Scaling(METRIC)
     depth = 1 / inverse_depth
     assert scaling.take(0, depth, inverse_depth, sigma).factors[0] == pytest.approx(1.0, rel=1e-6)

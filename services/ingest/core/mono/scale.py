@@ -78,8 +78,8 @@ class Scaling:
         count = int((sigma <= PARALLAX * inverse_depth).sum())
         if count >= FEWEST:
             return None
-        if self._last is not None and abs(stamp_ns - self._last.stamp_ns) <= HELD_NS:
-            return self._last
+        if (last := self._before(stamp_ns)) is not None:
+            return last
         raise ScaleError(
             f"nothing tells the scale of its depth: {count} points are seen with parallax, {FEWEST} are needed; the "
             "camera has to move sideways past things with corners"
@@ -94,11 +94,16 @@ class Scaling:
         if held := self.check(stamp_ns, inverse_depth, sigma):
             return held
         fit = fitted(stamp_ns, rows_of(output[told], self.kind), inverse_depth[told], sigma[told])
-        if self._last is not None and abs(stamp_ns - self._last.stamp_ns) <= HELD_NS:
-            weight = exp(-abs(stamp_ns - self._last.stamp_ns) / SMOOTH_NS)
-            fit = Fit(stamp_ns, fit.normal + weight * self._last.normal, fit.right + weight * self._last.right)
+        if (last := self._before(stamp_ns)) is not None:
+            weight = exp(-(stamp_ns - last.stamp_ns) / SMOOTH_NS)
+            fit = Fit(stamp_ns, fit.normal + weight * last.normal, fit.right + weight * last.right)
         self._last, self.usual = fit, float(np.median(inverse_depth[told]))
         return fit
+
+    def _before(self, stamp_ns: int) -> Fit | None:
+        """The last one that was told, where it is neither old nor, after a look ahead, of later."""
+        last = self._last
+        return last if last is not None and 0 <= stamp_ns - last.stamp_ns <= HELD_NS else None
 
 
 def rows_of(output: np.ndarray, kind: str) -> np.ndarray:
