@@ -67,13 +67,28 @@ def look(  # noqa: PLR0917
     if not len(points_px):
         return View(other_from_picture, points_px, np.zeros(0, bool))
     start_px = _seen_from(points_px, other_from_picture, camera, guess)
-    settings = {"winSize": WINDOW, "maxLevel": LEVELS, "flags": cv2.OPTFLOW_USE_INITIAL_FLOW}
-    there_px, found, _ = cv2.calcOpticalFlowPyrLK(picture, other, points_px, start_px.copy(), **settings)
-    back_px, returned, _ = cv2.calcOpticalFlowPyrLK(other, picture, there_px, points_px.copy(), **settings)
+    there_px, found = _flow(picture, other, points_px, start_px)
+    back_px, returned = _flow(other, picture, there_px, points_px)
     height, width = other.shape
     inside = (there_px >= 0).all(axis=1) & (there_px[:, 0] < width) & (there_px[:, 1] < height)
     closed = np.linalg.norm(back_px - points_px, axis=1) < RETURN_PX
-    return View(other_from_picture, there_px, inside & closed & (found[:, 0] > 0) & (returned[:, 0] > 0))
+    return View(other_from_picture, there_px, inside & closed & found & returned)
+
+
+def _flow(
+    picture: np.ndarray, other: np.ndarray, points_px: np.ndarray, start_px: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Where points (n, 2) went, looked for from `start_px` on, and whether (n,) they were found."""
+    there_px, found, _ = cv2.calcOpticalFlowPyrLK(
+        picture,
+        other,
+        points_px,
+        start_px.copy(),
+        winSize=WINDOW,
+        maxLevel=LEVELS,
+        flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+    )
+    return np.asarray(there_px), np.asarray(found)[:, 0] > 0
 
 
 def measure(points_px: np.ndarray, views: Sequence[View], camera: Intrinsics) -> Measured:
