@@ -68,7 +68,7 @@ def look(  # noqa: PLR0917
         return View(other_from_picture, points_px, np.zeros(0, bool))
     start_px = _seen_from(points_px, other_from_picture, camera, guess)
     there_px, found = _flow(picture, other, points_px, start_px)
-    back_px, returned = _flow(other, picture, there_px, points_px)
+    back_px, returned = _flow(other, picture, there_px, there_px - (start_px - points_px))
     height, width = other.shape
     inside = (there_px >= 0).all(axis=1) & (there_px[:, 0] < width) & (there_px[:, 1] < height)
     closed = np.linalg.norm(back_px - points_px, axis=1) < RETURN_PX
