@@ -7,7 +7,8 @@ A point at (u, v, 1), normalised, with inverse depth w lies along r + w t in ano
     a = w c,    a = (r_x - u' r_z, r_y - v' r_z),    c = (u' t_z - t_x, v' t_z - t_y)
 
 What is left of a across c is the distance from the epipolar line. Over all pictures w = sum(a c) / sum(c c), with the
-standard deviation NOISE_PX / (f sqrt(sum(c c))): about the same for near and far points.
+standard deviation n / (f sqrt(sum(c c))), about the same for near and far points; n, pixels, is what points are seen off
+their epipolar lines, at least NOISE_PX. A picture in which half of the points are not on their lines tells nothing.
 """
 
 from collections.abc import Sequence
@@ -24,6 +25,8 @@ RETURN_PX = 0.7  # a point followed there and back ends this close to where it b
 OFF_LINE_PX = 1.5  # from its epipolar line
 OFF_PX = 2.0  # of what one picture sees from what all say
 NOISE_PX = 0.5
+LEAST_SHARE = 0.5  # of the points followed into a picture that lie on their epipolar lines
+NORMAL = 1.4826  # standard deviation over median of what is off
 FARTHEST, NEAREST = 1 / 200, 1 / 0.1  # inverse depths between which a point is believed, 1/m
 TINY = 1e-12
 
@@ -96,7 +99,10 @@ def measure(points_px: np.ndarray, views: Sequence[View], camera: Intrinsics) ->
     focal_px = (camera.fx_px + camera.fy_px) / 2
     rays = _normalised(points_px, camera)
     equations = [_equations(rays, view, camera) for view in views]
-    used = [_on_line(a, c, view.followed, focal_px) for (a, c), view in zip(equations, views, strict=True)]
+    off_px = [_off_line(a, c, view.followed, focal_px) for (a, c), view in zip(equations, views, strict=True)]
+    used = [_on_line(off, view.followed) for off, view in zip(off_px, views, strict=True)]
+    seen_px = np.concatenate([np.zeros(0), *(off[ok] for off, ok in zip(off_px, used, strict=True))])
+    noise_px = max(NOISE_PX, NORMAL * float(np.median(seen_px))) if len(seen_px) else NOISE_PX
     inverse_depth, strength = _solved(equations, used, len(rays))
     used = [
         ok & (focal_px * np.linalg.norm(a - inverse_depth[:, None] * c, axis=1) < OFF_PX)
@@ -104,7 +110,7 @@ def measure(points_px: np.ndarray, views: Sequence[View], camera: Intrinsics) ->
     ]
     inverse_depth, strength = _solved(equations, used, len(rays))
     known = (strength > 0) & (inverse_depth > FARTHEST) & (inverse_depth < NEAREST)
-    sigma = NOISE_PX / focal_px / np.sqrt(strength[known])
+    sigma = noise_px / focal_px / np.sqrt(strength[known])
     return Measured(points_px[known], inverse_depth[known], sigma)
 
 
@@ -132,11 +138,17 @@ def _equations(rays: np.ndarray, view: View, camera: Intrinsics) -> tuple[np.nda
     return turned[:, :2] - seen * turned[:, 2:], seen * shift[2] - shift[:2]
 
 
-def _on_line(a: np.ndarray, c: np.ndarray, followed: np.ndarray, focal_px: float) -> np.ndarray:
-    """Points seen on their epipolar line, away from the epipole."""
+def _off_line(a: np.ndarray, c: np.ndarray, followed: np.ndarray, focal_px: float) -> np.ndarray:
+    """Pixels (n,) from where points are seen to their epipolar lines; infinite for none, and at the epipole."""
     length = np.linalg.norm(c, axis=1)
     across = np.abs(a[:, 0] * c[:, 1] - a[:, 1] * c[:, 0]) / np.maximum(length, TINY)
-    return followed & (length > TINY) & (focal_px * across < OFF_LINE_PX)
+    return np.where(followed & (length > TINY), focal_px * across, np.inf)
+
+
+def _on_line(off_px: np.ndarray, followed: np.ndarray) -> np.ndarray:
+    """Points (n,) of a view that can be believed."""
+    ok = off_px < OFF_LINE_PX
+    return ok if ok.sum() >= LEAST_SHARE * followed.sum() else np.zeros_like(ok)
 
 
 def _solved(

@@ -21,13 +21,13 @@ import numpy as np
 INVERSE, METRIC = "inverse", "metric"
 KINDS = (INVERSE, METRIC)
 FEWEST = 24  # points with parallax
-PARALLAX = 0.15  # most that a point's inverse depth may be unsure of, as a share of it
+PARALLAX = 0.06  # most that a point's inverse depth may be unsure of, as a share of it
 TOLERANCE, SPREAD = 0.1, 0.05  # error of the network that is still a fit, and its standard deviation; shares of 1/z
 LEAST_SHARE = 0.6  # of points that a scale has to fit
 CANDIDATES = 48  # points of which candidates are made
 WORTH = 20.0  # points that a frame counts for at most: the network's errors are those of surfaces, not of pixels
 ROUNDS = 4
-SMOOTH_NS, HELD_NS = 1_000_000_000, 3_000_000_000  # forgetting; and how long a scale is believed without parallax
+SMOOTH_NS, HELD_NS = 300_000_000, 1_000_000_000  # forgetting; and how long a scale is believed without parallax
 UNSURE = 0.2  # standard deviation of 1/z, as a share of it, beyond which a pixel is no measurement
 SINGULAR = 1e-9
 USUAL = 0.4  # inverse depth, 1/m, of what is not known yet
