@@ -7,7 +7,7 @@ A point at (u, v, 1), normalised, with inverse depth w lies along r + w t in ano
     a = w c,    a = (r_x - u' r_z, r_y - v' r_z),    c = (u' t_z - t_x, v' t_z - t_y)
 
 What is left of a across c is the distance from the epipolar line. Over all pictures w = sum(a c) / sum(c c), with the
-standard deviation n / (f sqrt(sum(c c))), about the same for near and far points; n, pixels, is what points are seen off
+standard deviation n / (f sqrt(sum(c c))), about the same for near and far points; n, pixels, is what points are off
 their epipolar lines, at least NOISE_PX. A picture in which half of the points are not on their lines tells nothing.
 """
 
