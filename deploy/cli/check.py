@@ -33,7 +33,9 @@ def add_commands(commands: Commands) -> None:
         "prior-sg check recordings/home",
         needs="map",
     )
-    parser.add_argument("source", help="a folder in a known layout (docs/sources.md), a recording, or ros2:/")
+    parser.add_argument(
+        "source", help="a folder in a known layout (docs/sources.md), a recording, ros2:/, realsense: or oak:"
+    )
     parser.add_argument("--json", action="store_true", help="print JSON")
     add_settings(parser)
     add_source_options(parser)
@@ -51,9 +53,15 @@ def cmd_check(arguments: argparse.Namespace) -> int:
 
 def before_start(path: str, cfg: "Config", console: Terminal) -> "Report":
     """A brief check: one line about the source and one for each problem. Raises HopelessSource and SourceError."""
-    from prior_sg.deploy.inspecting.check import check
+    from prior_sg.deploy.inspecting.check import check, unseen
     from prior_sg.services.ingest.sources import open_source
+    from prior_sg.services.ingest.sources.devices.poses import is_fifo
 
+    if is_fifo(cfg):
+        console.print(
+            f"{path} is not looked at before the start, for {cfg.pose_source} is a FIFO, which one reader empties"
+        )
+        return unseen(path)
     report = check(open_source(path, options=cfg), cfg, brief=True)
     console.print(report.summary)
     for finding in report.findings:

@@ -39,7 +39,10 @@ def add_commands(commands: Commands) -> None:
         'prior-sg run deploy/sample/home.mcap --environment "residential home" --task "serve drinks to guests"',
         needs="encode",
     )
-    run.add_argument("source", help="a folder in a known layout (docs/sources.md), a recording, or ros2:/ for a robot")
+    run.add_argument(
+        "source",
+        help="a folder in a known layout (docs/sources.md), a recording, ros2:/ for a robot, or realsense: or oak:",
+    )
     run.add_argument("--environment", required=True, help="what kind of place it is, in plain words")
     run.add_argument("--task", required=True, help="what the robot is to do, in plain words")
     run.add_argument("--regions", default="", help="fixed region names, separated by commas; default: the prior's")

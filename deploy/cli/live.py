@@ -31,7 +31,9 @@ def add_commands(commands: Commands) -> None:
         needs="map",
     )
     up.add_argument("services", nargs="*", help="services to start; default: all")
-    up.add_argument("--source", default="", help="what ingest reads, ros2:/ for a robot; default: nothing")
+    up.add_argument(
+        "--source", default="", help="what ingest reads, ros2:/ for a robot, realsense: or oak:; default: nothing"
+    )
     up.add_argument("--out", type=Path, default=Path("out/up"), help="folder for the database and logs")
     up.add_argument("--no-router", action="store_true", help="use the router at --connect instead of starting one")
     add_router(up)

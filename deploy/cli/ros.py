@@ -33,10 +33,10 @@ def add_commands(commands: Commands) -> None:
 
 def cmd_topics(arguments: argparse.Namespace) -> int:
     """List topics by name, and mark those that a run would read. Raises UserError and SourceError."""
-    from prior_sg.services.ingest.core.options import ReadOptions, is_live
+    from prior_sg.services.ingest.core.options import ReadOptions, is_robot
     from prior_sg.services.ingest.core.ros.topics import chosen, cloud_chosen
 
-    live = is_live(arguments.source)
+    live = is_robot(arguments.source)
     topics = _heard(arguments) if live else _recorded(Path(arguments.source))
     if arguments.json:
         print(json_text([_as_builtins(topic) for topic in topics], None))

@@ -84,10 +84,21 @@ OPTIONS = (
     Option("--depth-topic", "depth_topic", "TOPIC", "its depth images"),
     Option("--info-topic", "info_topic", "TOPIC", "camera info of its colour images"),
     Option("--pose-topic", "pose_topic", "TOPIC", "its odometry, poses or transforms; default: tf, else one of these"),
+    Option(
+        "--pose-source", "pose_source", "FILE|ros2:/", "where poses of a camera come from: growing lines, or a topic"
+    ),
+    Option(
+        "--mount", "body_from_camera", "TX,TY,TZ,QX,QY,QZ,QW", "the camera in the frame whose poses come", listed=True
+    ),
     Option("--graph-topic", "graph_topic", "TOPIC", "of a live robot: optimised poses (nav_msgs/Path) of --pose-frame"),
     Option("--fixed-frame", "fixed_frame", "FRAME", "the world, of tf; default: map, world, odom or the root"),
     Option("--pose-frame", "pose_frame", "FRAME", "the frame whose poses --pose-topic has"),
-    Option("--depth-model", "depth_model", "FILE", "ONNX file that sees depth in the pictures of a stereo camera"),
+    Option(
+        "--depth-model", "depth_model", "FILE", "ONNX file that sees depth in one picture, or in a stereo camera's two"
+    ),
+    Option(
+        "--depth-output", "depth_output", "KIND", "of a network that sees one picture", choices=("inverse", "metric")
+    ),
     Option(
         "--sync-tolerance", "sync_tolerance_s", "SECONDS", "most between stamps of one frame's colour, depth and pose"
     ),

@@ -75,6 +75,11 @@ def unreadable(path: str, reason: str) -> Report:
     return Report(source=path, layout="", summary="", findings=[found], beside=Beside(), seconds=0.0)
 
 
+def unseen(path: str) -> Report:
+    """The report on a source that can be read only once."""
+    return Report(source=path, layout="", summary="", findings=[], beside=Beside(), seconds=0.0)
+
+
 def look(
     source: Source, cfg: Config, *, brief: bool = False, progress: Progress = lambda done, total: None
 ) -> Recording:

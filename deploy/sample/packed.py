@@ -83,7 +83,7 @@ def pack_source(  # noqa: PLR0917
     """
     source = open_source(path, options=options)
     if source.live is not None:
-        raise PackError(f"{path} is a running robot: record it (`ros2 bag record`), or pack the log.mcap of a run")
+        raise PackError(f"{path} is live: record it (of a robot, `ros2 bag record`), or pack the log.mcap of a run")
     refused: Counter[str] = Counter()
     partial = log_path.with_name(f"{log_path.name}.partial")
     try:

@@ -109,7 +109,7 @@ async def drive(port: Port, cfg: Config) -> None:
 
 
 async def _opened(port: Port, cfg: Config) -> Source | None:
-    """The source; a robot that is not there is waited for, until the host wishes to stop.
+    """The source; a robot or camera that is not there is awaited, until the host wishes to stop.
 
     Raises SourceError; of a robot LastingError, for what waiting does not mend.
     """
@@ -119,7 +119,7 @@ async def _opened(port: Port, cfg: Config) -> Source | None:
         except SourceError as error:
             if isinstance(error, LastingError) or not is_live(cfg.source):
                 raise
-            log.warning("no robot yet", extra={"reason": str(error)})
+            log.warning("it is not there yet", extra={"reason": str(error)})
             await _stopped_while(port, asyncio.sleep(SEARCH_S))
     return None
 

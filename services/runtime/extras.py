@@ -32,6 +32,7 @@ MODULES = {  # by extra; what the build file lists there, by the names that code
     "foxglove": ("foxglove",),
     "ros": ("rosbags", "mcap_protobuf"),
     "record3d": ("lzfse",),
+    "cameras": ("pyrealsense2", "depthai"),
     "hydra": ("zmq", "spark_dsg"),
 }
 CONTAINS = {
@@ -42,6 +43,7 @@ CONTAINS = {
     "foxglove": ("map",),
     "ros": ("map",),
     "record3d": ("map",),
+    "cameras": ("map",),
     "hydra": ("map",),
 }
 
@@ -64,6 +66,13 @@ def require(extra: str, user: str) -> None:
     modules = [name for one in (extra, *CONTAINS.get(extra, ())) if one for name in MODULES[one]]
     if absent := [name for name in modules if find_spec(name) is None]:
         raise ExtraMissing(f"{user} needs {', '.join(absent)}: {remedy(extra)}")
+
+
+def require_module(module: str, user: str) -> None:
+    """Raise ExtraMissing on behalf of `user` unless one package is there; it can do without its extra's others."""
+    if find_spec(module) is None:
+        extra = next(extra for extra, modules in MODULES.items() if module in modules)
+        raise ExtraMissing(f"{user} needs {module}: {remedy(extra)}, or `pip install {module}`")
 
 
 def advice(error: ModuleNotFoundError) -> str | None:

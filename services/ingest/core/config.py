@@ -2,7 +2,7 @@
 
 from typing import Literal
 
-from prior_sg.services.ingest.core.options import ReadOptions
+from prior_sg.services.ingest.core.options import ReadOptions, check_posed
 
 
 class Config(ReadOptions, frozen=True, kw_only=True):
@@ -12,7 +12,7 @@ class Config(ReadOptions, frozen=True, kw_only=True):
     keyframes overlap by more than half at 60 to 75 degrees of view.
     """
 
-    source: str = ""  # a folder of a layout in docs/sources.md, an MCAP log, or ros2:/; empty = no source
+    source: str = ""  # a folder of a layout in docs/sources.md, an MCAP log, ros2:/, realsense: or oak:; empty = none
     speed: float = 0.0  # times real time, by stamps; 0 = as fast as the pipeline drains
     when_behind: Literal["wait", "skip"] = "wait"  # wait for slow workers, or keep pace and encode only the newest, as
     # a live source always does
@@ -24,3 +24,7 @@ class Config(ReadOptions, frozen=True, kw_only=True):
     max_interval_s: float = 2.0  # the same for time, so that a resting camera still reports; 0 = never
     max_speed_m_s: float = 10.0  # faster camera motion is a jump of the tracker, and refused; 0 = believe everything
     archive_mb: float = 256.0  # compressed keyframes kept for ARCHIVE, oldest dropped first
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_posed(self.source, self.pose_source)

@@ -15,8 +15,9 @@ CameraAxes = Literal["opencv", "opengl", "ros", "ned"]
 StampUnit = Literal["s", "ms", "us", "ns"]
 StampClock = Literal["header", "received"]
 LensModel = Literal["pinhole", "opencv", "fisheye"]
+DepthOutput = Literal["inverse", "metric"]
 COEFFICIENTS: dict[str, tuple[int, ...]] = {"pinhole": (0,), "opencv": (4, 5, 8), "fisheye": (4,)}
-LIVE = "ros2:"
+ROBOT, CAMERAS = "ros2:", ("realsense:", "oak:")  # what sources that are no files begin with
 ORIGIN_KEPT, ORIGIN_AUTO = "keep", "auto"
 ALL_CAMERAS = "all"
 
@@ -49,10 +50,18 @@ class ReadOptions(msgspec.Struct, frozen=True, kw_only=True):
     depth_topic: str = ""
     info_topic: str = ""  # the colour camera's info
     pose_topic: str = ""  # odometry, poses or transforms; empty = tf where it moves the camera, else one of them
+    pose_source: str = ""  # of a camera: a file or FIFO that grows by lines of stamp tx ty tz qx qy qz qw, or ros2:/
+    body_from_camera: list[float] = msgspec.field(
+        default_factory=list
+    )  # of a camera: tx ty tz qx qy qz qw of it in the
+    # frame whose poses come; empty = they are the camera's
     graph_topic: str = ""  # of a live robot: its optimised poses (nav_msgs/Path) of pose_frame; empty = jumps of tf
     fixed_frame: str = ""  # of tf: the world; empty = map, world, odom or the root
     pose_frame: str = ""  # the frame whose poses pose_topic has; empty = as its messages say, else the camera's
-    depth_model: str = ""  # an ONNX file that sees depth in two pictures; empty = OpenCV's semi-global matching
+    depth_model: str = ""  # an ONNX file that sees depth in one picture, or in two; empty = none, and of two pictures
+    # OpenCV's semi-global matching
+    depth_output: Literal["", DepthOutput] = ""  # of a depth_model of one picture: inverse depth, or (metric) depth;
+    # empty = as the file says
     sync_tolerance_s: float = 0.02  # most between stamps of colour, depth and pose that belong together
     ros_domain: int = 0  # of a live robot: its ROS_DOMAIN_ID
     end_after_s: float = 30.0  # a live source has ended after so long without a frame; 0 = never
@@ -81,6 +90,10 @@ class ReadOptions(msgspec.Struct, frozen=True, kw_only=True):
                 "several cameras have their own topics, intrinsics, lenses and stamps: with --cameras leave out "
                 "--color-topic, --depth-topic, --info-topic, --intrinsics, --distortion and --rate"
             )
+        if self.body_from_camera and not _is_pose(self.body_from_camera):
+            raise ValueError(
+                "body_from_camera must be tx ty tz qx qy qz qw, in metres, with a quaternion that is not zero"
+            )
         check_lens(self.camera_model, self.distortion)
         offset_of(self.origin)
 
@@ -101,8 +114,31 @@ class ReadOptions(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def is_live(source: str) -> bool:
-    """Whether a source is a running robot rather than a file."""
-    return source.startswith(LIVE)
+    """Whether a source is a running robot or a camera rather than a file."""
+    return is_robot(source) or is_camera(source)
+
+
+def is_robot(source: str) -> bool:
+    """Whether a source is a running robot."""
+    return source.startswith(ROBOT)
+
+
+def is_camera(source: str) -> bool:
+    """Whether a source is a camera, or its recording played back."""
+    return source.startswith(CAMERAS)
+
+
+def check_posed(source: str, pose_source: str) -> None:
+    """Raise ValueError for a camera of which nobody says where it is."""
+    if is_camera(source) and not pose_source:
+        raise ValueError(
+            f"{source}: a camera does not know where it is; give --pose-source FILE (or a FIFO, with lines of stamp tx "
+            "ty tz qx qy qz qw) or --pose-source ros2:/ with --pose-topic"
+        )
+
+
+def _is_pose(numbers: Sequence[float]) -> bool:
+    return len(numbers) == 7 and all(map(math.isfinite, numbers)) and any(numbers[3:])
 
 
 def check_lens(model: str, coefficients: Sequence[float]) -> None:

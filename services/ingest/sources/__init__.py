@@ -6,7 +6,7 @@ from pathlib import Path
 
 import msgspec
 
-from prior_sg.services.ingest.core.options import ReadOptions, is_live
+from prior_sg.services.ingest.core.options import ReadOptions, is_camera, is_robot
 from prior_sg.services.ingest.sources import (
     coda,
     dataset,
@@ -20,10 +20,12 @@ from prior_sg.services.ingest.sources import (
     tartanground,
     tum,
 )
-from prior_sg.services.ingest.sources.base import Source, SourceError
+from prior_sg.services.ingest.sources.base import Found, Source, SourceError
 from prior_sg.services.ingest.sources.clouds import folder as clouds_folder
+from prior_sg.services.ingest.sources.devices import live as devices_live
 from prior_sg.services.ingest.sources.exports import euroc, record3d, rtabmap, stray_scanner
 from prior_sg.services.ingest.sources.hints import hint
+from prior_sg.services.ingest.sources.mono.film import with_depth
 from prior_sg.services.ingest.sources.normalise import finish
 from prior_sg.services.ingest.sources.ros import live as ros_live
 from prior_sg.services.ingest.sources.ros import recordings as ros_recordings
@@ -65,11 +67,13 @@ def open_source(
     points up in the source's world, empty for what its layout says; `floor_m` is the height of its floor in that
     direction. Poses come out in a world with z up and the floor at zero; ground truth stays in the world as it comes
     out when neither is given. `robot` picks one robot of a log, empty for the first; these three go before `options`.
-    `ros2:/` is a running robot. Raises SourceError.
+    `ros2:/` is a running robot, `realsense:` and `oak:` are cameras. Raises SourceError.
     """
     path = Path(path)
     options = _with(options or ReadOptions(), world_up, floor_m, robot)
-    if is_live(str(path)):
+    if is_camera(str(path)):
+        return devices_live.load(path, options)
+    if is_robot(str(path)):
         return ros_live.load(path, options)
     if not path.exists():
         known = "a dataset folder, a 7-Scenes folder, a ROS bag or an MCAP log"
@@ -80,7 +84,7 @@ def open_source(
         return recording.load(path, options)
     for layout in LAYOUTS:
         if layout.fits(path):
-            return finish(layout.load(path, options), options)
+            return _finished(layout.load(path, options), options)
     said = hint(path, lambda folder: any(layout.fits(folder) for layout in LAYOUTS))
     looks = ", ".join(layout.LOOKS for layout in LAYOUTS)
     raise SourceError(
@@ -109,4 +113,13 @@ def _as_told(path: Path, options: ReadOptions) -> Source:
         found = layout.load(path, options)
     except OSError as error:
         raise SourceError(f"{path} cannot be read as {layout.NAME}: {error.strerror}") from error
-    return finish(replace(found, why=("as told",)), options)
+    return _finished(replace(found, why=("as told",)), options)
+
+
+def _finished(found: Found, options: ReadOptions) -> Source:
+    """The source of what a loader found, with depth where its files have none. Raises SourceError."""
+    if found.depthless:
+        return finish(*with_depth(found, options))
+    if options.depth_model and found.layout != euroc.NAME:
+        raise SourceError(f"{found.path} has depth, so that a network has nothing to do: leave out --depth-model")
+    return finish(found, options)

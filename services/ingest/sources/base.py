@@ -54,6 +54,8 @@ class Source:
     close: Callable[[], None] = lambda: None  # ends what runs; safe from any thread
     thinned: "Callable[[Wanted], Iterator[RawFrame | BadFrame]] | None" = None  # the same frames, but images, which
     # cost time, only of the wanted ones; the others' files are looked at and their images left empty
+    sparing: "Callable[[], Iterator[RawFrame | BadFrame]] | None" = None  # the same frames, images only of those that
+    # may become keyframes; None = images cost little
 
     def __iter__(self) -> Iterator[RawFrame | BadFrame]:
         return self.frames()
@@ -65,7 +67,7 @@ class Source:
             return
         corrections = self.corrections()
         waiting = next(corrections, None)
-        for frame in self.frames():
+        for frame in self.frames() if self.sparing is None else self.sparing():
             while waiting is not None and isinstance(frame, RawFrame) and waiting.stamp_ns < frame.stamp_ns:
                 yield waiting
                 waiting = next(corrections, None)
@@ -96,12 +98,13 @@ class Images:
 
 @dataclass(frozen=True)
 class Entry:
-    """One frame before it is read: `pose` gives source_from_camera, both raise FrameError."""
+    """One frame before it is read: `pose` gives source_from_camera; all raise FrameError."""
 
     frame_id: int
     stamp_ns: int
     pose: Callable[[], np.ndarray]
     images: Callable[[], Images]
+    glance: Callable[[], Images] | None = None  # images as far as they cost little; None = they do
 
 
 @dataclass(frozen=True)
@@ -120,6 +123,8 @@ class Found:
     convention: Convention | None = None  # how written poses are read; None = in a way no option changes
     why: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
+    depthless: bool = False  # images are colour alone, in which depth is to be seen
+    costly: bool = False  # images take long, so that only those are made that are needed
     assumed_hz: float = 0.0  # frames per second where the layout has no stamps and nobody told; 0 = stamps are real
     name: str = ""  # of the camera, where the robot has several
     beside: "tuple[Found, ...]" = ()  # its other cameras, in the same world and with real stamps

@@ -29,6 +29,7 @@ from prior_sg.services.ingest.core.detection import (
     LEAST_SHARE,
     OPTIONS,
     USUAL_UNIT_M,
+    Meaning,
     Verdict,
     Written,
     meaning_of,
@@ -74,9 +75,11 @@ def fits(path: Path) -> bool:
     """Whether a folder has this layout."""
     if not path.is_dir():
         return False
-    held = [folder_of(path, names) is not None for names in (COLORS, DEPTHS, POSES)]
-    found = None if all(held) else pose_lists.find(path)
-    return all(held) or (found is not None and (any(held[:2]) or found.name == pose_lists.TRANSFORMS))
+    colors, depths, poses = (folder_of(path, names) is not None for names in (COLORS, DEPTHS, POSES))
+    if colors and poses:
+        return True
+    found = pose_lists.find(path)
+    return found is not None and (colors or depths or found.name == pose_lists.TRANSFORMS)
 
 
 @dataclass(frozen=True)
@@ -97,6 +100,7 @@ class Folder:
     poses: Mapping[float, Path | np.ndarray]
     held: tuple[str, ...]  # what was found
     listed: PoseList | None = None
+    depthless: bool = False  # there is colour alone
 
 
 @dataclass(frozen=True)
@@ -109,7 +113,7 @@ class Known:
 
 def load(path: Path, options: ReadOptions) -> Found:
     """A folder in a layout of one's own. Raises SourceError."""
-    folder = _folder(path)
+    folder = _folder(path, options)
     keys = sorted(folder.colors.keys() | folder.depths.keys() | folder.poses.keys())
     files = [Files(folder.colors.get(key), folder.depths.get(key), folder.poses.get(key)) for key in keys]
     camera, scale_m, notes = _camera(path, folder, options)
@@ -128,7 +132,7 @@ def load(path: Path, options: ReadOptions) -> Found:
         camera,
         verdict.meaning.unit_m,
         [
-            Entry(number, stamp, partial(_pose, file, convention), partial(_images, file))
+            Entry(number, stamp, partial(_pose, file, convention), partial(_images, file, folder.depthless))
             for number, stamp, file in zip(_numbers(keys), stamps, files, strict=True)
         ],
         up=up,
@@ -136,11 +140,12 @@ def load(path: Path, options: ReadOptions) -> Found:
         convention=convention,
         why=(f"{', '.join(folder.held)} lie in it, and no other layout fits",),
         notes=(*notes, *said, *timed),
+        depthless=folder.depthless,
         assumed_hz=assumed_hz,
     )
 
 
-def _folder(path: Path) -> Folder:
+def _folder(path: Path, options: ReadOptions) -> Folder:
     """The files of a folder by the number of their frame. Raises SourceError."""
     colors, depths, poses = (folder_of(path, names) for names in (COLORS, DEPTHS, POSES))
     found = None if poses is not None else pose_lists.find(path)
@@ -148,8 +153,12 @@ def _folder(path: Path) -> Folder:
     colors = colors or (None if listed is None else listed.images)
     if colors is None or not colors.is_dir() or (poses is None and listed is None):
         raise SourceError(f"{path} lacks images or poses: looked for {LOOKS}; poses may be {pose_lists.UNDERSTOOD}")
-    if depths is None and not (listed and listed.depth_names):
-        raise SourceError(f"{path} lacks depth images: put a folder depth/ with one for each colour image into it")
+    depthless = depths is None and not (listed and listed.depth_names)
+    if depthless and not options.depth_model:
+        raise SourceError(
+            f"{path} lacks depth images: put a folder depth/ with one for each colour image into it, or give "
+            "--depth-model FILE.onnx, a network that sees depth in one picture"
+        )
     by_color = _by_key(colors, PICTURES)
     stems = {file.stem: key for key, file in by_color.items()}
     by_depth = {} if depths is None else _by_key(depths, ARRAYS)
@@ -157,8 +166,9 @@ def _folder(path: Path) -> Folder:
         by_depth = {stems[s]: listed.path.parent / name for s, name in listed.depth_names.items() if s in stems}
     held = tuple(f"{part.name}/" for part in (colors, depths, poses) if part is not None)
     if listed is None:
-        return Folder(by_color, by_depth, _by_key(poses, MATRICES) if poses else {}, held)
-    return Folder(by_color, by_depth, listed.of(sorted(by_color), stems), (*held, listed.path.name), listed)
+        return Folder(by_color, by_depth, _by_key(poses, MATRICES) if poses else {}, held, depthless=depthless)
+    held = (*held, listed.path.name)
+    return Folder(by_color, by_depth, listed.of(sorted(by_color), stems), held, listed, depthless)
 
 
 def folder_of(path: Path, names: Sequence[str]) -> Path | None:
@@ -189,7 +199,7 @@ def _numbers(keys: Sequence[float]) -> list[int]:
 def _camera(path: Path, folder: Folder, options: ReadOptions) -> tuple[Camera, float | None, list[str]]:
     """The camera, metres per depth unit where its file says, and notes. Raises SourceError."""
     color_size = first_size(list(folder.colors.values()), path)
-    depth_size = first_size(list(folder.depths.values()), path)
+    depth_size = color_size if folder.depthless else first_size(list(folder.depths.values()), path)
     file, fields = described(path, folder.listed)
     if file is None:
         if not options.intrinsics:
@@ -249,7 +259,9 @@ def _posed(file: Files, convention: Convention) -> np.ndarray | None:
         return None
 
 
-def _images(file: Files) -> Images:
+def _images(file: Files, depthless: bool) -> Images:
+    if depthless and file.color is not None:
+        return Images(read_bytes(file.color), b"")
     if file.color is None or file.depth is None:
         raise FrameError(f"it has no {'colour' if file.color is None else 'depth'} file")
     return Images(read_bytes(file.color), read_bytes(file.depth))
@@ -260,6 +272,8 @@ def _verdict(
 ) -> tuple[Verdict, list[str]]:
     """What poses and depth mean, and how that is known. Raises SourceError that names the options."""
     pairs = _pairs(path, files)
+    if folder.depthless:
+        return _told_verdict(path, files, folder.listed, options)
     depths = [written.depth for pair in pairs for written in pair]
     told = _told(pairs, folder.listed, options)
     open_ = [name for name, value in told.items() if not value]
@@ -282,6 +296,29 @@ def _verdict(
         )
     said = _said(verdict, folder.listed, open_)
     return verdict, said if floats else [*said, _unit_said(known_m, units_m, verdict)]
+
+
+def _told_verdict(
+    path: Path, files: list[Files], listed: PoseList | None, options: ReadOptions
+) -> tuple[Verdict, list[str]]:
+    """What poses mean where no depth images could tell. Raises SourceError that names the options."""
+    first = Written(np.zeros((1, 1)), _first_numbers(files))
+    told = _told([(first, first)], listed, options)
+    if open_ := [name for name, value in told.items() if not value]:
+        raise SourceError(f"{path} has no depth that would tell what its poses mean: give {_asked(open_)}")
+    (convention,) = _conventions(told, options.position_scale_m)
+    verdict = Verdict(Meaning(convention, USUAL_UNIT_M), 0.0, ())
+    return verdict, _said(verdict, listed, ())
+
+
+def _first_numbers(files: list[Files]) -> np.ndarray:
+    """The first pose that can be read, as it is written; there is one."""
+    for file in files:
+        try:
+            return _numbers_of(file)
+        except (FrameError, PoseError, ImageError):
+            continue
+    raise AssertionError("_pairs has found one")
 
 
 def _told(pairs: Sequence[tuple[Written, Written]], listed: PoseList | None, options: ReadOptions) -> dict[str, str]:

@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -11,8 +12,10 @@ import numpy as np
 
 from prior_sg.schemas.frames import Intrinsics
 from prior_sg.services.headers import JPEG_MAGIC, ImageError, is_sized, trimmed
+from prior_sg.services.ingest.core.config import Config
 from prior_sg.services.ingest.core.detection import likely_unit_m
-from prior_sg.services.ingest.core.frames import BadFrame, RawFrame
+from prior_sg.services.ingest.core.due import Due
+from prior_sg.services.ingest.core.frames import BadFrame, RawFrame, View
 from prior_sg.services.ingest.core.options import ORIGIN_AUTO, ORIGIN_KEPT, ReadOptions, offset_of
 from prior_sg.services.ingest.core.pairing import risen
 from prior_sg.services.ingest.core.pixels import encoded, measured, millimetres, stored
@@ -232,6 +235,7 @@ def finish(found: Found, options: ReadOptions) -> Source:
         depth_unit_m=normaliser.depth.unit_m,
         world_from_source=normaliser.world_from_source,
         thinned=lambda wanted: _frames(rolls, wanted),
+        sparing=partial(_sparing, rolls, options) if found.costly and isinstance(options, Config) else None,
     )
 
 
@@ -287,9 +291,30 @@ def _frames(rolls: Sequence[tuple[Normaliser, Entry]], wanted: Wanted | None = N
             pose = entry.pose()
             whole = wanted is None or wanted(index, normaliser.pose(pose))
             make = normaliser.frame if whole else normaliser.bare
-            yield make(index, total, entry.frame_id, entry.stamp_ns, pose, entry.images())
+            images = entry.images if whole else entry.glance or entry.images
+            yield make(index, total, entry.frame_id, entry.stamp_ns, pose, images())
         except UNUSABLE as error:
             yield BadFrame(frame_id=entry.frame_id, reason=str(error), index=index, total=total)
+
+
+def _sparing(rolls: Sequence[tuple[Normaliser, Entry]], cfg: Config) -> Iterator[RawFrame | BadFrame]:
+    """All frames, with images where a keyframe may be due."""
+    due = Due(cfg)
+    wanted = set[int]()
+
+    def wants(index: int, pose: np.ndarray) -> bool:
+        normaliser, entry = rolls[index]
+        if due(View(entry.frame_id, entry.stamp_ns, pose, camera=normaliser.camera)):
+            wanted.add(index)
+        return index in wanted
+
+    for frame in _frames(rolls, wants):
+        if isinstance(frame, RawFrame):
+            yield frame if frame.index in wanted else msgspec.structs.replace(frame, pose_only=True)
+            continue
+        if frame.index in wanted:
+            due.failed()
+        yield frame
 
 
 def _paced(found: Found, options: ReadOptions) -> tuple[Sequence[Entry], tuple[str, ...]]:

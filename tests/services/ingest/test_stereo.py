@@ -163,7 +163,9 @@ def test_a_rate_that_is_told_counts_in_place_of_stamps(kept):
     assert [frame.stamp_ns for frame in source] == [0, 500_000_000, 1_000_000_000, 1_500_000_000]
 
 
-@pytest.mark.parametrize("made", [lambda path: network(path, inputs=1), lambda path: path.write_bytes(b"no network")])
+@pytest.mark.parametrize(
+    "made", [lambda path: network(path, shape=(1, 4, "h", "w")), lambda path: path.write_bytes(b"no")]
+)
 def test_a_file_that_is_no_network_that_matches_is_told(tmp_path, kept, made):
     pytest.importorskip("onnxruntime")
     made(tmp_path / "n.onnx")

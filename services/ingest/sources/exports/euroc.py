@@ -8,7 +8,8 @@ mav0/state_groundtruth_estimate0/data.csv      stamp (ns), position, quaternion 
                                                qx qy qz qw
 
 Depth comes from the two pictures: rectified, then matched by OpenCV's SGBM, or by a network of one's own with
---depth-model (depth_models.py). Poses are interpolated. Unknown lenses and sequences of one camera are told.
+--depth-model (depth_models.py); by one that sees it in one picture, of cam0 alone (mono/film.py). Poses are
+interpolated. Unknown lenses are told, and sequences of one camera without such a network.
 Source: projects.asl.ethz.ch/datasets, the paper of Burri et al. 2016.
 """
 
@@ -57,9 +58,12 @@ def fits(path: Path) -> bool:
 def load(path: Path, options: ReadOptions) -> Found:
     """A sequence of EuRoC. Raises SourceError."""
     lefts, rights = (numbered(path / "mav0" / name / "data", r"(\d+)\.(?:png|jpg)") for name in ("cam0", "cam1"))
+    if lefts and depth_models.sees_one(options):
+        return _of_one(path, lefts, options)
     if not lefts or not rights:
         raise SourceError(
-            f"{path} has pictures of {'one camera' if lefts else 'no left camera'}: depth needs cam0 and cam1"
+            f"{path} has pictures of {'one camera' if lefts else 'no left camera'}: depth needs cam0 and cam1, or cam0 "
+            "and a --depth-model that sees it in one picture"
         )
     (left, body_from_left), (right, body_from_right) = (
         _sensor(path / "mav0" / name / "sensor.yaml") for name in ("cam0", "cam1")
@@ -92,6 +96,36 @@ def load(path: Path, options: ReadOptions) -> Found:
         why=("mav0/cam0 lies in it",),
         notes=(f"depth is that of two cameras {pair.baseline_m:.3f} m apart, {said}", f"poses of {file.name}"),
     )
+
+
+def _of_one(path: Path, files: dict[int, Path], options: ReadOptions) -> Found:
+    """The left camera alone. Raises SourceError."""
+    lens, body_from_camera = _sensor(path / "mav0/cam0/sensor.yaml")
+    track, file = _track(path, options)
+    entries = [
+        Entry(
+            number,
+            options.told_ns(number, stamp),
+            partial(_pose, track, stamp, body_from_camera),
+            partial(_picture, picture),
+        )
+        for number, (stamp, picture) in enumerate(files.items())
+    ]
+    return Found(
+        NAME,
+        path,
+        base.Camera(lens.intrinsics, lens.model, lens.distortion),
+        MILLIMETRE,
+        entries,
+        ground_truth=truth_beside(path),
+        why=("mav0/cam0 lies in it",),
+        notes=(f"poses of {file.name}",),
+        depthless=True,
+    )
+
+
+def _picture(file: Path) -> Images:
+    return Images(read_bytes(file), b"")
 
 
 def _both(lefts: dict[int, Path], rights: dict[int, Path]) -> list[tuple[int, tuple[Path, Path]]]:

@@ -74,10 +74,10 @@ class Tally:
         self._found: dict[tuple[str, str], list] = {}  # count and first text since the last word
         self._said_s: dict[tuple[str, str], float] = {}
 
-    def add(self, fault: Fault) -> None:
-        """Count one."""
+    def add(self, fault: Fault, count: int = 1) -> None:
+        """Count one, or several of the same."""
         key = fault.what, fault.kind or kind_of(fault.text)
-        self._found.setdefault(key, [0, fault.text])[0] += 1
+        self._found.setdefault(key, [0, fault.text])[0] += count
 
     def words(self, ended: bool = False) -> Iterator[Unused]:
         """Those that are due; at the end all."""

@@ -14,10 +14,10 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from prior_sg.services.ingest.core import selection
 from prior_sg.services.ingest.core.config import Config
+from prior_sg.services.ingest.core.due import Due
 from prior_sg.services.ingest.core.frames import BadFrame, RawFrame, View
-from prior_sg.services.ingest.core.options import LIVE, ReadOptions
+from prior_sg.services.ingest.core.options import ROBOT, ReadOptions
 from prior_sg.services.ingest.core.ros.topics import NAMED, Topic
 from prior_sg.services.ingest.sources.base import Source, SourceError
 from prior_sg.services.ingest.sources.normalise import UNUSABLE, Normaliser
@@ -38,7 +38,7 @@ LOOK_S = 8.0
 
 def endpoint_of(source: str) -> str:
     """The router that an address such as ros2:/tcp/HOST:PORT names."""
-    return source.removeprefix(LIVE).strip("/") or ENDPOINT
+    return source.removeprefix(ROBOT).strip("/") or ENDPOINT
 
 
 def load(path: Path, options: ReadOptions) -> Source:
@@ -85,20 +85,6 @@ def heard(source: str, domain: int, seconds: float) -> list[Topic]:
             return look.topics()
     except (BusError, WireError) as error:
         raise SourceError(f"{source}: {error}") from error
-
-
-class Due:
-    """Whether a frame may become a keyframe, so that its images are worth decoding."""
-
-    def __init__(self, cfg: Config) -> None:
-        self._cfg = cfg
-        self._newest: dict[str, View] = {}  # by camera
-
-    def __call__(self, view: View) -> bool:
-        if not selection.due(self._newest.get(view.camera), view, self._cfg):
-            return False
-        self._newest[view.camera] = view
-        return True
 
 
 def _check(path: Path, options: ReadOptions) -> None:

@@ -1,0 +1,1 @@
+"""Depth of sources that have none, seen in their pictures by a network of the user's."""
