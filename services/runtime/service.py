@@ -8,6 +8,7 @@ import msgspec
 
 from prior_sg.schemas.codec import Message
 from prior_sg.schemas.status import Loss
+from prior_sg.schemas.succession import Bequest
 from prior_sg.schemas.topics import Query, Topic
 from prior_sg.services.errors import PriorSgError
 
@@ -59,6 +60,17 @@ Output = tuple[Topic, Message] | Ask
 
 
 @dataclass(frozen=True)
+class Handover(Generic[State, Config]):
+    """How a service that others follow goes on in another process. Its successor reads what it reads and tells nothing:
+    the step gets `Succession` first, and `TakesOver` when it is its turn. `lacks` says, as part of a sentence, what a
+    successor still waits for before it can take over; empty = nothing. `bequest` is the last word of the predecessor.
+    """
+
+    lacks: Callable[[State, Config], str]
+    bequest: Callable[[State, Identity, Config], Bequest]
+
+
+@dataclass(frozen=True)
 class Service(Generic[State, Config]):
     """One service: what it reads, writes and answers, and the functions that do it, over its own state and config.
 
@@ -88,6 +100,8 @@ class Service(Generic[State, Config]):
     key_fields: Callable[[Config], dict[str, str]] = lambda cfg: {}  # config values that appear in keys of `answers`
     losses: Callable[[State], list[Loss]] = lambda state: []  # what could not be used; also read during a step
     close: Callable[[State], None] = lambda state: None
+    handover: Handover | None = None  # without: a successor begins anew
+    beside: bool = False  # a successor serves before its predecessor ends; else, without `handover`, after
     replay_tolerance: float = 1e-6  # by which floats of a replay may differ; networks differ with threads and machine
     replay_config: Callable[[Config], Config] = lambda cfg: cfg  # for a replay, which touches nothing outside
 
