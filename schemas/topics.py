@@ -40,6 +40,7 @@ prepare()  # every process imports this table before it opens a bus, whose threa
 
 ROOT = "psg"
 WAITING = "0"  # in place of an epoch
+FLEET = "fleet"  # in place of a robot
 Delivery = Literal["latest", "every", "job"]
 
 
@@ -212,8 +213,8 @@ def status_key(service: str, instance: str) -> str:
 
 
 def yield_key(robot: str, service: str, instance: str) -> str:
-    """Where one process is asked to yield; `*` as robot = it serves the fleet."""
-    return f"{YIELD.key.format(robot='fleet' if robot == '*' else robot)}/{service}/{instance}"
+    """Where one process is asked to yield; `fleet` as robot, where it serves that."""
+    return f"{YIELD.key.format(robot=robot)}/{service}/{instance}"
 
 
 def swap_key(service: str, instance: str) -> str:

@@ -9,7 +9,7 @@ import msgspec
 from prior_sg.schemas.codec import Message
 from prior_sg.schemas.status import Loss
 from prior_sg.schemas.succession import Bequest
-from prior_sg.schemas.topics import Query, Topic
+from prior_sg.schemas.topics import FLEET, Query, Topic
 from prior_sg.services.errors import PriorSgError
 
 State = TypeVar("State")
@@ -31,6 +31,11 @@ class Identity:
     robot: str
     instance: str
     epoch: int
+
+    @property
+    def whose(self) -> str:
+        """Who is served, as it stands in keys where the name of a robot stands."""
+        return FLEET if self.robot == "*" else self.robot
 
 
 @dataclass(frozen=True)

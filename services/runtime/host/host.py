@@ -231,7 +231,7 @@ class Host:
         if self._standby is None:
             self._answer()
         self.bus.serve(status_key(service.name, self.identity.instance), self._answer_status)
-        self.bus.serve(yield_key(robot, service.name, self.identity.instance), self._asked_to_yield)
+        self.bus.serve(yield_key(self.identity.whose, service.name, self.identity.instance), self._asked_to_yield)
         for topic in service.writes:
             if topic.delivery == "job":
                 limit = service.job_limit(self.cfg)
@@ -296,8 +296,7 @@ class Host:
         """Nothing is taken in after this."""
         identity, handover = self.identity, self.service.handover
         if handover is None:
-            robot = "fleet" if identity.robot == "*" else identity.robot
-            self._bequest = Bequest(robot=robot, service=self.service.name, instance=identity.instance)
+            self._bequest = Bequest(robot=identity.whose, service=self.service.name, instance=identity.instance)
         else:
             self._bequest = handover.bequest(self._state, identity, self.cfg)
         self._loop.call_soon_threadsafe(self.stop)

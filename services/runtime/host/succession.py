@@ -29,7 +29,7 @@ class Predecessor:
     """The process to take over from, as its successor sees it."""
 
     bus: Bus
-    robot: str  # `*` of a service of the fleet
+    whose: str  # see Identity
     service: str
     instance: str
     successor: str
@@ -42,7 +42,7 @@ class Predecessor:
         def receive(answer: Answer) -> None:
             loop.call_soon_threadsafe(answered.set_result, answer)
 
-        key = yield_key(self.robot, self.service, self.instance)
+        key = yield_key(self.whose, self.service, self.instance)
         request = encode(YieldRequest(successor=self.successor))
         await asyncio.to_thread(self.bus.call, key, request, YIELD_S, receive)
         answer = await answered
