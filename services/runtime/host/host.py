@@ -18,11 +18,10 @@ import psutil
 
 from prior_sg.schemas.codec import DecodeError, Message, decode, encode, versions
 from prior_sg.schemas.status import Consumed, JobDone, ServiceStatus, Started, StatusRequest, Tick, TopicCount
-from prior_sg.schemas.succession import Bequest, Succession, TakesOver, YieldRequest
+from prior_sg.schemas.succession import Bequest, Succession, TakesOver
 from prior_sg.schemas.topics import (
     DELTAS,
     JOURNAL,
-    YIELD,
     Query,
     Topic,
     alive_key,
@@ -45,14 +44,14 @@ from prior_sg.services.runtime.host.outbox import Outbox
 from prior_sg.services.runtime.host.port import Fed, Port
 from prior_sg.services.runtime.host.succession import Predecessor, Standby
 from prior_sg.services.runtime.host.timing import Timing
+from prior_sg.services.runtime.host.yielding import Yielding
 from prior_sg.services.runtime.jobs.board import Ended
 from prior_sg.services.runtime.jobs.dispatcher import CREDITS
 from prior_sg.services.runtime.jobs.pool import JobPool, done
 from prior_sg.services.runtime.service import Ask, Identity, Service
 
 log = logging.getLogger(__name__)
-DRAIN_S = 60.0  # for what a process that yields has begun
-DRAIN_LOOK_S = 0.02
+FEW_INPUTS = 4  # that may wait in a process that has caught up
 
 
 class Host:
@@ -80,10 +79,8 @@ class Host:
         self._door = Door(self.inbox)
         self._lease, self._fence = lease, fence
         self._standby, self._replaces, self._follows = standby, replaces, follows
-        self._heir: Request | None = None  # who has asked this process to yield
-        self._bequest: Bequest | None = None
-        self._yields = asyncio.Event()
         self._no_more = asyncio.Event()  # of a source
+        self._yielding = Yielding(self.inbox, self._no_more, self._may_yield)
         self._driving = self._answers = False
         self.stopping = asyncio.Event()
         self._loop = asyncio.get_running_loop()
@@ -105,7 +102,7 @@ class Host:
         if self.service.handover is not None and (self._standby is not None or self._follows):
             self.inbox.put(Succession(predecessor=self._standby.predecessor.instance if self._standby else ""))
         await self._on_thread(self._join)
-        tasks = [asyncio.create_task(self._work()), asyncio.create_task(self._yield())]
+        tasks = [asyncio.create_task(self._work()), asyncio.create_task(self._drain())]
         if self.service.tick_s is not None:
             tasks.append(asyncio.create_task(self._tick(self.service.tick_s)))
         if self.service.drive is not None:
@@ -139,12 +136,12 @@ class Host:
         await lease.keep()
 
     async def _lacking(self) -> str:
-        """What this process still lacks; more than inputs that wait."""
+        """What this process still lacks; a few inputs wait in any."""
         handover = self.service.handover
         assert handover is not None
-        return (
-            "the inputs that wait" if len(self.inbox) else await self._on_thread(handover.lacks, self._state, self.cfg)
-        )
+        if (waiting := len(self.inbox)) > FEW_INPUTS:
+            return f"{waiting} inputs that wait"
+        return str(await self._on_thread(handover.lacks, self._state, self.cfg))
 
     async def _replace(self, predecessor: Predecessor) -> None:
         """Have the predecessor yield; where it does not, this process ends."""
@@ -154,16 +151,20 @@ class Host:
     @property
     def yielded(self) -> bool:
         """Whether another has taken over from this process."""
-        return self._bequest is not None
+        return self._yielding.bequest is not None
 
-    async def _yield(self) -> None:
-        """Once asked to: take in nothing more from outside, finish what has come in, and end."""
-        await self._yields.wait()
-        deadline_s = time.monotonic() + DRAIN_S
-        while self._is_busy() and time.monotonic() < deadline_s:
-            await asyncio.sleep(DRAIN_LOOK_S)
-        self.inbox.put(LastWord())
+    async def _drain(self) -> None:
+        await self._yielding.drain(self._is_busy)
         await self.stopping.wait()
+
+    def _is_busy(self) -> bool:
+        """Whether a source is still being read, or an errand or a job given to a worker is under way."""
+        return self._driving or bool(self._asks.under_way) or any(pool.outstanding for pool in self._pools.values())
+
+    def _may_yield(self) -> str:
+        if self._standby is not None and not self._answers:
+            return "it is not in charge itself yet"
+        return "it is ending already" if self.stopping.is_set() else ""
 
     def stop(self) -> None:
         """Ask the service to end after the input it is working on; safe to call from the loop's thread only."""
@@ -172,46 +173,12 @@ class Host:
         self._waiting.set()
 
     async def _leave(self) -> None:
-        await self._on_thread(self.service.close, self._state)
-        if self._heir is not None:
-            await self._hand_over(self._heir)
         for pool in self._pools.values():
             pool.close()
+        await self._on_thread(self.service.close, self._state)
+        await self._yielding.hand_over(self._lease)
         await self._on_thread(self.bus.close)
         self._thread.shutdown(wait=False)
-
-    async def _hand_over(self, heir: Request) -> None:
-        """Let go of what this process is in charge of, and say the last word."""
-        if self._bequest is None:
-            heir.refuse("it was stopped before it was done")
-            return
-        if self._lease is not None:
-            await self._lease.release()
-        heir.reply(encode(self._bequest))
-
-    def _is_busy(self) -> bool:
-        """Whether a source is still being read, or an errand or a job given to a worker is under way."""
-        return self._driving or bool(self._asks.under_way) or any(pool.outstanding for pool in self._pools.values())
-
-    def _asked_to_yield(self, request: Request) -> None:
-        try:
-            successor = decode(YieldRequest, request.payload).successor
-        except DecodeError:
-            self.inbox.of(YIELD.name).malformed += 1
-            request.refuse("the request is not a valid YieldRequest")
-            return
-        self._loop.call_soon_threadsafe(self._begin_to_yield, request, successor)
-
-    def _begin_to_yield(self, request: Request, successor: str) -> None:
-        if self._standby is not None and not self._answers:
-            request.refuse("it is not in charge itself yet")
-        elif self._heir is not None or self.stopping.is_set():
-            request.refuse("it is ending already")
-        else:
-            log.info("yields", extra={"to": successor})
-            self._heir = request
-            self._no_more.set()
-            self._yields.set()
 
     def _join(self) -> None:
         """Declare everything once; be seen only when all of it stands."""
@@ -231,7 +198,7 @@ class Host:
         if self._standby is None:
             self._answer()
         self.bus.serve(status_key(service.name, self.identity.instance), self._answer_status)
-        self.bus.serve(yield_key(self.identity.whose, service.name, self.identity.instance), self._asked_to_yield)
+        self.bus.serve(yield_key(self.identity.whose, service.name, self.identity.instance), self._yielding.receive)
         for topic in service.writes:
             if topic.delivery == "job":
                 limit = service.job_limit(self.cfg)
@@ -296,9 +263,11 @@ class Host:
         """Nothing is taken in after this."""
         identity, handover = self.identity, self.service.handover
         if handover is None:
-            self._bequest = Bequest(robot=identity.whose, service=self.service.name, instance=identity.instance)
+            self._yielding.bequest = Bequest(
+                robot=identity.whose, service=self.service.name, instance=identity.instance
+            )
         else:
-            self._bequest = handover.bequest(self._state, identity, self.cfg)
+            self._yielding.bequest = handover.bequest(self._state, identity, self.cfg)
         self._loop.call_soon_threadsafe(self.stop)
 
     def _handle_sample(self, sample: Sample) -> None:
@@ -397,7 +366,7 @@ class Host:
     def _offer_work(self, request: Request) -> None:
         job = self.service.job
         assert job is not None
-        if not self._yields.is_set() and self._slots.acquire(blocking=False):
+        if not self._yielding.begun.is_set() and self._slots.acquire(blocking=False):
             fault_of = partial(fault_of_job, job, request.key)
             message = self._door.admitted(job.type, request.payload, name=job.name, key=request.key, fault_of=fault_of)
             self.inbox.put(Work(request, message))

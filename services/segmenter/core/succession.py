@@ -65,6 +65,7 @@ class CatchingUp:
     """What a process waits for before it tells anything. `stands_by` = another is in charge."""
 
     stands_by: bool = False
+    gathers: bool = False  # evidence comes from caches, whose end nobody tells
     waits: set[str] = field(default_factory=set)  # answers that are still to come
     legacy: Legacy | None = None  # until it is taken over
     still_ticks: int = 0  # since more of the former map was seen
@@ -77,7 +78,7 @@ class CatchingUp:
 
     def begin(self, predecessor: str) -> None:
         """Others have gone before."""
-        self.stands_by, self.legacy = bool(predecessor), Legacy()
+        self.stands_by, self.gathers, self.legacy = bool(predecessor), not predecessor, Legacy()
         self.waits = {"regions", "objects", "evidence"} if predecessor else {"scene"}
 
     def hear(self, told: RegionDelta | ObjectDelta | Scene) -> None:

@@ -239,7 +239,7 @@ def lacking(state: State, cfg: Config) -> str:
     if legacy.digest and aim.in_force is None:
         return "the prior in force"
     there, again = _seen_again(state)
-    if again < cfg.spaces.coverage * there or (waits.still_ticks < 1 and not waits.stands_by):
+    if again < cfg.spaces.coverage * there or (waits.gathers and waits.still_ticks < 1):
         return f"evidence of {there - again} places"
     return "the objects" if state.objects.outdated(state.seen.spaces.force) else ""
 
