@@ -1,4 +1,4 @@
-"""The end of a process from which another takes over: it takes in nothing more, finishes what it has, and says a word."""
+"""The end of a process from which another takes over: it takes in nothing more, and finishes what it has begun."""
 
 import asyncio
 import logging
