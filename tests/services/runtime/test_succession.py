@@ -182,7 +182,7 @@ def test_a_successor_tells_nothing_until_the_predecessor_has_said_its_last_word(
                     client.publish(KEYFRAME, of("yield3", number))
                 await until(lambda: len(deltas) == 4)
                 second = await here.start(FOLLOWER, "f2", succeeds="f1")
-                await until(lambda: len(second._state["seen"]) == 4)
+                await until(lambda: second._state is not None and len(second._state["seen"]) == 4)
                 await asyncio.sleep(0.5)
                 assert not first.yielded and second._state["silent"]
                 for number in range(4, 12):
