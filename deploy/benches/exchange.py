@@ -161,7 +161,7 @@ class Running:
     def up(self) -> Iterator["Running"]:
         """Router, supervisor and a client, until the end of the block."""
         self.endpoint = free_endpoint("tcp/127.0.0.1:0")
-        router = RouterHere(self.endpoint, None)
+        router = RouterHere(self.endpoint, lambda: None)
         with tempfile.TemporaryDirectory() as folder:
             self.out = Path(folder)
             settings = [f"ingest.source={self._source}", f"ingest.speed={self._speed}", *self._settings]

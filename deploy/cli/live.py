@@ -120,7 +120,11 @@ def _stay_up(arguments: argparse.Namespace, names: list[str]) -> int:
     check_settings(arguments.config, settings)
     if arguments.no_router:
         open_client(arguments.connect).bus.close()  # finds out at once whether a router is there
-    router = None if arguments.no_router else RouterHere(arguments.connect, beyond)
+    router = (
+        None
+        if arguments.no_router
+        else RouterHere(arguments.connect, lambda: beyond_this_host(arguments.listen, arguments.join))
+    )
     supervisor = Supervisor(arguments.connect, arguments.robot, arguments.out / "logs", settings, arguments.config)
     client = open_client(arguments.connect)
     roll = Roll(client.bus)

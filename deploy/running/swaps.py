@@ -22,19 +22,22 @@ REOPEN_POLL_S = 0.05
 
 
 class RouterHere:
-    """The router of this process, which can be started again in its place. Raises BusError."""
+    """The router of this process, which can be started again in its place. `beyond` tells who may join it, anew at each
+    start. Raises BusError.
+    """
 
-    def __init__(self, endpoint: str, beyond: Beyond | None) -> None:
+    def __init__(self, endpoint: str, beyond: Callable[[], Beyond | None]) -> None:
         self._endpoint, self._beyond = endpoint, beyond
-        self._stop = open_router(endpoint, beyond)
+        self._stop = open_router(endpoint, beyond())
 
     def restart(self) -> None:
         """End it and start another at the same endpoints: clients come back within a second."""
+        beyond = self._beyond()
         self._stop()
         end_s = time.monotonic() + REOPEN_S
         while True:
             try:
-                self._stop = open_router(self._endpoint, self._beyond)
+                self._stop = open_router(self._endpoint, beyond)
             except EndpointTakenError:
                 if time.monotonic() > end_s:
                     raise
@@ -73,7 +76,7 @@ class Swaps:
 
     def _swap(self, name: str, asked: SwapRequest, request: Request) -> str:
         if name == ROUTER and self._router is not None:
-            request.reply(encode(Swapped(successor=ROUTER)))
+            request.reply(encode(Swapped(successor=ROUTER)))  # before, for it goes through this router
             self._router.restart()
             return "the router was started again in its place"
         config = ""
