@@ -34,11 +34,13 @@ from prior_sg.schemas.queries import SceneAnswer, SceneQuery
 from prior_sg.schemas.regions import PosteriorReply, PosteriorRequest, RegionDelta
 from prior_sg.schemas.scene import HistoryRequest, RevisionList, Scene, SceneRequest, SceneRevision
 from prior_sg.schemas.status import Consumed, EpochKnown, EpochRequest, ServiceStatus, StatusRequest
+from prior_sg.schemas.succession import Bequest, Evidence, EvidenceRequest, Swapped, SwapRequest, YieldRequest
 
 prepare()  # every process imports this table before it opens a bus, whose threads then find all decoders built
 
 ROOT = "psg"
 WAITING = "0"  # in place of an epoch
+FLEET = "fleet"  # in place of a robot
 Delivery = Literal["latest", "every", "job"]
 
 
@@ -166,6 +168,7 @@ SCENE_QUERY = Query("SCENE_QUERY", SceneQuery, SceneAnswer, f"{ROOT}/{{robot}}/a
 TEXT = Query("TEXT", TextRequest, TextEmbeddings, f"{ROOT}/encoder/{{space}}/text")
 EPOCH = Query("EPOCH", EpochRequest, EpochKnown, f"{ROOT}/{{robot}}/ask/epoch/{{topic}}/{{keeper}}")
 PRIORS = Query("PRIORS", PriorRequest, PriorList, f"{ROOT}/fleet/ask/prior")
+EVIDENCE = Query("EVIDENCE", EvidenceRequest, Evidence, f"{ROOT}/{{robot}}/ask/evidence")
 
 QUERIES = (
     ARCHIVE,
@@ -181,9 +184,12 @@ QUERIES = (
     TEXT,
     EPOCH,
     PRIORS,
+    EVIDENCE,
 )
 
 STATUS = Query("STATUS", StatusRequest, ServiceStatus, f"{ROOT}/status")
+YIELD = Query("YIELD", YieldRequest, Bequest, f"{ROOT}/{{robot}}/yield")
+SWAP = Query("SWAP", SwapRequest, Swapped, f"{ROOT}/fleet/swap")
 
 
 def alive_key(service: str, instance: str) -> str:
@@ -206,10 +212,20 @@ def status_key(service: str, instance: str) -> str:
     return f"{STATUS.key}/{service}/{instance}"
 
 
+def yield_key(robot: str, service: str, instance: str) -> str:
+    """Where one process is asked to yield; `fleet` as robot, where it serves that."""
+    return f"{YIELD.key.format(robot=robot)}/{service}/{instance}"
+
+
+def swap_key(service: str, instance: str) -> str:
+    """Where who started a process is asked to exchange it."""
+    return f"{SWAP.key}/{service}/{instance}"
+
+
 _FIELD = re.compile(r"\\{\w+\\}")  # as `re.escape` leaves it
 _CALLS: tuple[tuple[re.Pattern[str], type[Message], type[Message] | None], ...] = (
     *((re.compile(_FIELD.sub(".+", re.escape(q.key))), q.request, q.reply) for q in QUERIES),
-    (re.compile(f"{STATUS.key}/.+"), STATUS.request, STATUS.reply),
+    *((re.compile(f"{_FIELD.sub('.+', re.escape(q.key))}/.+"), q.request, q.reply) for q in (STATUS, YIELD, SWAP)),
     *((re.compile(f"{topic.key}/run/.+"), topic.type, None) for topic in TOPICS if topic.delivery == "job"),
 )
 

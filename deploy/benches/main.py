@@ -87,6 +87,13 @@ def lidar() -> tuple[dict, dict]:
     return lidar_bench(SAMPLE)
 
 
+def exchanged() -> tuple[dict, dict]:
+    """Every service and the router exchanged in mid-run; see `prior_sg.deploy.benches.exchange`."""
+    from prior_sg.deploy.benches.exchange import ROWS, exchange_bench  # needs the encoder
+
+    return exchange_bench(ROWS, SAMPLE)
+
+
 def hydra() -> tuple[dict, dict]:
     """The bridge to Hydra; see `prior_sg.deploy.benches.hydra`."""
     from prior_sg.deploy.benches.hydra import hydra_bench  # needs the extra `hydra`
@@ -136,6 +143,7 @@ LONG: dict[str, Callable[[float], tuple[dict, dict]]] = {  # no part of `all`; t
     "pool": attacked_pool,
     "store_crashes": lambda seconds: crashes(),
     "lidar": lambda seconds: lidar(),  # seven minutes and more
+    "exchange": lambda seconds: exchanged(),  # nine runs of the sample at half its pace
     "view": lambda seconds: view(),  # needs an extra and a browser
     "hydra": lambda seconds: hydra(),  # needs an extra
 }

@@ -80,10 +80,10 @@ def add_run_options(parser: argparse.ArgumentParser) -> None:
 def settings_of(arguments: argparse.Namespace) -> list[str]:
     """Settings that run options stand for, then those given by --set."""
     places = [f"place_graph.places={arguments.places}"] if arguments.places else []
-    return [*places, *_encoder_settings(arguments.encoder), *source_settings(arguments), *arguments.set]
+    return [*places, *encoder_settings(arguments.encoder), *source_settings(arguments), *arguments.set]
 
 
-def _encoder_settings(choice: str) -> list[str]:
+def encoder_settings(choice: str) -> list[str]:
     """Settings of workers and segmenter for one choice of an encoder. Raises UserError."""
     from prior_sg.services.feature_pyramid.encoders.base import EncoderUnavailable, space_of
 

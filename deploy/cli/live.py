@@ -19,6 +19,7 @@ from prior_sg.services.runtime import extras
 if TYPE_CHECKING:
     from prior_sg.deploy.running.roll import Roll
     from prior_sg.deploy.running.supervisor import Supervisor
+    from prior_sg.deploy.running.swaps import Swaps
 
 
 def add_commands(commands: Commands) -> None:
@@ -101,10 +102,10 @@ def _stay_up(arguments: argparse.Namespace, names: list[str]) -> int:
     from prior_sg.deploy.running.job import require_files
     from prior_sg.deploy.running.roll import Roll
     from prior_sg.deploy.running.supervisor import Supervisor
+    from prior_sg.deploy.running.swaps import RouterHere, Swaps
     from prior_sg.deploy.settings import check_settings
     from prior_sg.services.ingest.core.options import is_live
     from prior_sg.services.registry import BY_NAME
-    from prior_sg.services.runtime.zenoh_bus import open_router
 
     require_files()
     beyond = beyond_this_host(arguments.listen, arguments.join)
@@ -121,10 +122,16 @@ def _stay_up(arguments: argparse.Namespace, names: list[str]) -> int:
     check_settings(arguments.config, settings)
     if arguments.no_router:
         open_client(arguments.connect).bus.close()  # finds out at once whether a router is there
-    stop_router = (lambda: None) if arguments.no_router else open_router(arguments.connect, beyond)
+    router = (
+        None
+        if arguments.no_router
+        else RouterHere(arguments.connect, lambda: beyond_this_host(arguments.listen, arguments.join))
+    )
     supervisor = Supervisor(arguments.connect, arguments.robot, arguments.out / "logs", settings, arguments.config)
     client = open_client(arguments.connect)
     roll = Roll(client.bus)
+    supervisor.hears = roll.hears
+    swaps = Swaps(client.bus, supervisor, arguments.out, router)
     try:
         with until_interrupted():
             for name in sorted(names, key=lambda name: name == "ingest"):
@@ -135,20 +142,21 @@ def _stay_up(arguments: argparse.Namespace, names: list[str]) -> int:
                 supervisor.start_door("ros", "prior_sg.deploy.ros.process", bridge_arguments(arguments))
             listening = " and ".join((arguments.connect, *arguments.listen))
             console.print(f"router {listening}; logs in {supervisor.log_folder}; Ctrl-C stops")
-            wait(lambda: _tell(supervisor, roll, arguments.restart_hung))
+            wait(lambda: _tell(supervisor, roll, arguments.restart_hung, swaps))
         return 0
     finally:
         supervisor.stop()
         client.bus.close()
-        stop_router()
+        if router is not None:
+            router.stop()
 
 
-def _tell(supervisor: "Supervisor", roll: "Roll", restart_hung: bool) -> None:
+def _tell(supervisor: "Supervisor", roll: "Roll", restart_hung: bool, swaps: "Swaps | None" = None) -> None:
     """What has happened to the processes; those that hang are ended, to be started again, where that is wished."""
     silence, hung = roll.check(supervisor.children)
     for child in hung if restart_hung else ():
         child.kill()
-    for event in (*silence, *supervisor.check()):
+    for event in (*silence, *(swaps.check() if swaps is not None else ()), *supervisor.check()):
         console.print(event)
 
 

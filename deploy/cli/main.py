@@ -24,6 +24,7 @@ def build_parser() -> argparse.ArgumentParser:
         priors,
         query,
         ros,
+        swap,
         tools,
         view,
     )
@@ -38,6 +39,7 @@ def build_parser() -> argparse.ArgumentParser:
     for module in (
         jobs,
         live,
+        swap,
         view,
         foxglove,
         query,

@@ -14,6 +14,7 @@ from prior_sg.schemas.codec import DecodeError, Message, decode, encode
 from prior_sg.schemas.frames import Keyframe
 from prior_sg.schemas.migrations import journalled
 from prior_sg.schemas.status import Consumed, Started, Tick
+from prior_sg.schemas.succession import Succession, TakesOver
 from prior_sg.schemas.topics import JOURNAL, KEYFRAME, QUERIES, TOPICS, Topic
 from prior_sg.services.refusals import InputRefused
 from prior_sg.services.registry import BY_NAME
@@ -25,6 +26,7 @@ from prior_sg.services.runtime.service import Identity, Service
 logger = logging.getLogger(__name__)
 TOPIC_BY_NAME = {topic.name: topic for topic in TOPICS}
 QUERY_BY_NAME = {query.name: query for query in QUERIES}
+FED_BY_NAME = {kind.__name__: kind for kind in (Tick, Succession, TakesOver)}  # inputs that a host makes
 
 
 @dataclass
@@ -95,8 +97,8 @@ class Log:
 
     def _input(self, entry: Consumed) -> Message:
         versions = self._versions.get(entry.instance, {})
-        if entry.topic == "Tick":
-            return journalled(Tick, entry.inline, versions)
+        if entry.topic in FED_BY_NAME:
+            return journalled(FED_BY_NAME[entry.topic], entry.inline, versions)
         errands = {errand.name: errand for errand in self.service.errands}
         if question := QUERY_BY_NAME.get(entry.topic) or errands.get(entry.topic):
             return journalled(question.reply, entry.inline, versions)

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from prior_sg.schemas.topics import (
+    FLEET,
     JOURNAL,
     QUERIES,
     ROOT,
@@ -21,6 +22,7 @@ from prior_sg.schemas.topics import (
     roll_key,
     status_key,
     worker_keys,
+    yield_key,
 )
 from prior_sg.services.registry import OPERATOR_WRITES, SERVICES
 from prior_sg.services.runtime.keys import Participant, Role
@@ -77,6 +79,7 @@ def grants_of(role: Role, name: str) -> Grants:
         answers=(
             *(_asked_on(query, robot) for query in QUERIES if any(query in s.answers for s in services)),
             *(status_key(service.name, "*") for service in services),
+            *(yield_key(_served(service, robot), service.name, "*") for service in services),
             *(job_key(job, "*", "*") for job in worked),
         ),
         announces=(
@@ -95,9 +98,15 @@ def grants_of(role: Role, name: str) -> Grants:
         asks=(
             *(_asked_on(query, robot) for query in QUERIES),
             status_key("*", "*"),
+            *(yield_key(_served(service, robot), service.name, "*") for service in services),
             *(job_key(job, "*", robot) for job in jobs),
         ),
     )
+
+
+def _served(service: Service, robot: str) -> str:
+    """Who is served by one service's processes, as it stands in their keys."""
+    return robot if service.scope == "robot" else FLEET
 
 
 def _may_write(role: Role, topic: Topic) -> bool:

@@ -28,6 +28,11 @@ class Roll:
         self._called: dict[str, Callable[[], None]] = {}
         bus.watch(alive_key("*", "*"), self._saw)
 
+    def hears(self, unique: str) -> bool:
+        """Whether a process is alive on the bus."""
+        with self._lock:
+            return unique in self._heard
+
     def check(self, children: Iterable[Child]) -> tuple[list[str], list[Child]]:
         """What happened, for the user, and the children that hang now."""
         running = {

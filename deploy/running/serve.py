@@ -24,6 +24,7 @@ from prior_sg.services.runtime.bus import BusError
 from prior_sg.services.runtime.config import ConfigError
 from prior_sg.services.runtime.host.host import Host
 from prior_sg.services.runtime.host.lease import Fence, Lease, SupersededError
+from prior_sg.services.runtime.host.succession import Predecessor, Standby
 from prior_sg.services.runtime.logs import start_logging
 from prior_sg.services.runtime.record import LogError
 from prior_sg.services.runtime.service import Identity, Service, ServiceError
@@ -34,6 +35,7 @@ PARENT_CHECK_S = 1.0
 HOPELESS = (ConfigError, BusError, ServiceError, LogError)  # their messages say what to do
 EXIT_HOPELESS = 2  # starting again would fail again
 EXIT_SUPERSEDED = 3  # another is in charge: started again, it waits for that one's end
+EXIT_YIELDED = 4  # another has taken over: not to be started again
 
 
 def service_names() -> list[str]:
@@ -51,22 +53,30 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--instance", default="", help="name of this process; default: a random one")
     parser.add_argument("--config", default="", help="TOML file with a section per service")
     parser.add_argument("--set", action="append", default=[], metavar="SERVICE.FIELD=VALUE", help="one setting")
+    parser.add_argument(
+        "--succeeds", default="", metavar="INSTANCE", help="take over from this process, which yields and ends"
+    )
     parser.add_argument("--log-level", default="info", choices=("debug", "info", "warning", "error"))
     parser.add_argument("--parent", type=int, default=0, help="end when this process is gone")
 
 
-async def serve(arguments: argparse.Namespace, instance: str) -> None:
-    """Run until a signal, or until the parent is gone."""
+async def serve(arguments: argparse.Namespace, instance: str) -> bool:
+    """Run until a signal, until the parent is gone, or until another takes over: then True."""
     from prior_sg.services.registry import BY_NAME
 
     service = BY_NAME[arguments.service]
     cfg = resolved_config(service, arguments.config, arguments.set)
     robot = arguments.robot if service.scope == "robot" else "*"
-    await stay(service, cfg, Identity(robot, instance, time.time_ns()), arguments.connect, arguments.parent)
+    identity = Identity(robot, instance, time.time_ns())
+    return await stay(service, cfg, identity, arguments.connect, arguments.parent, succeeds=arguments.succeeds)
 
 
-async def stay(service: Service, cfg: Any, identity: Identity, connect: str, parent: int = 0) -> None:
-    """Run a service on the bus of a router until a signal, or until the parent, if there is one, is gone."""
+async def stay(
+    service: Service, cfg: Any, identity: Identity, connect: str, parent: int = 0, *, succeeds: str = ""
+) -> bool:
+    """Run a service on the bus of a router until a signal, until the parent, if there is one, is gone, or until another
+    takes over: then True. `succeeds` is the instance from which this process takes over.
+    """
     bus = await asyncio.to_thread(ZenohBus, connect)
     stopping = asyncio.Event()
     loop = asyncio.get_running_loop()
@@ -74,28 +84,43 @@ async def stay(service: Service, cfg: Any, identity: Identity, connect: str, par
         loop.add_signal_handler(number, stopping.set)
     watcher = asyncio.create_task(_stop_with_parent(stopping, parent))
     try:
-        host = await _unless(stopping, _in_charge(service, bus, cfg, identity))
+        host = await _unless(stopping, _in_charge(service, bus, cfg, identity, succeeds))
         if host is not None:
             await _stopped_by(stopping, host)
+        return host is not None and host.yielded
     finally:
         watcher.cancel()
         bus.close()  # also when the service never got so far as to leave by itself
 
 
-async def _in_charge(service: Service, bus: ZenohBus, cfg: Any, identity: Identity) -> Host:
-    """The host of a service, once it may write: what writes the same deltas has one lease, whatever it is called."""
-    from prior_sg.services.registry import LEASED, SERVICES, WRITERS
+async def _in_charge(service: Service, bus: ZenohBus, cfg: Any, identity: Identity, succeeds: str = "") -> Host:
+    """The host of a service, once it may write, or stand by: what writes the same deltas has one lease, whatever it is
+    called."""
+    from prior_sg.services.registry import WRITERS
 
     robot, instance = identity.robot, identity.instance
     fence = await asyncio.to_thread(Fence, bus, robot, WRITERS)
+    former = Predecessor(bus, identity.whose, service.name, succeeds, instance) if succeeds else None
+    if former is not None and service.handover is None and not service.beside:
+        await former.yields()
     if service.scope != "robot":
-        return Host(service, bus, cfg, identity, fence=fence)
+        return Host(service, bus, cfg, identity, fence=fence, replaces=former if service.beside else None)
+    lease = _lease(service, bus, identity)
+    if former is not None and service.handover is not None:
+        identity = Identity(robot, instance, await lease.stand_by())
+        return Host(service, bus, cfg, identity, lease=lease, fence=fence, standby=Standby(former, lease))
+    identity = Identity(robot, instance, await lease.take())
+    return Host(service, bus, cfg, identity, lease=lease, fence=fence, follows=lease.has_predecessor)
+
+
+def _lease(service: Service, bus: ZenohBus, identity: Identity) -> Lease:
+    from prior_sg.services.registry import LEASED, SERVICES, WRITERS
+
     topics = [topic for topic in service.writes if topic.name in LEASED]
     keepers = [other.name for other in SERVICES if EPOCH in other.answers and other is not service]
     role = LEASED[topics[0].name] if topics else service.name
     shared = [name for name, services in WRITERS.items() if len(services) > 1]
-    lease = Lease(bus, robot, role, instance, topics=topics, keepers=keepers, shared=shared)
-    return Host(service, bus, cfg, Identity(robot, instance, await lease.take()), lease=lease, fence=fence)
+    return Lease(bus, identity.robot, role, identity.instance, topics=topics, keepers=keepers, shared=shared)
 
 
 async def _unless(stopping: asyncio.Event, starting: Coroutine[Any, Any, Host]) -> Host | None:
@@ -144,7 +169,7 @@ def run(arguments: argparse.Namespace) -> int:
             import uvloop
 
             asyncio.set_event_loop_policy(uvloop.EventLoopPolicy())
-        asyncio.run(serve(arguments, instance))
+        yielded = asyncio.run(serve(arguments, instance))
     except HOPELESS as error:
         log.error(str(error))
         return EXIT_HOPELESS
@@ -157,8 +182,8 @@ def run(arguments: argparse.Namespace) -> int:
             return EXIT_HOPELESS
         log.exception("the service failed")
         return 1
-    log.info("stopped")
-    return 0
+    log.info("another has taken over" if yielded else "stopped")
+    return EXIT_YIELDED if yielded else 0
 
 
 def main() -> int:

@@ -1,5 +1,6 @@
 """Child processes: one per service instance, restarted when they die, stopped in order."""
 
+import itertools
 import json
 import os
 import signal
@@ -7,6 +8,7 @@ import subprocess
 import sys
 import time
 import uuid
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -42,6 +44,7 @@ class Child:
     restarts: int = 0
     restart_at_s: float = 0.0
     unique: str = ""  # its name on the bus
+    succeeds: str = ""  # the instance that it is to take over from, until it has
 
     def start(self) -> None:
         """Start the process; its log is appended to."""
@@ -54,6 +57,7 @@ class Child:
             "--parent",
             str(os.getpid()),
             *self.arguments,
+            *(("--succeeds", self.succeeds) if self.succeeds else ()),
         ]
         # Unique on the bus: another robot, host or run may have a process of the same short name.
         self.unique = f"{self.instance}-{uuid.uuid4().hex[:6]}"
@@ -68,6 +72,16 @@ class Child:
                 env=environment | {"OMP_WAIT_POLICY": "PASSIVE"},
             )
         self.started_s = time.monotonic()
+
+    @property
+    def code(self) -> int | None:
+        """Exit status; None while it runs, and where it is not started."""
+        return None if self.process is None else self.process.poll()
+
+    @property
+    def runs(self) -> bool:
+        """Whether the process exists."""
+        return self.process is not None and self.process.poll() is None
 
     @property
     def pid(self) -> int:
@@ -92,6 +106,15 @@ class Child:
 
 
 @dataclass
+class Exchange:
+    """A child that is to take over from another; `told` gets its name, or why it does not."""
+
+    former: Child
+    heir: Child
+    told: Callable[[str, str], None]
+
+
+@dataclass
 class Supervisor:
     """Starts services in the order given and stops them in the same order."""
 
@@ -101,6 +124,8 @@ class Supervisor:
     settings: list[str] = field(default_factory=list)
     config: str = ""
     children: list[Child] = field(default_factory=list)
+    hears: Callable[[str], bool] = lambda unique: True  # whether a process is seen on the bus
+    exchanges: list[Exchange] = field(default_factory=list)
 
     def start(self, service: str, copies: int = 1) -> None:
         """Start one service, or several workers of it."""
@@ -108,16 +133,39 @@ class Supervisor:
         # Workers share the cores; the others do much with little and would only get in each other's way.
         threads = max(1, (os.cpu_count() or 1) // copies) if BY_NAME[service].job is not None else 1
         for number in range(copies):
-            instance = f"{service}-{number + 1}"
-            arguments = ["--robot", self.robot, "--connect", self.connect]
-            arguments += ["--config", self.config] if self.config else []
-            for setting in self.settings:
-                arguments += ["--set", setting]
-            log_path = self.log_folder / f"{instance}.log"
-            log_path.unlink(missing_ok=True)
-            child = Child(service, instance, arguments, log_path, threads)
-            child.start()
-            self.children.append(child)
+            self._start(service, f"{service}-{number + 1}", threads, self.config, settings=self.settings)
+
+    def _start(
+        self, service: str, instance: str, threads: int, config: str, *, settings: Sequence[str], succeeds: str = ""
+    ) -> Child:
+        arguments = ["--robot", self.robot, "--connect", self.connect]
+        arguments += ["--config", config] if config else []
+        for setting in settings:
+            arguments += ["--set", setting]
+        log_path = self.log_folder / f"{instance}.log"
+        log_path.unlink(missing_ok=True)
+        child = Child(service, instance, arguments, log_path, threads, succeeds=succeeds)
+        child.start()
+        self.children.append(child)
+        return child
+
+    def exchange(self, unique: str, config: str, settings: Sequence[str], told: Callable[[str, str], None]) -> str:
+        """Start a successor of the child of this name on the bus; `config` replaces that of the others, `settings` come
+        after theirs. Returns what happened, for the user. Raises UserError where there is nothing to exchange.
+        """
+        former = next((child for child in self.children if child.unique == unique and child.runs), None)
+        if former is None:
+            raise UserError(f"{unique} does not run here any more; see `prior-sg health`")
+        if any(former in (one.former, one.heir) for one in self.exchanges):
+            raise UserError(f"{former.instance} is being exchanged already; wait for the end of that")
+        names = {child.instance for child in self.children}
+        instance = next(name for n in itertools.count(1) if (name := f"{former.service}-{n}") not in names)
+        settings = [*self.settings, *settings]
+        heir = self._start(
+            former.service, instance, former.threads, config or self.config, settings=settings, succeeds=unique
+        )
+        self.exchanges.append(Exchange(former, heir, told))
+        return f"{instance} is to take over from {former.instance}"
 
     def start_door(self, name: str, module: str, arguments: list[str]) -> None:
         """Start a process that is no service but serves others, such as the HTTP interface."""
@@ -139,9 +187,12 @@ class Supervisor:
 
     def check(self) -> list[str]:
         """Restart what has died; returns what happened, for the user. Raises ChildFailed when it keeps dying."""
-        events = []
+        events = self._exchanged()
         now_s = time.monotonic()
+        exchanged = [child for one in self.exchanges for child in (one.former, one.heir)]
         for child in self.children:
+            if child in exchanged:
+                continue
             if child.process is None:
                 if now_s >= child.restart_at_s:
                     child.restarts += 1
@@ -157,6 +208,28 @@ class Supervisor:
                 child.process, child.restart_at_s = None, now_s + delay_s
                 why = f": {child.last_words()}" if code > 0 else ""
                 events.append(f"{child.instance} ended ({_reason(code)}){why}; restarting")
+        return events
+
+    def _exchanged(self) -> list[str]:
+        """What became of the exchanges. A successor that fails is given up; then the former serves on, or again."""
+        events = []
+        for one in list(self.exchanges):
+            former, heir = one.former, one.heir
+            if heir.code is not None:
+                why = heir.last_words()
+                self.children.remove(heir)
+                events.append(f"{former.instance} stays: {heir.instance} ended ({_reason(heir.code)}): {why}")
+                if not former.runs:
+                    former.process, former.restart_at_s = None, time.monotonic()
+                one.told("", f"{former.instance} stays: {why}")
+            elif not former.runs and self.hears(heir.unique):
+                heir.succeeds = ""
+                self.children.remove(former)
+                events.append(f"{heir.instance} has taken over from {former.instance}")
+                one.told(heir.unique, "")
+            else:
+                continue
+            self.exchanges.remove(one)
         return events
 
     def stop(self) -> None:

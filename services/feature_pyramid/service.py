@@ -66,4 +66,5 @@ SERVICE = Service(
     close=lambda state: state.reader.shutdown(wait=False, cancel_futures=True),
     losses=lambda state: state.losses.told,
     replay_tolerance=2e-3,  # of half-precision embeddings
+    beside=True,
 )

@@ -61,4 +61,5 @@ SERVICE = Service(
     errands=(ASK_MODEL, RECALL, KEEP),
     tick_s=TICK_S,
     replay_config=lambda cfg: msgspec.structs.replace(cfg, archive="", signing_key="", trusted_keys=""),
+    beside=True,
 )

@@ -84,8 +84,8 @@ class Bus(Protocol):
     def subscribe(self, topic: Topic, pattern: str, on_sample: OnSample, on_missed: OnMissed) -> Callable[[], None]:
         """Receive samples; for `every`, also those published shortly before. Returns what ends it."""
 
-    def serve(self, key: str, on_request: OnRequest) -> None:
-        """Answer calls on a key."""
+    def serve(self, key: str, on_request: OnRequest) -> Callable[[], None]:
+        """Answer calls on a key. Returns what ends it."""
 
     def call(self, key: str, payload: bytes, timeout_s: float, on_answer: OnAnswer) -> None:
         """Ask whoever serves the key; the answer arrives in the callback, always exactly once."""
@@ -193,10 +193,16 @@ class LocalBus:
         with hub.lock:
             hub.subscribers = [one for one in hub.subscribers if one is not entry]
 
-    def serve(self, key: str, on_request: OnRequest) -> None:
+    def serve(self, key: str, on_request: OnRequest) -> Callable[[], None]:
         """Answer calls on a key expression."""
         with self._hub.lock:
-            self._hub.servers[key] = (self._id, on_request)
+            self._hub.servers[key] = entry = (self._id, on_request)
+        return lambda: self._withdraw_server(key, entry)
+
+    def _withdraw_server(self, key: str, entry: tuple[int, OnRequest]) -> None:
+        with self._hub.lock:
+            if self._hub.servers.get(key) is entry:
+                del self._hub.servers[key]
 
     def call(self, key: str, payload: bytes, timeout_s: float, on_answer: OnAnswer) -> None:
         """Ask the first server whose expression matches."""

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple, TypeVar
 from prior_sg.schemas.codec import DecodeError, Message, decode, encode
 from prior_sg.schemas.priors import Prior, PriorRequest, Task, TaskInForce, TaskRequest
 from prior_sg.schemas.status import ServiceStatus, StatusRequest
+from prior_sg.schemas.succession import Swapped, SwapRequest
 from prior_sg.schemas.topics import (
     PRIOR,
     PRIORS,
@@ -22,6 +23,7 @@ from prior_sg.schemas.topics import (
     lease_key,
     roll_key,
     status_key,
+    swap_key,
 )
 from prior_sg.services.errors import PriorSgError
 from prior_sg.services.runtime.bus import Answer, Bus, BusError, Sample, message_in, pack_header
@@ -180,6 +182,10 @@ class BusClient:
         return self._ask(
             status_key(service, instance), ServiceStatus, StatusRequest(), f"status of {instance}", timeout_s
         )
+
+    def swap(self, service: str, instance: str, request: SwapRequest, timeout_s: float) -> Swapped:
+        """Have a process exchanged by who started it. Raises BusError where nobody answers."""
+        return self._ask(swap_key(service, instance), Swapped, request, f"exchange of {instance}", timeout_s)
 
     def _saw(self, key: str, alive: bool) -> None:
         service, instance = key.split("/")[-2:]

@@ -8,7 +8,8 @@ import msgspec
 
 from prior_sg.schemas.codec import Message
 from prior_sg.schemas.status import Loss
-from prior_sg.schemas.topics import Query, Topic
+from prior_sg.schemas.succession import Bequest
+from prior_sg.schemas.topics import FLEET, Query, Topic
 from prior_sg.services.errors import PriorSgError
 
 State = TypeVar("State")
@@ -30,6 +31,11 @@ class Identity:
     robot: str
     instance: str
     epoch: int
+
+    @property
+    def whose(self) -> str:
+        """Who is served, as it stands in keys where the name of a robot stands."""
+        return FLEET if self.robot == "*" else self.robot
 
 
 @dataclass(frozen=True)
@@ -56,6 +62,17 @@ class Ask:
 
 
 Output = tuple[Topic, Message] | Ask
+
+
+@dataclass(frozen=True)
+class Handover(Generic[State, Config]):
+    """How a service that others follow goes on in another process. Its successor reads what it reads and tells nothing:
+    the step gets `Succession` first, and `TakesOver` when it is its turn. `lacks` says, as part of a sentence, what a
+    successor still waits for before it can take over; empty = nothing. `bequest` is the last word of the predecessor.
+    """
+
+    lacks: Callable[[State, Config], str]
+    bequest: Callable[[State, Identity, Config], Bequest]
 
 
 @dataclass(frozen=True)
@@ -88,6 +105,8 @@ class Service(Generic[State, Config]):
     key_fields: Callable[[Config], dict[str, str]] = lambda cfg: {}  # config values that appear in keys of `answers`
     losses: Callable[[State], list[Loss]] = lambda state: []  # what could not be used; also read during a step
     close: Callable[[State], None] = lambda state: None
+    handover: Handover | None = None  # without: a successor begins anew
+    beside: bool = False  # a successor serves before its predecessor ends; else, without `handover`, after
     replay_tolerance: float = 1e-6  # by which floats of a replay may differ; networks differ with threads and machine
     replay_config: Callable[[Config], Config] = lambda cfg: cfg  # for a replay, which touches nothing outside
 

@@ -269,9 +269,9 @@ class ZenohBus:
 
         return end
 
-    def serve(self, key: str, on_request: OnRequest) -> None:
+    def serve(self, key: str, on_request: OnRequest) -> Callable[[], None]:
         """Answer calls on a key expression."""
-        self._entities.append(
+        return self._kept(
             self._session.declare_queryable(key, lambda query: on_request(ZenohRequest(query)), complete=True)
         )
 

@@ -3,8 +3,8 @@
 import msgspec
 import numpy as np
 
-from prior_sg.schemas import features, frames, objects, places, priors, queries, regions, scene, status
-from prior_sg.schemas.codec import Message
+from prior_sg.schemas import features, frames, objects, places, priors, queries, regions, scene, status, succession
+from prior_sg.schemas.codec import M, Message
 
 CAMERA = frames.Intrinsics(640, 480, 525.5, 526.5, 319.5, 239.5)
 POSE = np.array([[0.0, -1, 0, 1.5], [1, 0, 0, -2.5], [0, 0, 1, 3.5], [0, 0, 0, 1]])
@@ -479,6 +479,37 @@ EXAMPLES: list[Message] = [
         clock_ns=8,
         release="1",
     ),
+]
+
+
+def of(kind: type[M]) -> M:
+    """The example of a type."""
+    return next(message for message in EXAMPLES if isinstance(message, kind))
+
+
+EXAMPLES += [
+    succession.YieldRequest(successor="i"),
+    BEQUEST := succession.Bequest(
+        robot="r",
+        service="s",
+        instance="i",
+        places=of(places.PlaceDelta),
+        regions=of(regions.RegionDelta),
+        objects=of(objects.ObjectDelta),
+        next_ids={"places": 1},
+    ),
+    succession.Succession(predecessor="i"),
+    succession.TakesOver(bequest=BEQUEST),
+    succession.EvidenceRequest(robot="r", after_frame_id=1),
+    succession.Evidence(
+        robot="r",
+        space="s",
+        last_frame_id=1,
+        pyramids=[of(features.Pyramid)],
+        detections=[of(objects.Detections)],
+    ),
+    succession.SwapRequest(settings=["segmenter.beta=3"], config="c"),
+    succession.Swapped(successor="i", error="e"),
 ]
 
 

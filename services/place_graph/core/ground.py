@@ -8,7 +8,7 @@ whose axes are those of the rectangle times the square root of two. Pieces whose
 line between them, and whose ellipses overlap are joined.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -72,6 +72,11 @@ class GroundGraph(PlaceGraph):
         z_low, z_high = grid.bounds.low[2], grid.bounds.high[2]
         self._relink(Box(np.array((*low * tile, z_low)), np.array((*high * tile, z_high))), changes)
         return changes
+
+    def renumber(self, number: Mapping[int, int], next_id: int) -> None:
+        """Give every place another id."""
+        super().renumber(number, next_id)
+        self.pieces = {number[i]: piece for i, piece in self.pieces.items()}
 
     def shapes(self, ids: Iterable[int], voxel_m: float) -> GroundColumns:
         """Ellipse and hull of places, ids ascending."""

@@ -1,5 +1,7 @@
 """What readers of the place graph know, and the delta that brings them up to date (pure)."""
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from prior_sg.services.place_graph.core.columns import EdgeColumns, GoneColumns, GraphColumns, PlaceColumns
@@ -40,6 +42,11 @@ class PlaceLedger:
             _edge_columns(changed_edges, voxel_m),
             _gone_columns(removed, merged, explicit),
         )
+
+    def renumber(self, number: Mapping[int, int]) -> None:
+        """Places have other ids; nothing of this ledger has been told yet."""
+        self.places = {number[i]: place for i, place in self.places.items()}
+        self.edges = {number[a]: {number[b]: c for b, c in links.items()} for a, links in self.edges.items()}
 
     def snapshot(self, voxel_m: float) -> GraphColumns:
         """All that readers have been told, ids ascending."""

@@ -5,7 +5,7 @@ outward normals of a place's open faces, each weighed by its area, add up to its
 surfaces, whose normals cancel, and a doorway not yet passed adds up to its width times its height.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -55,6 +55,11 @@ class Openings:
             if not normal.any():
                 del self.told[place_id]
         return _columns({i: normal for i, normal in news.items() if i in shown}, voxel_m)
+
+    def renumber(self, number: Mapping[int, int]) -> None:
+        """Places have other ids."""
+        self.normals = {number[i]: normal for i, normal in self.normals.items() if i in number}
+        self.told = {number[i]: normal for i, normal in self.told.items() if i in number}
 
     def forget(self, ids: Iterable[int]) -> None:
         """Places that are no more."""

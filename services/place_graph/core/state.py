@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from prior_sg.schemas.frames import Keyframe
 from prior_sg.schemas.status import Loss
 from prior_sg.services.deltas import PoseCorrections
@@ -14,6 +16,16 @@ from prior_sg.services.place_graph.core.openings import Openings
 from prior_sg.services.place_graph.core.skeleton.graph import PlaceGraph
 from prior_sg.services.place_graph.core.trajectory import Trajectory
 from prior_sg.services.place_graph.core.volume.grid import VoxelGrid
+
+
+@dataclass
+class Legacy:
+    """What readers know of the map before this process."""
+
+    ids: np.ndarray  # (place,)
+    positions_m: np.ndarray  # (place, 3)
+    next_id: int  # none has had it or a higher one
+    frame_ids: frozenset[int] = field(default_factory=frozenset)  # keyframes in that map, as far as it is told
 
 
 @dataclass
@@ -34,11 +46,29 @@ class State:
     refused: dict[int, str] = field(default_factory=dict)  # why keyframes could not be used, by frame id
     joined_frame_id: int = 0  # first keyframe heard live; earlier ones come from the archive
     behind: bool = False  # earlier keyframes are still to come from the archive: readers keep what they have
-    unanswered: int = 0  # keyframes heard live since the archive answered last, while behind
+    stands_by: bool = False  # another is in charge: nothing is told
+    unnamed: bool = False  # what the map was before this process is not known yet
+    legacy: Legacy | None = None  # the former map, until its ids are taken over
+    unanswered: int = 0  # keyframes heard live since the archive answered last, while something is missing
     revision: int = -1
     stamp_ns: int = 0
     frame_id: int = -1
     origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of the world, as the newest keyframe says
+
+    @property
+    def silent(self) -> bool:
+        """Whether readers keep what they have."""
+        return self.stands_by or self.incomplete
+
+    @property
+    def incomplete(self) -> bool:
+        """Whether something is still to come of what was known before this process."""
+        return self.behind or self.unnamed or bool(self.lacking)
+
+    @property
+    def lacking(self) -> frozenset[int]:
+        """Keyframes of the former map that this one has not seen."""
+        return frozenset() if self.legacy is None else self.legacy.frame_ids - self.seen
 
     def losses(self) -> list[Loss]:
         """Keyframes refused, those left out that were fused later."""

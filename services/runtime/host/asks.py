@@ -42,6 +42,11 @@ class Asks:
         return (*self._running, self.fault)
 
     @property
+    def under_way(self) -> int:
+        """Errands that are being done."""
+        return len(self._running)
+
+    @property
     def waiting_for(self) -> list[str]:
         """Names of what is asked and not answered yet, sorted."""
         return sorted({name for name, _ in list(self._open)})

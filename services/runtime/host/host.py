@@ -18,6 +18,7 @@ import psutil
 
 from prior_sg.schemas.codec import DecodeError, Message, decode, encode, versions
 from prior_sg.schemas.status import Consumed, JobDone, ServiceStatus, Started, StatusRequest, Tick, TopicCount
+from prior_sg.schemas.succession import Bequest, Succession, TakesOver
 from prior_sg.schemas.topics import (
     DELTAS,
     JOURNAL,
@@ -27,6 +28,7 @@ from prior_sg.schemas.topics import (
     fault_of_job,
     status_key,
     worker_keys,
+    yield_key,
 )
 from prior_sg.services.refusals import InputRefused, NotYet
 from prior_sg.services.runtime.bus import Bus, Request, Sample
@@ -36,22 +38,27 @@ from prior_sg.services.runtime.host.door import Door
 from prior_sg.services.runtime.host.faults import fault_of_clock, fault_of_reply, fault_of_writer
 from prior_sg.services.runtime.host.flow import Progress
 from prior_sg.services.runtime.host.inbox import Inbox
-from prior_sg.services.runtime.host.items import Question, Work
+from prior_sg.services.runtime.host.items import LastWord, Question, Work
 from prior_sg.services.runtime.host.lease import Fence, Lease
 from prior_sg.services.runtime.host.outbox import Outbox
 from prior_sg.services.runtime.host.port import Fed, Port
+from prior_sg.services.runtime.host.succession import Predecessor, Standby
 from prior_sg.services.runtime.host.timing import Timing
+from prior_sg.services.runtime.host.yielding import Yielding
 from prior_sg.services.runtime.jobs.board import Ended
 from prior_sg.services.runtime.jobs.dispatcher import CREDITS
 from prior_sg.services.runtime.jobs.pool import JobPool, done
 from prior_sg.services.runtime.service import Ask, Identity, Service
 
 log = logging.getLogger(__name__)
+FEW_INPUTS = 4  # that may wait in a process that has caught up
 
 
 class Host:
     """One running service. `await run()` ends when `stop` is called or the service fails (then it raises), also when
-    it loses its `lease`. What comes from writers that are not in charge stays outside the `fence`.
+    it loses its `lease`. What comes from writers that are not in charge stays outside the `fence`. With `standby` it
+    first waits for its turn; with `replaces` it asks that process to yield once it serves itself; `follows` = readers
+    know of another that went before.
     """
 
     def __init__(
@@ -63,11 +70,18 @@ class Host:
         *,
         lease: Lease | None = None,
         fence: Fence | None = None,
+        standby: Standby | None = None,
+        replaces: Predecessor | None = None,
+        follows: bool = False,
     ) -> None:
         self.service, self.bus, self.cfg, self.identity = service, bus, cfg, identity
         self.inbox = Inbox(wake=self._wake)
         self._door = Door(self.inbox)
         self._lease, self._fence = lease, fence
+        self._standby, self._replaces, self._follows = standby, replaces, follows
+        self._no_more = asyncio.Event()  # of a source
+        self._yielding = Yielding(self.inbox, self._no_more, self._may_yield)
+        self._driving = self._answers = False
         self.stopping = asyncio.Event()
         self._loop = asyncio.get_running_loop()
         self._waiting = asyncio.Event()
@@ -85,14 +99,18 @@ class Host:
         self._state = await self._on_thread(self.service.init, self.cfg, self.identity)
         for errand in self.service.errands:
             self._asks.can_do(errand, errand.open(self.cfg, self.identity))
+        if self.service.handover is not None and (self._standby is not None or self._follows):
+            self.inbox.put(Succession(predecessor=self._standby.predecessor.instance if self._standby else ""))
         await self._on_thread(self._join)
-        tasks = [asyncio.create_task(self._work())]
+        tasks = [asyncio.create_task(self._work()), asyncio.create_task(self._drain())]
         if self.service.tick_s is not None:
             tasks.append(asyncio.create_task(self._tick(self.service.tick_s)))
         if self.service.drive is not None:
             tasks.append(asyncio.create_task(self._drive()))
         if self._lease is not None:
-            tasks.append(asyncio.create_task(self._lease.keep()))
+            tasks.append(asyncio.create_task(self._in_charge(self._lease)))
+        if self._replaces is not None:
+            tasks.append(asyncio.create_task(self._replace(self._replaces)))
         stop = asyncio.create_task(self.stopping.wait())
         try:
             pending = {*tasks, self._asks.fault, stop}
@@ -108,15 +126,57 @@ class Host:
             await asyncio.gather(*under_way, return_exceptions=True)
             await self._leave()
 
+    async def _in_charge(self, lease: Lease) -> None:
+        """Be in charge, after standing by where that is so."""
+        if self._standby is not None:
+            bequest = await self._standby.turn(self._lacking)
+            await self._on_thread(self._answer)
+            self.inbox.put(TakesOver(bequest=bequest), first=True)
+            log.info("takes over", extra={"from": self._standby.predecessor.instance})
+        await lease.keep()
+
+    async def _lacking(self) -> str:
+        """What this process still lacks; a few inputs wait in any."""
+        handover = self.service.handover
+        assert handover is not None
+        if (waiting := len(self.inbox)) > FEW_INPUTS:
+            return f"{waiting} inputs that wait"
+        return str(await self._on_thread(handover.lacks, self._state, self.cfg))
+
+    async def _replace(self, predecessor: Predecessor) -> None:
+        """Have the predecessor yield; where it does not, this process ends."""
+        await predecessor.yields()
+        log.info("takes over", extra={"from": predecessor.instance})
+
+    @property
+    def yielded(self) -> bool:
+        """Whether another has taken over from this process."""
+        return self._yielding.bequest is not None
+
+    async def _drain(self) -> None:
+        await self._yielding.drain(self._is_busy)
+        await self.stopping.wait()
+
+    def _is_busy(self) -> bool:
+        """Whether a source is still being read, or an errand or a job given to a worker is under way."""
+        return self._driving or bool(self._asks.under_way) or any(pool.outstanding for pool in self._pools.values())
+
+    def _may_yield(self) -> str:
+        if self._standby is not None and not self._answers:
+            return "it is not in charge itself yet"
+        return "it is ending already" if self.stopping.is_set() else ""
+
     def stop(self) -> None:
         """Ask the service to end after the input it is working on; safe to call from the loop's thread only."""
         self.stopping.set()
+        self._no_more.set()
         self._waiting.set()
 
     async def _leave(self) -> None:
         for pool in self._pools.values():
             pool.close()
         await self._on_thread(self.service.close, self._state)
+        await self._yielding.hand_over(self._lease)
         await self._on_thread(self.bus.close)
         self._thread.shutdown(wait=False)
 
@@ -135,9 +195,10 @@ class Host:
         )
         self._outbox.journal("START", inline=encode(started))
         log.info("started", extra={"robot": robot, "config": msgspec.to_builtins(self.cfg)})
-        for query in service.answers:
-            self.bus.serve(service.answer_key(query, robot, self.cfg), partial(self._queue_question, query))
+        if self._standby is None:
+            self._answer()
         self.bus.serve(status_key(service.name, self.identity.instance), self._answer_status)
+        self.bus.serve(yield_key(self.identity.whose, service.name, self.identity.instance), self._yielding.receive)
         for topic in service.writes:
             if topic.delivery == "job":
                 limit = service.job_limit(self.cfg)
@@ -154,6 +215,13 @@ class Host:
             self.bus.announce(live_key)
         self.bus.announce(alive_key(service.name, self.identity.instance))
 
+    def _answer(self) -> None:
+        """Declare what this process answers: nothing while another is in charge."""
+        for query in self.service.answers:
+            key = self.service.answer_key(query, self.identity.robot, self.cfg)
+            self.bus.serve(key, partial(self._queue_question, query))
+        self._answers = True
+
     def _wake(self) -> None:
         self._loop.call_soon_threadsafe(self._waiting.set)
 
@@ -167,16 +235,16 @@ class Host:
     def _take_some(self, budget_s: float = 0.05) -> None:
         """Work for a while without going back to the event loop for every input."""
         end_s = time.monotonic() + budget_s
-        while time.monotonic() < end_s and (item := self.inbox.take()) is not None:
+        while time.monotonic() < end_s and not self.yielded and (item := self.inbox.take()) is not None:
             self._handle(item)
 
     def _handle(self, item: Any) -> None:
         match item:
             case Sample():
                 self._handle_sample(item)
-            case Tick():
+            case Tick() | Succession() | TakesOver():
                 self._step(item)
-                self._outbox.journal("Tick", inline=encode(item))
+                self._outbox.journal(type(item).__name__, inline=encode(item))
             case Reply():
                 self._handle_reply(item)
             case Question():
@@ -188,6 +256,19 @@ class Host:
             case Fed():
                 self._step(item.message)
                 self._loop.call_soon_threadsafe(item.done)
+            case LastWord():
+                self._say_last_word()
+
+    def _say_last_word(self) -> None:
+        """Nothing is taken in after this."""
+        identity, handover = self.identity, self.service.handover
+        if handover is None:
+            self._yielding.bequest = Bequest(
+                robot=identity.whose, service=self.service.name, instance=identity.instance
+            )
+        else:
+            self._yielding.bequest = handover.bequest(self._state, identity, self.cfg)
+        self._loop.call_soon_threadsafe(self.stop)
 
     def _handle_sample(self, sample: Sample) -> None:
         topic, key = sample.topic, sample.key
@@ -285,7 +366,7 @@ class Host:
     def _offer_work(self, request: Request) -> None:
         job = self.service.job
         assert job is not None
-        if self._slots.acquire(blocking=False):
+        if not self._yielding.begun.is_set() and self._slots.acquire(blocking=False):
             fault_of = partial(fault_of_job, job, request.key)
             message = self._door.admitted(job.type, request.payload, name=job.name, key=request.key, fault_of=fault_of)
             self.inbox.put(Work(request, message))
@@ -349,8 +430,12 @@ class Host:
 
     async def _drive(self) -> None:
         assert self.service.drive is not None
-        port = Port(self.identity.robot, self.stopping, self.inbox, self._progress, self.service.writes, self._pools)
-        await self.service.drive(port, self.cfg)
+        port = Port(self.identity.robot, self._no_more, self.inbox, self._progress, self.service.writes, self._pools)
+        self._driving = True
+        try:
+            await self.service.drive(port, self.cfg)
+        finally:
+            self._driving = False
 
     def _missed(self, topic: Topic, number: int) -> None:
         self.inbox.missed(topic.name, number)

@@ -21,3 +21,8 @@ class Work:
 
     request: Request
     message: Message | None  # None = malformed
+
+
+@dataclass(frozen=True)
+class LastWord:
+    """This process is to end here: another takes over."""

@@ -3,7 +3,7 @@
 The token is Zenoh's liveliness: it goes when its holder ends, dies or cannot be reached. An epoch is drawn above every
 one seen: in tokens, and by the keepers, the services that follow the writer. Where two are in charge, after a link was
 cut or when both began at once, the higher epoch wins and the other stops itself. One that starts while another is in
-charge waits for its end.
+charge waits for its end, or stands by until that one yields to it.
 """
 
 import asyncio
@@ -63,8 +63,9 @@ def standing(key: str) -> Standing | None:
 
 
 class Lease:
-    """The right of one process to write for a robot. `await take()`, then `await keep()`, which ends by
-    SupersededError. `shared` names the topics that another writes as well, by right, and may number above.
+    """The right of one process to write for a robot. `await take()`, or `await stand_by()` and later `await
+    take_over()`; then `await keep()`, which ends by SupersededError. `shared` names the topics that another writes as
+    well, by right, and may number above.
     """
 
     def __init__(
@@ -88,26 +89,59 @@ class Lease:
         self._seen: frozenset[str] = frozenset()
         self._followed = -1  # the highest epoch that a keeper has said it follows
         self._told: set[str] = set()
+        self._withdraw: Callable[[], None] = lambda: None  # of the token
         self.holder = Holder(-1, instance)
+
+    @property
+    def has_predecessor(self) -> bool:
+        """Whether readers follow what another wrote before; known from `take` on."""
+        return 0 <= self._followed != self.holder.epoch
 
     async def take(self) -> int:
         """Wait until nobody else is in charge, then be it; returns the epoch."""
+        await self._look()
+        await self.alone()
+        while True:
+            epoch = await self._draw()
+            if await self._hold():
+                return epoch
+            await self.alone()
+
+    async def stand_by(self) -> int:
+        """The epoch with which this process is to take over from who is in charge now."""
+        await self._look()
+        return await self._draw()
+
+    async def take_over(self) -> None:
+        """Be in charge, with the epoch drawn when this process began to stand by. Raises SupersededError."""
+        if not await self._hold():
+            await self._check_others()
+
+    async def release(self) -> None:
+        """Be in charge no more."""
+        await asyncio.to_thread(self._withdraw)
+
+    async def _look(self) -> None:
+        """See who is in charge, now and from now on."""
         await self._known()
         others = await self._others()  # first: beside a watch, Zenoh answers from what that has heard so far
         await asyncio.to_thread(self._bus.watch, self._pattern, self._saw)
         await asyncio.sleep(HISTORY_S if others else 0.0)
-        await self._wait_for_others()
-        while True:
-            await self._known()
-            others = await self._others()
-            epoch = next_epoch(time.time_ns(), max([self._followed, *(other.epoch for other in others)]))
-            self.holder = Holder(epoch, self._instance)
-            withdraw = await asyncio.to_thread(self._announce, str(epoch))
-            others = await self._others()
-            if max([self.holder, *others]) == self.holder:
-                return epoch
-            withdraw()
-            await self._wait_for_others()
+
+    async def _draw(self) -> int:
+        await self._known()
+        others = await self._others()
+        epoch = next_epoch(time.time_ns(), max([self._followed, *(other.epoch for other in others)]))
+        self.holder = Holder(epoch, self._instance)
+        return epoch
+
+    async def _hold(self) -> bool:
+        """Announce that this process is in charge; False after taking it back, for another is."""
+        self._withdraw = await asyncio.to_thread(self._announce, str(self.holder.epoch))
+        if max([self.holder, *await self._others()]) == self.holder:
+            return True
+        await self.release()
+        return False
 
     async def keep(self) -> None:
         """Until another is in charge. Raises SupersededError."""
@@ -140,22 +174,25 @@ class Lease:
     def _announce(self, epoch: str) -> Callable[[], None]:
         return self._bus.announce(lease_key(self._robot, self._service, epoch, self._instance))
 
-    async def _wait_for_others(self) -> None:
+    async def alone(self) -> None:
+        """Wait, and be seen to, until nobody else has been in charge for a while."""
         if not (others := await self._others()):
             return
         log.warning(
             f"{max(others).instance} is in charge of {self._what}: waiting for its end, then this one takes over"
         )
         withdraw = await asyncio.to_thread(self._announce, WAITING)
-        while True:
-            self._changed.clear()
-            if not await self._others():
-                await asyncio.sleep(GRACE_S)
-                if not await self._others() and self._bus.connected():
-                    break
-            else:
-                await self._changed.wait()
-        withdraw()
+        try:
+            while True:
+                self._changed.clear()
+                if not await self._others():
+                    await asyncio.sleep(GRACE_S)
+                    if not await self._others() and self._bus.connected():
+                        break
+                else:
+                    await self._changed.wait()
+        finally:
+            withdraw()
         log.warning(f"nobody is in charge of {self._what} any more: this process takes over")
 
     async def _others(self) -> list[Holder]:

@@ -34,7 +34,7 @@ class Outbox:
     def journal(self, topic: str, **fields: Any) -> None:
         """One more input is finished with; `fields` are those of `Consumed` that say which."""
         entry = Consumed(
-            robot=self._identity.robot if self._identity.robot != "*" else "fleet",
+            robot=self._identity.whose,
             service=self._service,
             instance=self._identity.instance,
             order=self._order,

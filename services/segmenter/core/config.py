@@ -77,6 +77,7 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
     footprint_cell_m: float = 0.1  # grid of the regions' areas
     evidence_ticks: int = 40  # ticks between two reports of what the map shows of its prior; 0 = none
     evidence_places: int = 5  # a region of fewer places is not counted there: most are mistakes
+    catch_up_ticks: int = 20  # ticks without progress after which a successor of a dead process tells what it has
     prior_wait_ticks: int = 4  # ticks to wait for a task's prior before asking for it
     remembered_priors: int = 4  # priors kept that no task has asked for yet
 

@@ -16,6 +16,7 @@ from prior_sg.services.segmenter.core.objects.object_map import ObjectMap
 from prior_sg.services.segmenter.core.objects.tracks import Tracks
 from prior_sg.services.segmenter.core.prior_report import PriorReport
 from prior_sg.services.segmenter.core.regions.region_map import RegionMap
+from prior_sg.services.segmenter.core.succession import CatchingUp
 
 
 @dataclass
@@ -32,6 +33,7 @@ class State:
     regions: RegionMap = field(default_factory=RegionMap)
     corrections: PoseCorrections = field(default_factory=PoseCorrections)
     report: PriorReport = field(default_factory=PriorReport)
+    catching_up: CatchingUp = field(default_factory=CatchingUp)
     stamp_ns: int = 0  # of the newest place delta, pyramid or detections
 
     @property

@@ -16,7 +16,9 @@ from prior_sg.schemas.objects import Detections, ObjectDelta
 from prior_sg.schemas.places import PlaceDelta, SnapshotRequest
 from prior_sg.schemas.priors import Prior, PriorEvidence, PriorList, Task, TaskInForce
 from prior_sg.schemas.regions import RegionDelta
+from prior_sg.schemas.scene import Scene
 from prior_sg.schemas.status import Tick
+from prior_sg.schemas.succession import Evidence, EvidenceRequest, Succession, TakesOver
 from prior_sg.services.segmenter.core import inference, prior_evidence, report
 from prior_sg.services.segmenter.core.aim import object_concepts, region_concepts
 from prior_sg.services.segmenter.core.config import Config
@@ -24,6 +26,7 @@ from prior_sg.services.segmenter.core.evidence import handover
 from prior_sg.services.segmenter.core.evidence.kernel import Targets
 from prior_sg.services.segmenter.core.objects.names import named
 from prior_sg.services.segmenter.core.state import State
+from prior_sg.services.segmenter.core.succession import SAME_MAP
 
 
 def update(state: State, message: Message, cfg: Config) -> Iterator[Message]:
@@ -32,6 +35,9 @@ def update(state: State, message: Message, cfg: Config) -> Iterator[Message]:
     yield from take(state, message, cfg)
     switched = align(state, cfg)
     yield from _requests(state, cfg)
+    if state.catching_up.silent:
+        yield from _catch_up(state, idle or switched, cfg)
+        return
     if switched or idle:
         yield from follow_objects(state, cfg)
     if switched or (state.labelling.dirty and isinstance(message, Pyramid | Tick)):
@@ -58,8 +64,13 @@ def take(state: State, message: Message, cfg: Config) -> Iterator[Message]:
         case Tick():
             state.aim.tick()
             handover.tick(state.seen.spaces)
-            yield from handover.questions(state.seen.spaces, state.seen.archive, state.robot, cfg.spaces)
+            if not state.catching_up.stands_by:
+                yield from handover.questions(state.seen.spaces, state.seen.archive, state.robot, cfg.spaces)
             yield from follow_spaces(state, cfg)
+        case Evidence():
+            yield from take_evidence(state, message, cfg)
+        case Succession() | TakesOver() | RegionDelta() | ObjectDelta() | Scene():
+            hear_former(state, message)
 
 
 def follow_places(state: State, delta: PlaceDelta, cfg: Config) -> None:
@@ -78,6 +89,8 @@ def follow_places(state: State, delta: PlaceDelta, cfg: Config) -> None:
 
 def observe(state: State, pyramid: Pyramid, cfg: Config) -> None:
     """Integrate one frame into the places it sees; a repeated frame is ignored, one of another space kept apart."""
+    if state.catching_up.silent and state.seen.holds(pyramid):
+        return  # from a cache, and from the predecessor
     pose = state.corrections.pose(pyramid.frame_id, pyramid.world_from_camera)
     pyramid = msgspec.structs.replace(pyramid, world_from_camera=pose)
     rows = state.seen.observe(pyramid, _targets(state), cfg)
@@ -89,6 +102,8 @@ def observe(state: State, pyramid: Pyramid, cfg: Config) -> None:
 
 def detect(state: State, detections: Detections, cfg: Config) -> None:
     """Associate one frame's detections; those of a space that is not in force wait for it, if it may take over."""
+    if state.catching_up.silent and state.objects.holds(detections):
+        return
     of = f"keyframe {detections.frame_id}, {detections.space}"
     if detections.space != state.seen.spaces.force and not cfg.spaces.follow:
         state.seen.losses.add("detections ignored", "their space is not in force", of=of)
@@ -167,6 +182,91 @@ def follow_objects(state: State, cfg: Config) -> Iterator[ObjectDelta]:
         if prior is not None:
             inference.see_objects(state, objects.ledger.view(), cfg)
         yield delta
+
+
+def take_evidence(state: State, evidence: Evidence, cfg: Config) -> Iterator[EvidenceRequest]:
+    """What the predecessor has seen, page by page."""
+    if evidence.space and not len(state.seen.archive):
+        state.seen.spaces.force = evidence.space
+    for pyramid in evidence.pyramids:
+        observe(state, pyramid, cfg)
+    for detections in evidence.detections:
+        detect(state, detections, cfg)
+    if evidence.pyramids or evidence.detections:
+        yield EvidenceRequest(robot=state.robot, after_frame_id=evidence.last_frame_id)
+    elif state.catching_up.silent:
+        state.catching_up.waits.discard("evidence")
+        state.objects.sort()
+
+
+def hear_former(state: State, message: Succession | TakesOver | RegionDelta | ObjectDelta | Scene) -> None:
+    """Others have gone before this process; what readers know of them, and when it is this one's turn."""
+    match message:
+        case Succession():
+            state.catching_up.begin(message.predecessor)
+            state.map.asked_snapshot = True
+        case TakesOver():
+            state.catching_up.take_over(message.bequest)
+        case _:
+            state.catching_up.hear(message)
+
+
+def _catch_up(state: State, thoroughly: bool, cfg: Config) -> Iterator[RegionDelta | ObjectDelta]:
+    """Follow everything and tell nothing, until what readers know can be told again, under the same names."""
+    if thoroughly:
+        for _ in follow_objects(state, cfg):
+            pass  # so that the experts see them
+        state.catching_up.tick(_seen_again(state)[1])
+    if state.aim.in_force is not None and (thoroughly or state.catching_up.stands_by):
+        inference.evaluate_experts(state, thoroughly, cfg)
+        inference.settle(state, cfg, hurried=not thoroughly)
+    waits = state.catching_up
+    if waits.stands_by or (state.map.follower.epoch < 0 and waits.legacy is not None and len(waits.legacy.place_ids)):
+        return
+    if not lacking(state, cfg) or waits.still_ticks >= cfg.catch_up_ticks:
+        yield from _tell_all(state, cfg)
+
+
+def lacking(state: State, cfg: Config) -> str:
+    """What is still missing of what was known before this process, as part of a sentence; empty = nothing."""
+    waits, legacy, aim = state.catching_up, state.catching_up.legacy, state.aim
+    if legacy is None:
+        return ""
+    if waits.waits:
+        return f"what is known of {' and '.join(sorted(waits.waits))} beside {len(state.seen.archive)} keyframes"
+    if len(legacy.place_ids) and state.map.follower.epoch < 0:
+        return "the places of the map"
+    if legacy.digest and aim.in_force is None:
+        return "the prior in force"
+    there, again = _seen_again(state)
+    if again < cfg.spaces.coverage * there or (waits.gathers and waits.still_ticks < 1):
+        return f"evidence of {there - again} places"
+    return "the objects" if state.objects.outdated(state.seen.spaces.force) else ""
+
+
+def _seen_again(state: State) -> tuple[int, int]:
+    """How many of the places that were looked at before are in the map, and how many of these have been seen again;
+    none where the map is another.
+    """
+    legacy = state.catching_up.legacy
+    if legacy is None:
+        return 0, 0
+    rows = state.map.graph.rows(legacy.seen_ids)
+    rows = rows[rows >= 0]
+    if len(rows) < SAME_MAP * len(legacy.seen_ids):
+        return 0, 0
+    return len(rows), int((state.seen.evidence.frames[state.map.places.slots[rows]] > 0).sum())
+
+
+def _tell_all(state: State, cfg: Config) -> Iterator[RegionDelta | ObjectDelta]:
+    """Take over the former ids, and tell everything."""
+    legacy, state.catching_up.legacy = state.catching_up.legacy, None
+    assert legacy is not None
+    state.map.places.regions = legacy.regions_of(state.map.graph.ids)
+    state.regions.inherit(legacy.regions, legacy.next_region_id)
+    state.objects.inherit(legacy.objects, legacy.next_object_id, cfg.tracking)
+    yield from follow_objects(state, cfg)
+    yield from _segment(state, switched=False, idle=False, cfg=cfg)
 
 
 def _segment(state: State, switched: bool, idle: bool, cfg: Config) -> Iterator[RegionDelta]:

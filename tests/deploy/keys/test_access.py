@@ -283,3 +283,12 @@ def test_bundles_are_for_their_owner_and_names_are_names(tmp_path):
     with pytest.raises(BusError, match="no bundle"):
         read_bundle(tmp_path)
     assert msgspec.json.decode((authority.folder / "participants.json").read_bytes())[0]["role"] == "viewer"
+
+
+def test_who_may_have_a_process_yield_runs_the_same_and_nobody_beyond_a_host_has_one_exchanged():
+    asks = {role: grants_of(role, "robotA").asks for role in ("robot", "edge", "operator", "viewer")}
+    yields = {role: {key for key in keys if "/yield/" in key} for role, keys in asks.items()}
+    assert yields["robot"] == {f"psg/robotA/yield/{name}/*" for name in ("ingest", "place_graph", "segmenter")}
+    assert "psg/*/yield/segmenter/*" in yields["edge"] and "psg/fleet/yield/scene_store/*" in yields["edge"]
+    assert not yields["operator"] and not yields["viewer"]
+    assert not [key for keys in asks.values() for key in keys if "/swap" in key]

@@ -18,6 +18,7 @@ from scipy.sparse.csgraph import connected_components
 from prior_sg.schemas.codec import encode
 from prior_sg.schemas.frames import ArchiveReply, Intrinsics, Keyframe, PoseUpdate
 from prior_sg.schemas.places import MapRequest, PlaceDelta, SnapshotRequest
+from prior_sg.schemas.succession import Succession, TakesOver
 from prior_sg.schemas.topics import ARCHIVE, PLACE_DELTA, PLACE_SNAPSHOT, VOXEL_MAP
 from prior_sg.services import images
 from prior_sg.services.geometry import inside_polygon, pose_from_quaternion
@@ -903,6 +904,51 @@ def test_a_successor_waits_for_a_silent_archive_within_a_bound():
     [(_, delta)] = runner.feed(*ROOM_WALK[6:7])
     assert delta.snapshot and len(delta.past_frame_ids) == 3
     assert len(runner.feed(*ROOM_WALK[7:8])) == 1
+
+
+def archive_of(frames):
+    archive = {frame.frame_id: frame for frame in frames}
+
+    def page_of(request):
+        wanted = range(request.first_frame_id, request.end_frame_id)
+        page = [archive[number] for number in sorted(archive) if number in wanted][:2]
+        return ArchiveReply(robot="r", oldest_frame_id=0, keyframes=page)
+
+    return page_of
+
+
+def test_a_successor_that_stands_by_gives_places_the_ids_they_had():
+    first = Runner(service.SERVICE, CFG, Identity("r", "p", 1))
+    first.state.graph._next_id = 500  # as after many places that are gone
+    deltas = [delta for _, delta in first.feed(*ROOM_WALK[:6])]
+    second = Runner(service.SERVICE, CFG, Identity("r", "q", 2), {ARCHIVE: archive_of(ROOM_WALK[:6])})
+    second.answers[PLACE_SNAPSHOT] = first
+    assert service.lacks(second.state, CFG) == "" and second.feed(Succession(predecessor="p")) == []
+    assert second.feed(ROOM_WALK[5], ROOM_WALK[4]) == [] and service.lacks(second.state, CFG) == ""
+    assert sorted(second.state.seen) == [frame.frame_id for frame in ROOM_WALK[:6]]
+    with pytest.raises(NotYet):
+        second.answer(PLACE_SNAPSHOT, SnapshotRequest(robot="r"))
+    told = read(deltas + [delta for _, delta in first.feed(ROOM_WALK[6])])
+    last_word = service.bequest(first.state, first.identity, CFG)
+    assert second.feed(TakesOver(bequest=last_word)) == []  # the newest keyframe has not come yet
+    [(_, delta), *_] = second.feed(ROOM_WALK[6])
+    assert delta.snapshot and delta.epoch == 2
+    there = dict(zip(delta.place_ids.tolist(), delta.positions_m.tolist(), strict=True))
+    same = [number for number in there if number in told.places]
+    assert len(same) >= 0.9 * len(told.places)
+    apart_m = [np.linalg.norm(np.subtract(there[number], told.places[number][:3])) for number in same]
+    assert max(apart_m) <= CFG.graph_rules.merge * CFG.voxel_m
+    assert second.state.graph.next_id >= first.state.graph.next_id
+    assert len(second.feed(ROOM_WALK[7])) == 1
+
+
+def test_a_successor_says_which_keyframes_it_lacks():
+    first = Runner(service.SERVICE, CFG, Identity("r", "p", 1))
+    first.feed(*ROOM_WALK[:6])
+    second = Runner(service.SERVICE, CFG, Identity("r", "q", 2), {ARCHIVE: archive_of(ROOM_WALK[3:6])})
+    second.answers[PLACE_SNAPSHOT] = first
+    second.feed(Succession(predecessor="p"), ROOM_WALK[5])
+    assert "3 keyframes of its predecessor's map" in service.lacks(second.state, CFG)
 
 
 def test_a_pose_update_from_before_the_first_keyframe_empties_no_readers_map():

@@ -1,5 +1,6 @@
 """Places with lasting ids and the edges between them, updated inside a region of the map (pure)."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -93,6 +94,20 @@ class PlaceGraph:
         voxels = np.concatenate((self._voxels(sorted(stirred)), [changed.low, changed.high - 1], gone))
         self._relink(Box(voxels.min(axis=0), voxels.max(axis=0) + 1), grid, changes)
         return changes
+
+    @property
+    def next_id(self) -> int:
+        """The number of the next new place; none has had it or a higher one."""
+        return self._next_id
+
+    def renumber(self, number: Mapping[int, int], next_id: int) -> None:
+        """Give every place another id."""
+        self.places = {number[i]: place for i, place in self.places.items()}
+        self.edges = {number[a]: {number[b]: c for b, c in links.items()} for a, links in self.edges.items()}
+        self._touching = {number[a]: {number[b] for b in others} for a, others in self._touching.items()}
+        self.frozen = {number[i] for i in self.frozen}
+        self._by_cell = {cell: {number[i] for i in ids} for cell, ids in self._by_cell.items()}
+        self._next_id = next_id
 
     def freeze(self, box: Box) -> None:
         """The voxels of a box were dropped: its places stay as they are until they are seen again."""

@@ -22,6 +22,10 @@ class FrameArchive:
         self.frames: list[Frame] = []
         self._index: dict[int, int] = {}  # by frame id
 
+    def get(self, frame_id: int) -> Frame:
+        """The frame of this number. Raises KeyError."""
+        return self.frames[self._index[frame_id]]
+
     def add(self, frame_id: int, frame: Frame) -> bool:
         """Keep a frame; False when this id is already here."""
         if frame_id in self._index:

@@ -30,6 +30,16 @@ class Seen:
         """Whether no pyramids come at the moment."""
         return self.spaces.still_ticks >= RESTING_TICKS
 
+    @property
+    def archives(self) -> dict[str, FrameArchive]:
+        """All frames, by space."""
+        return {name: rival.archive for name, rival in self.spaces.rivals.items()} | {self.spaces.force: self.archive}
+
+    def holds(self, pyramid: Pyramid) -> bool:
+        """Whether this pyramid is here already."""
+        archive = self.archives.get(pyramid.space)
+        return archive is not None and pyramid.frame_id in archive.frame_ids
+
     def observe(self, pyramid: Pyramid, targets: kernel.Targets, cfg: Config) -> np.ndarray | None:
         """Integrate a frame into the targets that it sees; their rows. None for a repeat; a pyramid of another space is
         kept apart."""

@@ -5,13 +5,14 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from prior_sg.schemas.objects import Detections, ObjectDelta
+from prior_sg.schemas.objects import Detections, ObjectDelta, SceneObject
 from prior_sg.schemas.priors import Prior
 from prior_sg.services.segmenter.core.experts.context import ObjectView
 from prior_sg.services.segmenter.core.objects import tracks
 from prior_sg.services.segmenter.core.objects.ledger import ObjectLedger
 from prior_sg.services.segmenter.core.objects.names import Named
 from prior_sg.services.segmenter.core.objects.tracks import TrackingConfig, Tracks
+from prior_sg.services.segmenter.core.succession import same_objects
 
 
 @dataclass
@@ -25,6 +26,30 @@ class ObjectMap:
     def observe(self, detections: Detections, cfg: TrackingConfig) -> bool:
         """Associate one frame's detections; False for those that cannot be used."""
         return tracks.observe(self.tracks, detections, cfg)
+
+    def holds(self, detections: Detections) -> bool:
+        """Whether these are here already."""
+        return (detections.space, detections.detector, detections.frame_id) in self.tracks.archive
+
+    def sort(self) -> None:
+        """Associate all detections afresh, in the order of their frames."""
+        tracks.in_order(self.tracks)
+
+    def outdated(self, space: str) -> bool:
+        """Whether `renew` has to be called before these are the objects of a space."""
+        return tracks.outdated(self.tracks, space)
+
+    def inherit(self, former: list[SceneObject], next_id: int, cfg: TrackingConfig) -> None:
+        """Give the objects the ids that they had before this process, and tell them all anew."""
+        items = list(self.tracks.items.values())
+        boxes_m = np.array([track.box_m(cfg) for track in items]).reshape(-1, 2, 3)
+        number = same_objects(former, [track.id for track in items], boxes_m)
+        next_id = max(next_id, self.tracks.next_id)
+        for track in items:
+            if track.id not in number:
+                number[track.id], next_id = next_id, next_id + 1
+        tracks.renumber(self.tracks, number, next_id)
+        self.ledger = ObjectLedger()
 
     def move(self, poses: Mapping[int, np.ndarray]) -> None:
         """Frames have other poses (4, 4), by frame id."""

@@ -10,7 +10,7 @@ afresh. An object then keeps the id under which most of its detections were know
 """
 
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
 import msgspec
@@ -146,6 +146,20 @@ def move(tracks: Tracks, poses: dict[int, np.ndarray]) -> None:
         if key[2] in poses:
             tracks.archive[key] = msgspec.structs.replace(kept, world_from_camera=poses[key[2]].copy())
             tracks.moved = True
+
+
+def renumber(tracks: Tracks, number: Mapping[int, int], next_id: int) -> None:
+    """Objects have other ids; nothing of them may have been told yet."""
+    for track in tracks.items.values():
+        track.id = number[track.id]
+    tracks.items = dict(sorted((track.id, track) for track in tracks.items.values()))
+    tracks.next_id, tracks.merged, tracks.changed = next_id, [], True
+
+
+def in_order(tracks: Tracks) -> None:
+    """Detections came in any order: they are to be associated afresh in that of their frames."""
+    tracks.archive = dict(sorted(tracks.archive.items(), key=lambda kept: kept[0][2]))
+    tracks.moved = True
 
 
 def outdated(tracks: Tracks, space: str) -> bool:

@@ -21,6 +21,12 @@ class RegionMap:
     reformed: set[int] = field(default_factory=set)  # regions whose places came, went or moved
     ledger: Ledger = field(default_factory=Ledger)
 
+    def inherit(self, regions: list[Region], next_id: int) -> None:
+        """These regions were known before this process; nothing has been told yet."""
+        self.known = {region.id: region for region in regions}
+        self.next_id = max(self.next_id, next_id)
+        self.ledger = Ledger()
+
     def disturb(self, regions: np.ndarray) -> None:
         """Beliefs, ways or objects of these regions (place,) may have changed."""
         self.disturbed.update(regions.tolist())
