@@ -28,6 +28,7 @@ from prior_sg.schemas.status import JobDone, Loss
 from prior_sg.schemas.topics import CAMERA_STATE, ENCODE, INGEST_STATE, KEYFRAME, POSE_UPDATE, Topic
 from prior_sg.services.geometry import inverse, rotation_angle_rad
 from prior_sg.services.ingest.core.archive import KeyframeArchive
+from prior_sg.services.ingest.core.checkpoint import Checkpoint, Keeper
 from prior_sg.services.ingest.core.closures import spread
 from prior_sg.services.ingest.core.config import Config
 from prior_sg.services.ingest.core.continuity import BELIEVED_AFTER, POSES_JUMP, Continuity, Held, Refusal, reachable
@@ -47,6 +48,7 @@ class State:
     last: View | None = None  # newest frame believed
     jumped: View | None = None  # frame refused because its pose jumped, if that was the newest frame
     keyframe: View | None = None  # newest keyframe
+    index: int = -1  # position in the source of the newest frame believed
     read: int = 0
     total: int = 0
     rejected: int = 0
@@ -55,11 +57,15 @@ class State:
     skipped: int = 0
     corrections: int = 0  # pose updates published
     encoding: set[int] = field(default_factory=set)  # numbers of keyframes whose job is not done
+    backfilled: tuple[int, int] = (-1, -1)  # epoch and number of the newest wish of a reader that was heard
     ended: bool = False
     trail: list[View] = field(default_factory=list)  # keyframes since the poses last jumped
     continuity: Continuity = field(default_factory=Continuity)
     losses: Losses = field(default_factory=Losses)
     archive: KeyframeArchive = field(default_factory=KeyframeArchive)
+    keeper: Keeper | None = None  # of the archive beyond the end of the process
+    checkpoint: Checkpoint | None = None  # as it would be kept
+    not_kept: str = ""  # why nothing can be kept any more; empty = it can, or is not meant to be
 
 
 @dataclass(frozen=True)
@@ -113,7 +119,7 @@ def pass_over(state: State, unused: Unused) -> Iterator[Written]:
 
 def accept(state: State, frame: RawFrame, cfg: Config) -> Iterator[Written]:
     """Report the camera, and make the frame a keyframe when it is due."""
-    state.read, state.total = state.read + 1, frame.total
+    state.read, state.total, state.index = state.read + 1, frame.total, frame.index
     state.last, state.jumped = View.of(frame), None
     yield (
         CAMERA_STATE,
@@ -157,7 +163,13 @@ def encoded(state: State, done: JobDone) -> Iterator[Written]:
 
 
 def backfill(state: State, wish: Backfill) -> Iterator[Written]:
-    """Encode archived keyframes again, in one space: those that the asking reader lacks. They give way to new ones."""
+    """Encode archived keyframes again, in one space: those that the asking reader lacks. They give way to new ones.
+
+    A wish that was heard before this process began comes again from its writer's cache: what it asked for is done.
+    """
+    if wish.epoch > 0 and (wish.epoch, wish.number) <= state.backfilled:
+        return
+    state.backfilled = max(state.backfilled, (wish.epoch, wish.number))
     for keyframe in state.archive.lacked(wish):
         if not keyframe.color:
             continue

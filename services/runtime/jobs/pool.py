@@ -20,6 +20,7 @@ log = logging.getLogger(__name__)
 DEFAULT_TIMEOUT_S = 60.0
 DONE = "done"
 DONE_WITH = re.compile(rb"done (\d{1,6})")
+DONE_OF_OLD = DONE.encode()  # of a worker of 0.1, which does not count its results; no longer taken from 0.3 on
 
 
 class JobPool:
@@ -144,5 +145,7 @@ def _fault_of(answer: Answer) -> str:
     """Why a job is not done; empty when it is."""
     if answer.payload is None:
         return answer.reason
+    if answer.payload == DONE_OF_OLD:
+        return ""
     told = DONE_WITH.fullmatch(answer.payload)
     return "" if told is not None and int(told[1]) > 0 else NO_RESULT

@@ -58,7 +58,8 @@ def take(state: State, message: Message, cfg: Config) -> Iterator[Message]:
         case Tick():
             state.aim.tick()
             handover.tick(state.seen.spaces)
-            yield from handover.questions(state.seen.spaces, state.seen.archive, state.robot, cfg.spaces)
+            seen = state.seen
+            yield from handover.questions(seen.spaces, seen.archive, state.robot, state.epoch, cfg.spaces)
             yield from follow_spaces(state, cfg)
 
 
