@@ -22,7 +22,7 @@ from prior_sg.services.registry import BY_NAME
 from prior_sg.services.runtime.bus import message_in
 from prior_sg.services.runtime.client import BusClient
 from prior_sg.services.runtime.jobs.dispatcher import CREDITS
-from prior_sg.services.runtime.record import Logged, LogWriter, read_log
+from prior_sg.services.runtime.record import LogWriter, read_log
 from prior_sg.services.runtime.runner import Runner
 from prior_sg.services.runtime.zenoh_bus import ZenohBus
 
@@ -104,16 +104,15 @@ def test_it_goes_on_with_the_next_frame_and_all_keyframes_are_there_once(killed,
 
 
 def test_what_was_encoded_when_ingest_died_is_not_encoded_again(killed):
-    result, out, at_death = killed
+    result, _, at_death = killed
     before = at_death["ingest-1"]
     assert len(before) >= ENCODED_BEFORE > CREDITS * WORKERS
-    written = [
-        decode(one.topic.type, one.payload) if one.topic is PYRAMID else one for one in read_log(result.log_path)
-    ]
-    writers = [one.writer for one in written if isinstance(one, Logged) and one.topic is KEYFRAME]
+    written = list(read_log(result.log_path, (KEYFRAME, PYRAMID)))
+    writers = [one.writer for one in written if one.topic is KEYFRAME]
     assert len(set(writers)) == 2
-    begun = next(i for i, one in enumerate(written) if isinstance(one, Logged) and one.writer == writers[-1])
-    again = [one.frame_id for one in written[begun:] if isinstance(one, Pyramid) and one.frame_id in before]
+    begun = next(i for i, one in enumerate(written) if one.writer == writers[-1])
+    later = [decode(Pyramid, one.payload).frame_id for one in written[begun:] if one.topic is PYRAMID]
+    again = [frame_id for frame_id in later if frame_id in before]
     assert len(again) <= CREDITS * WORKERS  # whose word that they were done ingest may not have heard
 
 

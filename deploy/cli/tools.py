@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from rich.table import Table
 
-from prior_sg.deploy.cli.shared import Commands, add_bus, console, open_client
+from prior_sg.deploy.cli.shared import Commands, add_bus, add_log_mb, console, open_client
 from prior_sg.deploy.errors import UserError
 from prior_sg.deploy.evaluation import command as evaluation
 from prior_sg.deploy.evaluation import tune_command as tuning

@@ -4,6 +4,7 @@ import asyncio
 import os
 import sqlite3
 from contextlib import closing
+from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -183,12 +184,11 @@ def test_pace_and_size_are_no_other_settings(cfg):
 def test_a_damaged_archive_is_one_sentence_and_a_new_one(cfg, fault, caplog):
     before = Process(cfg, killed_after=6).driven()
     before.state.keeper.close()
-    path = cfg.archive_path
+    path = Path(cfg.archive_path)
     if fault == "no database":
-        with open(path, "r+b") as file:
-            file.write(os.urandom(4096))
+        path.write_bytes(os.urandom(4096) + path.read_bytes()[4096:])
     elif fault == "torn":
-        os.truncate(path, os.path.getsize(path) // 2)
+        os.truncate(path, path.stat().st_size // 2)
     else:
         with closing(sqlite3.connect(path)) as sql, sql:
             sql.execute(
@@ -202,7 +202,7 @@ def test_a_damaged_archive_is_one_sentence_and_a_new_one(cfg, fault, caplog):
 
 
 def test_a_file_of_another_program_is_left_alone(cfg, caplog):
-    os.makedirs(os.path.dirname(cfg.archive_path))
+    Path(cfg.archive_path).parent.mkdir()
     with closing(sqlite3.connect(cfg.archive_path)) as sql:
         sql.execute("CREATE TABLE theirs (x)")
     assert Process(cfg).driven().frames == list(range(12))
@@ -233,7 +233,7 @@ def test_a_full_disk_is_one_sentence_and_the_stream_goes_on(cfg, caplog):
     assert "no longer kept" in warning and "full" in warning
     (loss,) = process.progress.losses
     assert loss.what == "keyframes not kept on disk" and 0 < loss.count < 8
-    assert not os.path.exists(cfg.archive_path)
+    assert not Path(cfg.archive_path).exists()
     assert Process(cfg).driven().frames == list(range(12))
 
 
@@ -273,7 +273,7 @@ def test_a_robot_that_was_away_for_long_begins_anew(cfg, monkeypatch, caplog):
     sent = [frame(i, 100 + i, x=0.5 * i, total=0) for i in range(4)]
     monkeypatch.setattr("prior_sg.services.ingest.service.open_source", lambda path, options: robot_of(sent))
     Process(live).driven()
-    now_s = os.stat(f"{cfg.archive_path}-wal").st_mtime
+    now_s = Path(f"{cfg.archive_path}-wal").stat().st_mtime
     assert archive_file.opened(live, "tiago", lambda: now_s + 1.0)[1] is not None
     assert archive_file.opened(live, "tiago", lambda: now_s + archive_file.LIVE_GAP_S + 1.0)[1] is None
     assert "another world" in caplog.text
