@@ -5,6 +5,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+EXIT_INTERRUPTED = 130  # as shells say of a process that SIGINT has ended
 _came = threading.Event()
 
 

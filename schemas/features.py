@@ -39,6 +39,8 @@ class Backfill(Message, frozen=True, kw_only=True):
     space: str
     frame_ids: Annotated[np.ndarray, Shape("int64", "frame")]  # those it has
     settled: bool = False  # nothing has come for a while: what it lacks is not just on its way
+    epoch: Number = 0  # of the reader; 0 = it does not say
+    number: Number = 0  # among its wishes; rises
 
 
 class TextRequest(Message, frozen=True, kw_only=True):

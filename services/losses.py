@@ -25,6 +25,11 @@ class Losses:
 
     _found: dict[tuple[str, str], Loss] = field(default_factory=dict)
 
+    @staticmethod
+    def of(told: Iterable[Loss]) -> "Losses":
+        """Counts to go on with."""
+        return Losses({(loss.what, loss.reason): loss for loss in told})
+
     def add(self, what: str, text: str, *, reason: str = "", of: str = "", count: int = 1) -> None:
         """Count losses; their reason defaults to the kind of the text. `of` names the one that was lost."""
         reason = reason or kind_of(text)

@@ -30,7 +30,6 @@ MAY_GROW = {  # what is emptied by its owner, or holds one entry for each type, 
     "deploy/api/embedding.py",
     "deploy/evaluation/simulated.py",
     "deploy/running/recorder.py",
-    "deploy/viewing/live.py",
 }
 
 

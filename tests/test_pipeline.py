@@ -3,6 +3,7 @@
 import contextlib
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -370,8 +371,10 @@ def test_ctrl_c_leaves_results_and_no_processes(tmp_path):
         time.sleep(0.2)
     process.send_signal(signal.SIGINT)
     output, error = process.communicate(timeout=60)
-    assert process.returncode == 0, error
+    assert process.returncode == 130, error
     assert "interrupted: writing what there is" in output
+    told = re.search(r"interrupted: (\d+) of (\d+) keyframes were not encoded", output)
+    assert told is not None and int(told[2]) > 0 and f"{told[1]} missing" in output
     assert json.loads((tmp_path / "out" / "scene.json").read_text())["places"]
     assert summary(log)["KEYFRAME"] > 0
     left = subprocess.run(["pgrep", "-f", "--", f"--parent {process.pid}"], capture_output=True, text=True, check=False)

@@ -4,10 +4,11 @@ import argparse
 from pathlib import Path
 
 from prior_sg.deploy.cli.check import before_start
-from prior_sg.deploy.cli.shared import Commands, add_bus, add_settings, console
+from prior_sg.deploy.cli.shared import Commands, add_bus, add_log_mb, add_settings, console
 from prior_sg.deploy.cli.source_options import add_source_options, read_options, source_settings
 from prior_sg.deploy.edge import names_in
 from prior_sg.deploy.errors import UserError
+from prior_sg.deploy.interrupts import EXIT_INTERRUPTED
 from prior_sg.deploy.sample import COARSE, SAMPLE
 from prior_sg.deploy.settings import DEMO_ENVIRONMENT, DEMO_TASK
 
@@ -31,6 +32,7 @@ def add_commands(commands: Commands) -> None:
         "benchmarks do, so that labels can be scored",
     )
     add_run_options(demo)
+    add_log_mb(demo)
 
     run = commands.add(
         "run",
@@ -49,6 +51,7 @@ def add_commands(commands: Commands) -> None:
     run.add_argument("--out", type=Path, default=Path("out/run"), help="folder for the results")
     run.add_argument("--in-process", action="store_true", help="all services in this process, for debugging")
     add_run_options(run)
+    add_log_mb(run)
     add_source_options(run)
 
 
@@ -132,11 +135,16 @@ def cmd_run(arguments: argparse.Namespace) -> int:
         settings=settings_of(arguments),
         config=arguments.config,
         in_process=getattr(arguments, "in_process", False),
+        log_mb=arguments.log_mb,
         on_started=lambda endpoint, pids: console.print(
             f"{len(pids)} service processes: " + ", ".join(f"{name} {pid}" for name, pid in sorted(pids.items()))
         ),
     )
     result = run(job, console)
     report.write(result, job.out, beside.regions, console, beside.objects)
+    if result.interrupted:
+        counts = result.counts
+        console.print(f"interrupted: {counts.not_encoded} of {len(counts.keyframes)} keyframes were not encoded")
+        return EXIT_INTERRUPTED
     check_mapped(result, arguments.source)
     return 0

@@ -99,7 +99,7 @@ def cmd_up(arguments: argparse.Namespace) -> int:
 
 def _stay_up(arguments: argparse.Namespace, names: list[str]) -> int:
     from prior_sg.deploy.keys.routing import beyond_this_host
-    from prior_sg.deploy.running.job import require_files
+    from prior_sg.deploy.running.job import KEYFRAMES, require_files
     from prior_sg.deploy.running.roll import Roll
     from prior_sg.deploy.running.supervisor import Supervisor
     from prior_sg.deploy.running.swaps import RouterHere, Swaps
@@ -113,7 +113,11 @@ def _stay_up(arguments: argparse.Namespace, names: list[str]) -> int:
         raise UserError(f"these keys are of {own.name}, which writes nothing of {arguments.robot}; use --robot")
     if beyond is not None and arguments.no_router:
         raise UserError("--listen and --join are of the router that `up` starts; leave out --no-router")
-    settings = [f"scene_store.path={arguments.out / 'scene.sqlite'}", f"ingest.speed={arguments.speed}"]
+    settings = [
+        f"scene_store.path={arguments.out / 'scene.sqlite'}",
+        f"ingest.archive_path={arguments.out / KEYFRAMES}",
+        f"ingest.speed={arguments.speed}",
+    ]
     if arguments.source:
         if not is_live(arguments.source):  # a robot may come later, through the router that is started here
             before_start(arguments.source, read_options(arguments), console)

@@ -61,7 +61,7 @@ def build_parser() -> argparse.ArgumentParser:
 
 def main(argv: list[str] | None = None) -> int:
     """Exit status of the command; faults of the user or the system are one sentence on standard error."""
-    from prior_sg.deploy.interrupts import remembered
+    from prior_sg.deploy.interrupts import EXIT_INTERRUPTED, remembered
 
     try:
         with remembered():
@@ -71,7 +71,7 @@ def main(argv: list[str] | None = None) -> int:
         return 1
     except KeyboardInterrupt:
         print("prior-sg: interrupted", file=sys.stderr)
-        return 130
+        return EXIT_INTERRUPTED
 
 
 def _told(argv: list[str] | None) -> int:

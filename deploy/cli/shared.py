@@ -2,6 +2,7 @@
 
 import argparse
 import contextlib
+import math
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -74,6 +75,20 @@ def add_settings(parser: argparse.ArgumentParser) -> None:
     """Options that change the services' settings."""
     parser.add_argument("--config", default="", help="TOML file with a section per service")
     parser.add_argument("--set", action="append", default=[], metavar="SERVICE.FIELD=VALUE", help="one setting")
+
+
+def add_log_mb(parser: argparse.ArgumentParser) -> None:
+    """An option of whatever records a log."""
+    parser.add_argument(
+        "--log-mb", type=_not_negative, default=0.0, help="end the recording at this size; 0 = never (default)"
+    )
+
+
+def _not_negative(text: str) -> float:
+    number = float(text)
+    if not 0 <= number < math.inf:
+        raise argparse.ArgumentTypeError("must be a number from 0 on")
+    return number
 
 
 def open_client(connect: str) -> "BusClient":

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from rich.table import Table
 
-from prior_sg.deploy.cli.shared import Commands, add_bus, console, open_client
+from prior_sg.deploy.cli.shared import Commands, add_bus, add_log_mb, console, open_client
 from prior_sg.deploy.errors import UserError
 from prior_sg.deploy.evaluation import command as evaluation
 from prior_sg.deploy.evaluation import tune_command as tuning
@@ -46,6 +46,7 @@ def _add_logs(commands: Commands) -> None:
     )
     record.add_argument("log", type=Path)
     record.add_argument("--seconds", type=float, default=0.0, help="stop after this long; 0 = at Ctrl-C")
+    add_log_mb(record)
     add_bus(record, robot=False)
 
     replay = commands.add(
@@ -141,7 +142,7 @@ def cmd_record(arguments: argparse.Namespace) -> int:
     from prior_sg.deploy.running.recorder import Recorder
 
     with open_client(arguments.connect) as client:
-        recorder = Recorder(client, arguments.log)
+        recorder = Recorder(client, arguments.log, arguments.log_mb)
         end_s = time.monotonic() + (arguments.seconds or float("inf"))
         try:
             with console.status("recording; Ctrl-C stops") as status:
@@ -156,6 +157,8 @@ def cmd_record(arguments: argparse.Namespace) -> int:
         finally:
             recorder.close()
     console.print(f"{sum(recorder.counts.values())} messages: {arguments.log}")
+    if recorder.lacks:
+        console.print(recorder.lacks)
     return 0
 
 

@@ -4,6 +4,7 @@ import argparse
 import math
 import multiprocessing
 import os
+import signal
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
@@ -259,11 +260,17 @@ def in_parallel(
 ) -> "list[Judged]":
     """Each dataset judged in one of several processes, which start anew: compiled code and threads do not fork."""
     asked = argparse.Namespace(**{name: value for name, value in vars(arguments).items() if name != "run"})
-    with ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")) as pool:
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(jobs, context, signal.signal, (signal.SIGINT, signal.SIG_IGN)) as pool:
         futures = [pool.submit(judge, asked, dataset) for dataset in datasets]
-        for done, _ in enumerate(as_completed(futures)):
-            report(f"{jobs} datasets at a time", done + 1, len(datasets))
-        return [future.result() for future in futures]
+        try:
+            for done, _ in enumerate(as_completed(futures)):
+                report(f"{jobs} datasets at a time", done + 1, len(datasets))
+            return [future.result() for future in futures]
+        except KeyboardInterrupt:  # the processes do not hear of it: each would tell it as a fault of its own
+            for process in multiprocessing.active_children():
+                process.kill()
+            raise
 
 
 def judge_one(arguments: argparse.Namespace, dataset: "Dataset") -> "Part":

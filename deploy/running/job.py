@@ -48,6 +48,7 @@ START_TIMEOUT_S = 180.0
 PRIOR_TIMEOUT_S = 900.0  # a model may need minutes
 POLL_S = 0.1
 STALL_AFTER_S = 120.0
+KEYFRAMES = "keyframes.sqlite"  # below the output folder: what ingest needs to go on where it was
 
 
 class RunError(UserError):
@@ -70,6 +71,7 @@ class Job:
     settings: list[str] = field(default_factory=list)
     config: str = ""
     in_process: bool = False  # all services in this process on the local bus
+    log_mb: float = 0.0  # to which log.mcap may grow; 0 = without limit
     on_started: Callable[[str, dict[str, int]], None] = lambda endpoint, pids: None
 
     def __post_init__(self) -> None:
@@ -89,6 +91,7 @@ class Result:
     seconds: float
     prior: Prior  # that the task got when it was given
     losses: list[Loss]  # what could not be used, of all services, most frequent first
+    interrupted: bool = False  # by the user, before the end of the source or while the rest was being encoded
 
     @property
     def loss_lines(self) -> list[str]:
@@ -124,11 +127,16 @@ class Counts:
             case RegionDelta():
                 self.regions = message
 
+    @property
+    def not_encoded(self) -> int:
+        """Keyframes without a pyramid."""
+        return len(self.keyframes - set(self.pyramids))
+
     def encoded_summary(self) -> str:
         """One line about exactly-once encoding."""
         repeated = sum(count - 1 for count in self.pyramids.values())
-        missing = len(self.keyframes - set(self.pyramids))
-        return f"{len(self.keyframes)} keyframes, {len(self.pyramids)} encoded, {repeated} repeated, {missing} missing"
+        made = f"{len(self.keyframes)} keyframes, {len(self.pyramids)} encoded"
+        return f"{made}, {repeated} repeated, {self.not_encoded} missing"
 
 
 def make_folder(path: Path) -> None:
@@ -175,10 +183,11 @@ def run(job: Job, console: Terminal) -> Result:
 
 def _run_in_folder(job: Job, console: Terminal) -> Result:
     database = job.out / "scene.sqlite"
-    for leftover in job.out.glob("scene.sqlite*"):
+    for leftover in (*job.out.glob("scene.sqlite*"), *job.out.glob(f"{KEYFRAMES}*")):
         leftover.unlink()
     settings = [
         f"scene_store.path={database}",
+        f"ingest.archive_path={job.out / KEYFRAMES}",
         f"ingest.source={job.source}",
         f"ingest.speed={job.speed}",
         *job.settings,
@@ -203,7 +212,7 @@ def _run_in_folder(job: Job, console: Terminal) -> Result:
 def _run_on(bus: Bus, supervisor: "Supervisor | InProcess", job: Job, console: Terminal) -> Result:
     started_s = time.monotonic()
     with BusClient(bus) as client:
-        recorder = Recorder(client, job.out / "log.mcap")
+        recorder = Recorder(client, job.out / "log.mcap", job.log_mb)
         with contextlib.ExitStack() as ending:  # all of it, whatever fails or is interrupted on the way
             ending.callback(recorder.close)
             ending.callback(supervisor.stop)
@@ -243,7 +252,7 @@ class Run:
             progress.console.print(f"prior: {prior.provenance.source}, {prior.provenance.note}")
             self._start(["ingest"])  # last: the stream must not begin before its readers stand
             self.job.on_started(self.supervisor.connect, self.supervisor.pids())
-            self._follow(progress, bar)
+            interrupted = self._follow(progress, bar)
             progress.update(bar, description="reading the scene")
             scene = self.client.ask(SCENE, SceneRequest(robot=self.job.robot), 30.0)
             voxels = self.client.ask(VOXEL_MAP, MapRequest(robot=self.job.robot), 30.0)
@@ -251,8 +260,10 @@ class Run:
         self.recorder.attachments["scene.msgpack"] = ("application/msgpack", encode(scene))
         self.recorder.attachments["voxels.msgpack"] = ("application/msgpack", encode(voxels))
         self.recorder.attachments["losses.json"] = ("application/json", msgspec.json.encode(losses))
+        if lacks := self.recorder.lacks:
+            self.console.print(lacks)
         seconds = time.monotonic() - started_s
-        return Result(scene, voxels, self.job.out / "log.mcap", self.counts, seconds, prior, losses)
+        return Result(scene, voxels, self.job.out / "log.mcap", self.counts, seconds, prior, losses, interrupted)
 
     def _losses(self) -> list[Loss]:
         """What the services of this run could not use; one that does not answer says nothing, and that is said."""
@@ -315,8 +326,8 @@ class Run:
         except NoPriorError as error:
             raise RunError(str(error)) from error
 
-    def _follow(self, progress: Progress, bar: TaskID) -> None:
-        """Show progress until the source has ended and everything has settled, or the user interrupts."""
+    def _follow(self, progress: Progress, bar: TaskID) -> bool:
+        """Show progress until the source has ended and everything has settled; True when the user interrupts that."""
         finished, moved_s, last = False, time.monotonic(), (0, 0)
         while not (finished and self.settling.settled(QUIET_S)):
             for event in self.supervisor.check():
@@ -328,16 +339,17 @@ class Run:
                     last, moved_s = (state.frames_read, state.encoded), time.monotonic()
             progress.update(bar, description=_description(self.counts, finished))
             if self.interrupted.is_set():
-                progress.console.print("interrupted: writing what there is")
-                return
+                progress.console.print("interrupted: writing what there is; Ctrl-C again ends at once")
+                return True
             if time.monotonic() - max(moved_s, self.settling.changed_s) > STALL_AFTER_S:
                 said = f"nothing has moved for {STALL_AFTER_S:.0f} s; see the logs in {self.supervisor.log_folder}"
                 if not finished:
                     raise RunError(said)
                 progress.console.print(f"{said}; writing what there is")
-                return
+                return False
             self.recorder.check()
             time.sleep(POLL_S)
+        return False
 
 
 def _description(counts: Counts, finished: bool) -> str:

@@ -1,10 +1,14 @@
-"""Records every recorded topic of all robots into one log, and knows how far its readers are."""
+"""Records every recorded topic of all robots into one log, and knows how far its readers are.
+
+What arrives faster than it can be written waits, up to `MOST_WAITING_BYTES`; then whoever publishes is held back, for
+the bus gives nothing more to this process. A disk that takes nothing for `STUCK_S` holds nobody up any longer: what
+comes meanwhile is left out, and counted.
+"""
 
 import math
-import queue
 import threading
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable
 from pathlib import Path
 
@@ -17,32 +21,93 @@ from prior_sg.services.runtime.client import BusClient
 from prior_sg.services.runtime.record import LogError, LogWriter
 
 FLUSH_S = 1.0
+MOST_WAITING_BYTES = 256_000_000  # of messages not written yet
+STUCK_S = 10.0
 REST_S = 1.5  # without inputs, until the segmenter rests, adapts to the whole map, and settles
 TICKS_AFTER = {service.name: math.ceil(REST_S / service.tick_s) for service in SERVICES if service.tick_s is not None}
 Tap = Callable[[Sample, Message], None]
 
 
-class Recorder:
-    """Subscribes at once; writes on its own thread until `close`. `taps` see every valid message on that thread."""
+class Waiting:
+    """Samples on their way to one writer, in order. Who puts one waits while there are too many, unless the writer has
+    taken none for a while: then it is left out.
+    """
 
-    def __init__(self, client: BusClient, path: Path) -> None:
+    def __init__(self, most_bytes: int = MOST_WAITING_BYTES, stuck_s: float = STUCK_S) -> None:
+        self._most_bytes, self._stuck_s = most_bytes, stuck_s
+        self._changed = threading.Condition()
+        self._samples: deque[Sample] = deque()
+        self._bytes = 0
+        self._taken_s = time.monotonic()
+        self._closed = False
+        self.left_out = 0
+
+    def put(self, sample: Sample) -> None:
+        """Add a sample; after `close` there is no more to add."""
+        with self._changed:
+            if not self._samples:
+                self._taken_s = time.monotonic()  # nothing to take is no sign of a writer that is stuck
+            while not self._closed and self._samples and self._bytes + len(sample.payload) > self._most_bytes:
+                left_s = self._taken_s + self._stuck_s - time.monotonic()
+                if left_s <= 0:
+                    self.left_out += 1
+                    return
+                self._changed.wait(left_s)
+            if not self._closed:
+                self._samples.append(sample)
+                self._bytes += len(sample.payload)
+                self._changed.notify_all()
+
+    def take(self, timeout_s: float) -> Sample | None:
+        """The oldest sample; None when none has come for so long, or when all are taken and it is closed."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._samples or self._closed, timeout_s)
+            if not self._samples:
+                return None
+            sample = self._samples.popleft()
+            self._bytes -= len(sample.payload)
+            self._taken_s = time.monotonic()
+            self._changed.notify_all()
+            return sample
+
+    def close(self) -> None:
+        """Take nothing more in."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+
+    @property
+    def ended(self) -> bool:
+        """Closed, and all taken."""
+        return self._closed and not self._samples
+
+
+class Recorder:
+    """Subscribes at once; writes on its own thread until `close`. `taps` see every valid message on that thread.
+
+    With `limit_mb`, recording ends when the log has grown to so much; 0 = it does not. The taps go on.
+    """
+
+    def __init__(self, client: BusClient, path: Path, limit_mb: float = 0.0) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
+        self._path, self._limit_bytes = path, limit_mb * 1e6
         self._log = LogWriter(path)
         self.taps: list[Tap] = []
         self.counts: Counter[str] = Counter()
         self.malformed: Counter[str] = Counter()
+        self.beyond = 0  # messages that came when the log was full
         self.attachments: dict[str, tuple[str, bytes]] = {}  # name: media type and content, written at the end
         self.error: LogError | None = None
-        self._queue: queue.SimpleQueue[Sample | None] = queue.SimpleQueue()
+        self._waiting = Waiting()
         self._thread = threading.Thread(target=self._write, name="recorder", daemon=True)
         self._thread.start()
         for topic in TOPICS:
             if topic.recorded:
-                client.listen(topic, "*", self._queue.put)
+                client.listen(topic, "*", self._waiting.put)
 
     def close(self) -> None:
         """Write what has arrived, then finish the file. Raises LogError when something could not be written."""
-        self._queue.put(None)
+        self._waiting.close()
         self._thread.join()
         self.check()
         for name, (media_type, data) in self.attachments.items():
@@ -54,24 +119,26 @@ class Recorder:
         if self.error is not None:
             raise self.error
 
+    @property
+    def lacks(self) -> str:
+        """What the log lacks, as a sentence; empty when it holds everything."""
+        if self._waiting.left_out:
+            return f"{self._path} lacks {self._waiting.left_out} messages: the disk took nothing for {STUCK_S:.0f} s"
+        if self.beyond:
+            return f"{self._path} lacks the last {self.beyond} messages: it has grown to {self._limit_bytes / 1e6:g} MB"
+        return ""
+
     def _write(self) -> None:
         """Until the end, or until the log cannot be written (a full disk); the taps go on seeing what arrives."""
-        while True:
+        while not self._waiting.ended:
             try:
-                sample = self._next()
-                if sample is None:
-                    return
-                self._add(sample)
+                sample = self._waiting.take(FLUSH_S)
+                if sample is not None:
+                    self._add(sample)
+                elif self.error is None:
+                    self._log.flush()
             except LogError as error:
                 self.error = self.error or error
-
-    def _next(self) -> Sample | None:
-        while True:
-            try:
-                return self._queue.get(timeout=FLUSH_S)
-            except queue.Empty:
-                if self.error is None:
-                    self._log.flush()
 
     def _add(self, sample: Sample) -> None:
         """Record what is valid; what is not never reached any service's state either."""
@@ -80,9 +147,12 @@ class Recorder:
         except DecodeError:
             self.malformed[sample.topic.name] += 1
             return
-        self.counts[sample.topic.name] += 1
         for tap in self.taps:
             tap(sample, message)
+        if self._limit_bytes and self._log.size_bytes >= self._limit_bytes:
+            self.beyond += 1
+            return
+        self.counts[sample.topic.name] += 1
         if sample.writer and self.error is None:
             self._log.add(
                 sample.topic, sample.key, sample.payload, sample.writer, sample.sequence, sample.sent_ns, time.time_ns()

@@ -233,18 +233,28 @@ class Supervisor:
         return events
 
     def stop(self) -> None:
-        """Ask every process to end, in order; kill what does not."""
+        """Ask every process to end, in order; kill what does not, and all of them when this is interrupted."""
         for child in self.children:
             if child.process is not None and child.process.poll() is None:
                 child.process.send_signal(signal.SIGTERM)
         deadline_s = time.monotonic() + STOP_TIMEOUT_S
-        for child in self.children:
-            if child.process is not None:
-                try:
-                    child.process.wait(max(0.1, deadline_s - time.monotonic()))
-                except subprocess.TimeoutExpired:
-                    child.process.kill()
-                    child.process.wait()
+        try:
+            for child in self.children:
+                if child.process is not None:
+                    _wait(child.process, max(0.1, deadline_s - time.monotonic()))
+        except KeyboardInterrupt:
+            for child in self.children:
+                child.kill()
+            raise
+
+
+def _wait(process: subprocess.Popen, timeout_s: float) -> None:
+    """Wait for an end; kill what has not ended by then."""
+    try:
+        process.wait(timeout_s)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
 
 
 def _reason(code: int) -> str:

@@ -1,7 +1,10 @@
-"""A running system: its scene as the store has it, its images as they arrive."""
+"""A running system: its scene as the store has it, its images as they arrive.
+
+Images that come faster than they can be drawn wait, the newest of them; the others are fetched from ingest's archive
+when there is time, as those from before the page was opened are.
+"""
 
 import contextlib
-import queue
 import threading
 import time
 from collections import deque
@@ -27,7 +30,37 @@ from prior_sg.services.runtime.client import BusClient
 
 MOST_REVISIONS = 1000  # that the slider goes back
 MOST_CAMERAS = 2000
+MOST_IMAGES = 64  # that wait to be drawn
+IDLE_S = 0.5  # without images, before those that were left out are fetched
 TASK_WAIT_S = 300.0  # a language model may take minutes
+
+
+class Images:
+    """The newest keyframes that wait; `lacks` says that others exist: those before the first, and those left out."""
+
+    def __init__(self) -> None:
+        self._changed = threading.Condition()
+        self._samples: deque[Sample] = deque(maxlen=MOST_IMAGES)
+        self.lacks, self.closed = True, False
+
+    def put(self, sample: Sample) -> None:
+        """Add one, in place of the oldest where there are too many."""
+        with self._changed:
+            self.lacks |= len(self._samples) == MOST_IMAGES
+            self._samples.append(sample)
+            self._changed.notify()
+
+    def take(self, timeout_s: float) -> Sample | None:
+        """The oldest; None when none has come in time, or it is closed."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._samples or self.closed, timeout_s)
+            return self._samples.popleft() if self._samples and not self.closed else None
+
+    def close(self) -> None:
+        """Wait for nothing more."""
+        with self._changed:
+            self.closed = True
+            self._changed.notify()
 
 
 class Live:
@@ -42,14 +75,15 @@ class Live:
         self._revisions: list[StoredRevision] = []
         self._cameras: deque[Camera] = deque(maxlen=MOST_CAMERAS)
         self._poses = PoseCorrections()
-        self._samples: queue.SimpleQueue[Sample | ArchiveReply | None] = queue.SimpleQueue()
+        self._images = Images()
+        self._archived_until = 0  # number of the first keyframe that was not fetched from the archive
+        self._drawing = threading.Lock()  # of the cloud and the poses
         self._changed = threading.Event()
         changes = self._client.changes()
         threading.Thread(target=self._follow, args=(changes,), name="changes", daemon=True).start()
         threading.Thread(target=self._read_images, name="images", daemon=True).start()
-        for topic in (KEYFRAME, POSE_UPDATE):
-            self._bus.listen(topic, robot, self._samples.put)
-        threading.Thread(target=self._read_archive, name="archive", daemon=True).start()
+        self._bus.listen(KEYFRAME, robot, self._images.put)
+        self._bus.listen(POSE_UPDATE, robot, self._correct)
 
     def _follow(self, changes: Changes) -> None:
         for _ in changes:
@@ -60,39 +94,49 @@ class Live:
         self._changed.clear()
         return changed
 
-    def _read_archive(self) -> None:
-        """Images from before the page was opened, as far as they are kept."""
-        first = 0
-        with contextlib.suppress(BusError):  # no ingest, no images
-            while True:
-                reply: ArchiveReply = self._bus.ask(ARCHIVE, ArchiveRequest(robot=self.robot, first_frame_id=first))
-                if not reply.keyframes:
-                    return
-                self._samples.put(reply)
-                first = reply.keyframes[-1].frame_id + 1
+    def _correct(self, sample: Sample) -> None:
+        with contextlib.suppress(DecodeError, InputRefused), self._drawing:  # no service takes it either
+            self.cloud.move(self._poses.take(decode(PoseUpdate, sample.payload)) or {})
+        self._changed.set()
 
     def _read_images(self) -> None:
-        while (arrived := self._samples.get()) is not None:
-            with contextlib.suppress(DecodeError, InputRefused):  # no service takes it either
-                if isinstance(arrived, ArchiveReply):
-                    for keyframe in arrived.keyframes:
-                        self._take_image(keyframe)
-                else:
-                    message = decode(arrived.topic.type, arrived.payload)
-                    if isinstance(message, PoseUpdate):
-                        self.cloud.move(self._poses.take(message) or {})
-                    elif isinstance(message, Keyframe):
-                        self._take_image(message)
-            self._changed.set()
+        """Images as they come; when none does, those that the archive has and were left out."""
+        while not self._images.closed:
+            if not self._draw_next(IDLE_S) and self._images.lacks:
+                self._read_archive()
+
+    def _draw_next(self, timeout_s: float) -> bool:
+        """Draw the next image that arrives; False when none does in time."""
+        if (sample := self._images.take(timeout_s)) is None:
+            return False
+        with contextlib.suppress(DecodeError):  # no service takes it either
+            self._take_image(decode(Keyframe, sample.payload))
+        return True
+
+    def _read_archive(self) -> None:
+        """Images from before the page was opened, or before there was time, as far as they are kept."""
+        self._images.lacks = False
+        with contextlib.suppress(BusError):  # no ingest, no images
+            while not self._images.closed:
+                request = ArchiveRequest(robot=self.robot, first_frame_id=self._archived_until)
+                reply: ArchiveReply = self._bus.ask(ARCHIVE, request)
+                if not reply.keyframes:
+                    return
+                for keyframe in reply.keyframes:
+                    self._take_image(keyframe)
+                self._archived_until = reply.keyframes[-1].frame_id + 1
+                while self._draw_next(0.0):
+                    continue
 
     def _take_image(self, keyframe: Keyframe) -> None:
         if keyframe.frame_id in self.cloud:
             return
-        pose = self._poses.pose(keyframe.frame_id, keyframe.world_from_camera)
-        with contextlib.suppress(ImageFault):  # the map has refused such a keyframe, too
+        with contextlib.suppress(ImageFault), self._drawing:  # the map has refused such a keyframe, too
+            pose = self._poses.pose(keyframe.frame_id, keyframe.world_from_camera)
             frame = msgspec.structs.replace(keyframe, world_from_camera=pose)
             self.cloud.add(frame)
             self._cameras.append(camera_of(frame))
+        self._changed.set()
 
     def stamps(self) -> list[int]:
         return [revision.stamp_ns for revision in self._revisions]
@@ -133,5 +177,5 @@ class Live:
         return f"{count} regions, {switch.seconds:.1f} s after the task (with its prior {took_s:.1f} s)"
 
     def close(self) -> None:
-        self._samples.put(None)
+        self._images.close()
         self._client.close()

@@ -2,18 +2,42 @@
 
 import asyncio
 import logging
+import time
 from collections.abc import Awaitable, Iterator
 from typing import Protocol
 
+import msgspec
+
 from prior_sg.schemas.codec import Message
 from prior_sg.schemas.features import Backfill
-from prior_sg.schemas.frames import PoseUpdate
+from prior_sg.schemas.frames import Keyframe, PoseUpdate
 from prior_sg.schemas.status import JobDone, Tick
-from prior_sg.schemas.topics import ARCHIVE, BACKFILL, CAMERA_STATE, ENCODE, INGEST_STATE, KEYFRAME, POSE_UPDATE
-from prior_sg.services.ingest.core import selection
+from prior_sg.schemas.topics import (
+    ARCHIVE,
+    BACKFILL,
+    CAMERA_STATE,
+    ENCODE,
+    INGEST_STATE,
+    KEYFRAME,
+    POSE_UPDATE,
+    Topic,
+)
+from prior_sg.services.ingest import archive_file
+from prior_sg.services.ingest.core import resuming, selection
+from prior_sg.services.ingest.core.checkpoint import Checkpoint
 from prior_sg.services.ingest.core.config import Config
 from prior_sg.services.ingest.core.continuity import AHEAD_NS, Held
-from prior_sg.services.ingest.core.frames import BadFrame, Closure, Correction, EndOfSource, RawFrame, Unused
+from prior_sg.services.ingest.core.frames import (
+    BadFrame,
+    BegunAnew,
+    Closure,
+    Correction,
+    EndOfSource,
+    RawFrame,
+    Resumed,
+    Unused,
+)
+from prior_sg.services.ingest.core.keeping import keep, keep_after
 from prior_sg.services.ingest.core.options import is_live
 from prior_sg.services.ingest.sources import LastingError, Source, SourceError, open_source
 from prior_sg.services.ingest.sources.base import Event
@@ -37,12 +61,30 @@ class Port(Protocol):
 
 
 def init(cfg: Config, identity: Identity) -> selection.State:
-    """An empty state."""
-    return selection.State(robot=identity.robot, epoch=identity.epoch)
+    """An empty state, or that of the process before as far as it was kept."""
+    state = selection.State(robot=identity.robot, epoch=identity.epoch)
+    state.keeper, kept = archive_file.opened(cfg, identity.robot, time.time)
+    if kept is not None:
+        resuming.resume(state, kept, cfg)
+    return state
 
 
 def step(state: selection.State, message: Message, cfg: Config) -> Iterator[Output]:
     """Take one frame, one finished job, corrected poses, or the end of the source."""
+    could_keep = state.keeper is not None
+    for topic, told in _told(state, message, cfg):
+        if isinstance(told, Keyframe) and topic is KEYFRAME and not isinstance(message, Resumed):
+            keep(state, told)
+        yield topic, told
+    keep_after(state, message)
+    if could_keep and state.keeper is None:
+        log.warning(
+            f"keyframes are no longer kept in {cfg.archive_path}: {state.not_kept}; an ingest that dies now reads its "
+            "source from the beginning"
+        )
+
+
+def _told(state: selection.State, message: Message, cfg: Config) -> Iterator[tuple[Topic, Message]]:
     match message:
         case RawFrame():
             yield from _take(state, message, cfg)
@@ -63,6 +105,10 @@ def step(state: selection.State, message: Message, cfg: Config) -> Iterator[Outp
             yield from selection.backfill(state, message)
         case PoseUpdate():
             selection.correct(state, message)
+        case Resumed():
+            yield from resuming.tell_again(state, message.live)
+        case BegunAnew():
+            resuming.forget(state)
         case EndOfSource():
             yield from _refuse(state, state.continuity.release())
             yield from selection.end(state)
@@ -70,7 +116,7 @@ def step(state: selection.State, message: Message, cfg: Config) -> Iterator[Outp
             yield selection.progress(state)
 
 
-def _take(state: selection.State, frame: RawFrame, cfg: Config) -> Iterator[Output]:
+def _take(state: selection.State, frame: RawFrame, cfg: Config) -> Iterator[tuple[Topic, Message]]:
     verdict = selection.judge(state, frame, cfg)
     yield from _refuse(state, verdict.refused)
     if verdict.held is not None:
@@ -82,7 +128,7 @@ def _take(state: selection.State, frame: RawFrame, cfg: Config) -> Iterator[Outp
         yield from selection.accept(state, accepted, cfg)
 
 
-def _refuse(state: selection.State, refused: list[Held]) -> Iterator[Output]:
+def _refuse(state: selection.State, refused: list[Held]) -> Iterator[tuple[Topic, Message]]:
     for held in refused:
         log.warning("frame refused", extra={"frame": held.frame.frame_id, "reason": held.refusal.text})
         yield from selection.refuse(state, held)
@@ -126,7 +172,7 @@ async def _opened(port: Port, cfg: Config) -> Source | None:
 
 async def _fed(port: Port, source: Source, cfg: Config) -> bool:
     """Feed all that comes; False when the host wishes to stop before the end."""
-    events = source.events()
+    events = await _begun(port, source, await asyncio.to_thread(archive_file.left_off, cfg))
     pace = Pace(cfg.speed)
     while (event := await asyncio.to_thread(next, events, None)) is not None:
         if source.live is None:
@@ -137,6 +183,29 @@ async def _fed(port: Port, source: Source, cfg: Config) -> bool:
                 return False
         await port.consume(event)
     return not port.stopping.is_set()
+
+
+async def _begun(port: Port, source: Source, left: Checkpoint | None) -> Iterator[Event]:
+    """The source's events, from where the process before left off if it is the same source."""
+    if left is None:
+        return source.events()
+    if source.live is not None:
+        log.info("going on", extra={"keyframes": left.keyframes})
+        await port.consume(Resumed(live=True))
+        return source.events()
+    events = source.events(since=left.index)
+    found = await asyncio.to_thread(_next_frame, events)
+    if isinstance(found, RawFrame) and (found.frame_id, found.stamp_ns) == left.source_frame:
+        log.info("going on", extra={"after_frame": left.frame_id, "keyframes": left.keyframes})
+        await port.consume(Resumed(live=False))
+        return events
+    log.warning("the source is read from its beginning: it has changed since it was read", extra={"frame": left.index})
+    await port.consume(BegunAnew())
+    return source.events()
+
+
+def _next_frame(events: Iterator[Event]) -> Event | None:
+    return next((event for event in events if isinstance(event, RawFrame | BadFrame)), None)
 
 
 class Pace:
@@ -186,6 +255,11 @@ async def _stopped_while(port: Port, waiting: Awaitable[None]) -> bool:
         await asyncio.gather(*tasks, return_exceptions=True)
 
 
+def _close(state: selection.State) -> None:
+    if state.keeper is not None:
+        state.keeper.close()
+
+
 SERVICE = Service(
     name="ingest",
     purpose="reads a posed RGB-D source and selects keyframes",
@@ -198,6 +272,8 @@ SERVICE = Service(
     answers={ARCHIVE: selection.archived},
     drive=drive,
     losses=selection.losses,
+    close=_close,
+    replay_config=lambda cfg: msgspec.structs.replace(cfg, archive_path=""),
     job_limit=lambda cfg: cfg.window if _keeps_pace(cfg) else 0,
     tick_s=PROGRESS_S,
 )

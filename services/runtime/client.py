@@ -31,7 +31,9 @@ from prior_sg.services.runtime.host.lease import Standing, standing
 
 R = TypeVar("R", bound=Message)
 POLL_S = 0.5
+NOBODY = "nobody"  # the reason of a call that found no server
 STAMP_TIMEOUT_S = 2.0
+STAMP_TRIES = 5  # of a store that is there and busy
 PATIENT_POLLS = 4
 ALIVE_TIMEOUT_S = 2.0
 
@@ -46,6 +48,10 @@ class OnTheRoll(NamedTuple):
 
 class NoPriorError(PriorSgError):
     """The task has no prior; the message is the gateway's reason."""
+
+
+class NobodyError(BusError):
+    """Nobody is there who answers this question."""
 
 
 class BusClient:
@@ -104,20 +110,31 @@ class BusClient:
             raise BusError(f"{name}: no answer within {timeout_s:.0f} s; is the service running (`prior-sg health`)?")
         answer = answers[0]
         if answer.payload is None:
-            raise BusError(f"{name}: {_explain(answer.reason)}")
+            kind = NobodyError if answer.reason == NOBODY else BusError
+            raise kind(f"{name}: {_explain(answer.reason)}")
         try:
             return decode(reply_type, answer.payload)
         except DecodeError as error:
             raise BusError(f"{name}: the answer is not valid: {error}") from error
 
     def task_stamp_ns(self, robot: str) -> int:
-        """The stamp of a task given now: after the one in force, whatever the clock of the host that gave it said."""
-        now_ns = time.time_ns()
-        try:
-            known: TaskInForce = self.ask(TASK_IN_FORCE, TaskRequest(robot=robot), STAMP_TIMEOUT_S)
-        except BusError:  # no store is there that knows of one
-            return now_ns
-        return now_ns if known.task is None else max(now_ns, known.task.stamp_ns + 1)
+        """The stamp of a task given now: after the one in force, whatever the clock of the host that gave it said.
+
+        A busy store is asked again: a task stamped by the clock alone may come before the one in force, and nobody
+        would follow it. Raises BusError when it stays busy.
+        """
+        tries = 1
+        while True:
+            try:
+                known: TaskInForce = self.ask(TASK_IN_FORCE, TaskRequest(robot=robot), STAMP_TIMEOUT_S)
+            except NobodyError:  # no store is there that knows of one
+                return time.time_ns()
+            except BusError:
+                if tries >= STAMP_TRIES:
+                    raise
+                tries += 1
+            else:
+                return time.time_ns() if known.task is None else max(time.time_ns(), known.task.stamp_ns + 1)
 
     def give_task(self, task: Task, timeout_s: float, waiting: Callable[[str], None] = lambda reason: None) -> Prior:
         """Publish a task and wait for the prior that answers it; a model may take minutes, and `waiting` is told why
@@ -196,6 +213,6 @@ class BusClient:
 
 
 def _explain(reason: str) -> str:
-    if reason == "nobody":
+    if reason == NOBODY:
         return "nobody answers; is the service running (`prior-sg health`)?"
     return "no answer in time; the service is busy or hangs" if reason == "timeout" else reason

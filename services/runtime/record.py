@@ -126,6 +126,11 @@ class LogWriter:
             self._writer.flush()  # type: ignore[no-untyped-call]
             self._end = self._file.tell()
 
+    @property
+    def size_bytes(self) -> int:
+        """What is in the file so far; what waits for a chunk to fill is not."""
+        return self._end
+
     def close(self) -> None:
         """Write the index and close the file; closing twice does nothing."""
         if not self._file.closed:

@@ -245,7 +245,7 @@ EXAMPLES: list[Message] = [
         surface_m=f4([1, 2, 3], [4, 5, 6]),
         crops_total=5,
     ),
-    features.Backfill(robot="r", space="s", frame_ids=i8(1, 2), settled=True),
+    features.Backfill(robot="r", space="s", frame_ids=i8(1, 2), settled=True, epoch=3, number=4),
     features.TextRequest(space="s", concepts=[["a", "b"], ["c"]]),
     features.TextEmbeddings(
         space="s",

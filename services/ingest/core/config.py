@@ -24,6 +24,7 @@ class Config(ReadOptions, frozen=True, kw_only=True):
     max_interval_s: float = 2.0  # the same for time, so that a resting camera still reports; 0 = never
     max_speed_m_s: float = 10.0  # faster camera motion is a jump of the tracker, and refused; 0 = believe everything
     archive_mb: float = 256.0  # compressed keyframes kept for ARCHIVE, oldest dropped first
+    archive_path: str = ""  # file that keeps them beyond the end of the process; empty = none does
 
     def __post_init__(self) -> None:
         super().__post_init__()

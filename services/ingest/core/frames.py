@@ -73,6 +73,16 @@ class Closure(Message, frozen=True, kw_only=True):
         check_pose(self.after_from_before)
 
 
+class Resumed(Message, frozen=True, kw_only=True):
+    """The source goes on where a process that was killed had read it."""
+
+    live: bool
+
+
+class BegunAnew(Message, frozen=True, kw_only=True):
+    """The source is read from its beginning, although something was kept: that was of another one."""
+
+
 class EndOfSource(Message, frozen=True, kw_only=True):
     """Every frame of the source has been handed over."""
 

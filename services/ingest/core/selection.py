@@ -28,6 +28,7 @@ from prior_sg.schemas.status import JobDone, Loss
 from prior_sg.schemas.topics import CAMERA_STATE, ENCODE, INGEST_STATE, KEYFRAME, POSE_UPDATE, Topic
 from prior_sg.services.geometry import inverse, rotation_angle_rad
 from prior_sg.services.ingest.core.archive import KeyframeArchive
+from prior_sg.services.ingest.core.checkpoint import Checkpoint, Keeper
 from prior_sg.services.ingest.core.closures import spread
 from prior_sg.services.ingest.core.config import Config
 from prior_sg.services.ingest.core.continuity import BELIEVED_AFTER, POSES_JUMP, Continuity, Held, Refusal, reachable
@@ -46,6 +47,7 @@ class State:
     epoch: int = 0
     last: View | None = None  # newest frame believed
     cameras: dict[str, "Camera"] = field(default_factory=dict)  # of the robot, by name
+    index: int = -1  # position in the source of the newest frame believed
     read: int = 0
     total: int = 0
     rejected: int = 0
@@ -54,11 +56,15 @@ class State:
     skipped: int = 0
     corrections: int = 0  # pose updates published
     encoding: set[int] = field(default_factory=set)  # numbers of keyframes whose job is not done
+    backfilled: tuple[int, int] = (-1, -1)  # epoch and number of the newest wish of a reader that was heard
     ended: bool = False
     trail: list[View] = field(default_factory=list)  # keyframes since the poses last jumped
     continuity: Continuity = field(default_factory=Continuity)
     losses: Losses = field(default_factory=Losses)
     archive: KeyframeArchive = field(default_factory=KeyframeArchive)
+    keeper: Keeper | None = None  # of the archive beyond the end of the process
+    checkpoint: Checkpoint | None = None  # as it would be kept
+    not_kept: str = ""  # why nothing can be kept any more; empty = it can, or is not meant to be
 
 
 @dataclass
@@ -87,7 +93,7 @@ def judge(state: State, frame: RawFrame, cfg: Config) -> Verdict:
     refusal = None if last is None else line.out_of_line(last, shifted)
     if last is None or refusal is None:
         waiting = line.release()
-        if (jump := _jump(_camera(state, shifted.camera), shifted, cfg)) is not None:
+        if (jump := _jump(camera_of(state, shifted.camera), shifted, cfg)) is not None:
             return Verdict(refused=[*waiting, Held(shifted, jump)])
         line.interval_ns = 0 if last is None else shifted.stamp_ns - last.stamp_ns
         return Verdict([shifted], waiting)
@@ -102,7 +108,7 @@ def judge(state: State, frame: RawFrame, cfg: Config) -> Verdict:
 def refuse(state: State, held: Held) -> Iterator[Written]:
     """Count a frame that `judge` refused."""
     if held.refusal.kind == POSES_JUMP:
-        _camera(state, held.frame.camera).jumped = View.of(held.frame)
+        camera_of(state, held.frame.camera).jumped = View.of(held.frame)
     _count_refused(state.losses, held)
     yield from _lose(state, held.frame.total)
 
@@ -121,8 +127,8 @@ def pass_over(state: State, unused: Unused) -> Iterator[Written]:
 
 def accept(state: State, frame: RawFrame, cfg: Config) -> Iterator[Written]:
     """Report the camera, and make the frame a keyframe when it is due."""
-    state.read, state.total = state.read + 1, frame.total
-    camera = _camera(state, frame.camera)
+    state.read, state.total, state.index = state.read + 1, frame.total, frame.index
+    camera = camera_of(state, frame.camera)
     state.last = camera.last = View.of(frame)
     camera.jumped = None
     yield (
@@ -167,7 +173,13 @@ def encoded(state: State, done: JobDone) -> Iterator[Written]:
 
 
 def backfill(state: State, wish: Backfill) -> Iterator[Written]:
-    """Encode archived keyframes again, in one space: those that the asking reader lacks. They give way to new ones."""
+    """Encode archived keyframes again, in one space: those that the asking reader lacks. They give way to new ones.
+
+    A wish that was heard before this process began comes again from its writer's cache: what it asked for is done.
+    """
+    if wish.epoch > 0 and (wish.epoch, wish.number) <= state.backfilled:
+        return
+    state.backfilled = max(state.backfilled, (wish.epoch, wish.number))
     for keyframe in state.archive.lacked(wish):
         if not keyframe.color:
             continue
@@ -191,7 +203,7 @@ def close_loop(state: State, closure: Closure) -> Iterator[Written]:
     for camera in state.cameras.values():
         camera.last = _moved(camera.last, moved) if camera.last is not None else None
     for view, pose in zip(trail, poses, strict=True):
-        _camera(state, view.camera).keyframe = replace(view, world_from_camera=pose)
+        camera_of(state, view.camera).keyframe = replace(view, world_from_camera=pose)
     ids = np.array([view.frame_id for view in trail], np.int64)
     yield from _update(state, closure.stamp_ns, ids, np.stack(poses))
 
@@ -258,7 +270,8 @@ def _update(state: State, stamp_ns: int, frame_ids: np.ndarray, world_from_camer
     state.corrections += 1
 
 
-def _camera(state: State, name: str) -> Camera:
+def camera_of(state: State, name: str) -> Camera:
+    """What is remembered of a camera, by its name."""
     return state.cameras.setdefault(name, Camera())
 
 

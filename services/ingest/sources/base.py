@@ -60,21 +60,32 @@ class Source:
     def __iter__(self) -> Iterator[RawFrame | BadFrame]:
         return self.frames()
 
-    def events(self) -> "Iterator[Event]":
-        """Frames, with each correction before the first frame of a later stamp, or at the end."""
+    def events(self, since: int = 0) -> "Iterator[Event]":
+        """Frames, with each correction before the first frame of a later stamp, or at the end; of a source that is not
+        live, those from the frame at the position `since` on."""
         if self.live is not None:
             yield from self.live()
             return
         corrections = self.corrections()
         waiting = next(corrections, None)
-        for frame in self.frames() if self.sparing is None else self.sparing():
+        for frame in self._frames_since(since):
             while waiting is not None and isinstance(frame, RawFrame) and waiting.stamp_ns < frame.stamp_ns:
-                yield waiting
+                if frame.index >= since:
+                    yield waiting
                 waiting = next(corrections, None)
-            yield frame
+            if frame.index >= since:
+                yield frame
         if waiting is not None:
             yield waiting
         yield from corrections
+
+    def _frames_since(self, since: int) -> "Iterator[RawFrame | BadFrame]":
+        """All frames, those before without images where that is cheaper."""
+        if self.sparing is not None:
+            return self.sparing()
+        if self.thinned is None or since == 0:
+            return self.frames()
+        return self.thinned(lambda index, world_from_camera: index >= since)
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,9 @@ import threading
 from collections.abc import Callable, Hashable
 from functools import partial
 
-from prior_sg.schemas.topics import Topic, job_key, worker_keys
+from prior_sg.schemas.codec import DecodeError, decode, encode
+from prior_sg.schemas.status import ServiceStatus, StatusRequest
+from prior_sg.schemas.topics import Topic, job_key, status_key, worker_keys
 from prior_sg.services.runtime.bus import Answer, Bus
 from prior_sg.services.runtime.jobs.board import Board, Ended
 from prior_sg.services.runtime.jobs.dispatcher import NO_RESULT, Job
@@ -20,6 +22,8 @@ log = logging.getLogger(__name__)
 DEFAULT_TIMEOUT_S = 60.0
 DONE = "done"
 DONE_WITH = re.compile(rb"done (\d{1,6})")
+DONE_OF_OLD = DONE.encode()  # of a release that counted no results; no longer taken from 0.2 on
+STATUS_TIMEOUT_S = 3.0
 
 
 class JobPool:
@@ -102,8 +106,22 @@ class JobPool:
             self._bus.call(key, job.payload, self._timeout_s, partial(self._answered, name, job))
 
     def _answered(self, name: str, job: Job, answer: Answer) -> None:
+        if answer.payload == DONE_OF_OLD:
+            self._ask_release(name, job)
+        else:
+            self._ended(name, job, _fault_of(answer))
+
+    def _ask_release(self, name: str, job: Job) -> None:
+        """Who says no more than that it is done is believed when it is of a release that could say no more."""
+
+        def told(answer: Answer) -> None:
+            self._ended(name, job, "" if _is_of_old(answer) else NO_RESULT)
+
+        self._bus.call(status_key("*", name), encode(StatusRequest()), STATUS_TIMEOUT_S, told)
+
+    def _ended(self, name: str, job: Job, reason: str) -> None:
         with self._lock:
-            if reason := _fault_of(answer):
+            if reason:
                 ended = self._board.failed(name, job.id, reason, self._clock_s())
             else:
                 ended = self._board.finished(name, job.id, self._clock_s())
@@ -138,6 +156,14 @@ class JobPool:
 def done(results: int) -> bytes:
     """The answer of a worker that has done a job and published so many results of it."""
     return f"{DONE} {results}".encode()
+
+
+def _is_of_old(answer: Answer) -> bool:
+    """Whether a status is of a process that does not know its release, as none did that counted no results."""
+    try:
+        return answer.payload is not None and not decode(ServiceStatus, answer.payload).release
+    except DecodeError:
+        return False
 
 
 def _fault_of(answer: Answer) -> str:

@@ -65,7 +65,8 @@ def take(state: State, message: Message, cfg: Config) -> Iterator[Message]:
             state.aim.tick()
             handover.tick(state.seen.spaces)
             if not state.catching_up.stands_by:
-                yield from handover.questions(state.seen.spaces, state.seen.archive, state.robot, cfg.spaces)
+                seen = state.seen
+                yield from handover.questions(seen.spaces, seen.archive, state.robot, state.epoch, cfg.spaces)
             yield from follow_spaces(state, cfg)
         case Evidence():
             yield from take_evidence(state, message, cfg)

@@ -20,10 +20,27 @@ from prior_sg.deploy.cli.main import main
 from prior_sg.deploy.running import job
 from prior_sg.deploy.running.job import RunError, claimed_folder
 from prior_sg.deploy.running.supervisor import Child, ChildFailed, Supervisor
+from prior_sg.deploy.sample import SAMPLE
 from prior_sg.services.runtime.endpoints import free_endpoint
 
 COMMAND = [sys.executable, "-m", "prior_sg.deploy.cli.main"]
 ENVIRONMENT = os.environ | {"PYTHONPATH": str(Path(prior_sg.__file__).parents[1])}
+
+
+BEGUN = "import sys; from prior_sg.deploy.cli.main import main; print('begun', flush=True); sys.exit(main())"
+
+
+def begun(*arguments):
+    """A command that has got as far as our own code: what the interpreter says before that is not ours."""
+    process = subprocess.Popen(
+        [sys.executable, "-c", BEGUN, *arguments],
+        env=ENVIRONMENT,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+    assert process.stdout.readline() == "begun\n"
+    return process
 
 
 def started(*arguments, **options):
@@ -40,14 +57,47 @@ def test_a_folder_is_one_runs_at_a_time(tmp_path):
         assert list((tmp_path / "out").iterdir()) == []
 
 
-@pytest.mark.parametrize("delay_s", [0.3, 0.8, 1.5, 3.0])
-def test_an_interrupt_at_any_moment_is_told_in_a_line(tmp_path, delay_s):
-    process = started("up", "scene_store", "--out", str(tmp_path), "--connect", free_endpoint("tcp/127.0.0.1:0"))
+RUN = ("run", str(SAMPLE), "--environment", "residential home", "--task", "tidy up", "--out", "{out}")
+BENCH = ("bench", "segmenter")
+EVAL = ("eval", "world:station:0,1", "--encoder", "sim:0.5", "--jobs", "2", "--out", "{out}")
+
+
+@pytest.mark.parametrize(
+    ("command", "delay_s"),
+    [
+        (("up", "scene_store", "--out", "{out}"), 0.3),
+        (("up", "scene_store", "--out", "{out}"), 1.5),
+        (RUN, 0.5),
+        (RUN, 1.5),
+        (RUN, 3.0),
+        (("check", str(SAMPLE)), 0.5),
+        (BENCH, 1.5),
+        (EVAL, 1.5),
+    ],
+    ids=lambda value: value[0] if isinstance(value, tuple) else str(value),
+)
+def test_an_interrupt_at_any_moment_is_told_in_a_line(tmp_path, command, delay_s):
+    where = ("--connect", free_endpoint("tcp/127.0.0.1:0")) if command[0] in ("up", "run") else ()
+    process = begun(*(word.format(out=tmp_path) for word in command), *where)
     time.sleep(delay_s)
     process.send_signal(signal.SIGINT)
-    said, _ = process.communicate(timeout=60)
+    said, _ = process.communicate(timeout=120)
     assert "Traceback" not in said
-    assert process.returncode in (0, 130, -signal.SIGINT)
+    assert process.returncode in ((0, 130, -signal.SIGINT) if command[0] == "up" else (130, -signal.SIGINT))
+
+
+def test_a_second_interrupt_ends_processes_that_do_not_end_by_themselves(tmp_path):
+    supervisor = Supervisor("tcp/127.0.0.1:1", "ada", tmp_path)
+    for number in range(2):
+        child = Child("segmenter", f"segmenter-{number}", [], tmp_path / "log", 1)
+        child.process = subprocess.Popen(["/bin/sh", "-c", "trap '' TERM; echo; while :; do sleep 1; done"], stdout=-1)
+        assert child.process.stdout.readline() == b"\n"  # it will not hear SIGTERM
+        supervisor.children.append(child)
+    threading.Timer(0.2, signal.raise_signal, (signal.SIGINT,)).start()
+    with interrupts.remembered(), pytest.raises(KeyboardInterrupt):
+        supervisor.stop()
+    for child in supervisor.children:
+        assert child.process.wait(20) == -signal.SIGKILL
 
 
 def test_an_interrupt_that_an_import_swallowed_still_ends_the_run():

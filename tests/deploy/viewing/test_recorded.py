@@ -1,20 +1,22 @@
+import threading
 import time
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 
 from prior_sg.deploy.cli.main import main
 from prior_sg.deploy.errors import UserError
 from prior_sg.deploy.showing.moments import cloud_of
-from prior_sg.deploy.viewing.live import Live
+from prior_sg.deploy.viewing.live import MOST_IMAGES, Live
 from prior_sg.deploy.viewing.recorded import open_recorded
-from prior_sg.schemas.codec import LAST_NUMBER, encode
-from prior_sg.schemas.frames import PoseUpdate
+from prior_sg.schemas.codec import LAST_NUMBER, decode, encode
+from prior_sg.schemas.frames import ArchiveReply, ArchiveRequest, Keyframe, PoseUpdate
 from prior_sg.schemas.places import PlaceDelta
 from prior_sg.schemas.regions import RegionDelta
 from prior_sg.schemas.topics import KEYFRAME, PLACE_DELTA, POSE_UPDATE, REGION_DELTA
-from prior_sg.services.runtime.bus import Hub, LocalBus
+from prior_sg.services.runtime.bus import Hub, LocalBus, LocalRequest
 from prior_sg.services.runtime.record import LogError, LogWriter, read_log
 from tests.help.homes import home, keyframe
 
@@ -121,6 +123,40 @@ def test_what_no_service_took_hides_nothing_of_a_log(log: Path, tmp_path: Path) 
     while not len(live.cloud) and time.monotonic() < end_s:
         time.sleep(0.02)
     assert len(live.cloud) > 100
+    live.close()
+
+
+def test_images_that_come_too_fast_are_fetched_later(monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn: list[int] = []
+    busy, free = threading.Event(), threading.Event()
+
+    def take(self: Live, keyframe: Keyframe) -> None:
+        busy.set()
+        free.wait(10)
+        drawn.append(keyframe.frame_id)
+
+    monkeypatch.setattr(Live, "_take_image", take)
+    bus, asked = LocalBus(Hub()), []
+
+    def archive(request: LocalRequest) -> None:
+        first = decode(ArchiveRequest, request.payload).first_frame_id
+        asked.append(first)
+        keyframes = [msgspec.structs.replace(keyframe(), frame_id=number) for number in range(first, 200)][:16]
+        request.reply(encode(ArchiveReply(robot="robot1", oldest_frame_id=0, keyframes=keyframes)))
+
+    live = Live(bus, "robot1")
+    for number in range(200):
+        sent = msgspec.structs.replace(keyframe(), frame_id=number)
+        bus.put(KEYFRAME, KEYFRAME.key_of(sent), encode(sent), b"")
+        if not number:
+            assert busy.wait(5)
+    bus.serve("psg/robot1/ask/keyframes", archive)
+    free.set()
+    end_s = time.monotonic() + 10
+    while set(drawn) != set(range(200)) and time.monotonic() < end_s:
+        time.sleep(0.02)
+    assert drawn[: MOST_IMAGES + 1] == [0, *range(200 - MOST_IMAGES, 200)]  # the newest first
+    assert set(drawn) == set(range(200)) and asked[0] == 0
     live.close()
 
 

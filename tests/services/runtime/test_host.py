@@ -13,7 +13,7 @@ from prior_sg.schemas.codec import Message, decode, encode
 from prior_sg.schemas.frames import Intrinsics, Keyframe
 from prior_sg.schemas.places import MapRequest, SnapshotRequest, VoxelMap
 from prior_sg.schemas.priors import Task, TaskInForce
-from prior_sg.schemas.status import Consumed, JobDone, Started, Tick
+from prior_sg.schemas.status import Consumed, JobDone, ServiceStatus, Started, Tick
 from prior_sg.schemas.topics import (
     ENCODE,
     JOURNAL,
@@ -24,12 +24,14 @@ from prior_sg.schemas.topics import (
     VOXEL_MAP,
     alive_key,
     job_key,
+    status_key,
     worker_keys,
 )
 from prior_sg.services.refusals import InputRefused, fault_of_stamp
-from prior_sg.services.runtime.bus import Hub, LocalBus, pack_header
+from prior_sg.services.runtime.bus import BusError, Hub, LocalBus, pack_header
 from prior_sg.services.runtime.client import BusClient
 from prior_sg.services.runtime.host.host import Host
+from prior_sg.services.runtime.jobs.pool import JobPool
 from prior_sg.services.runtime.service import Ask, Identity, Service, UndeclaredError
 from prior_sg.services.runtime.zenoh_bus import ZenohBus, client_config
 
@@ -386,6 +388,29 @@ def task_ahead(state, request, cfg):
     return TaskInForce(robot="r", task=Task(robot="r", stamp_ns=2**62, environment="e", task="t"))
 
 
+def test_a_busy_store_is_asked_again_before_a_task_is_stamped(monkeypatch):
+    monkeypatch.setattr("prior_sg.services.runtime.client.STAMP_TIMEOUT_S", 0.05)
+    answered = []
+
+    def answer(request):
+        answered.append(request)
+        if len(answered) < wanted:
+            request.refuse("timeout")
+        else:
+            request.reply(
+                encode(TaskInForce(robot="r", task=Task(robot="r", stamp_ns=2**62, environment="e", task="t")))
+            )
+
+    wanted = 3
+    bus = LocalBus(Hub())
+    bus.serve("psg/r/ask/task", answer)
+    client = BusClient(bus)
+    assert client.task_stamp_ns("r") == 2**62 + 1 and len(answered) == 3
+    wanted = 99
+    with pytest.raises(BusError, match="busy"):  # stamped by the clock alone it would come before the one in force
+        client.task_stamp_ns("r")
+
+
 AHEAD = Service("ahead", "", "robot", Config, lambda cfg, me: [], reader_step, answers={TASK_IN_FORCE: task_ahead})
 
 
@@ -476,5 +501,47 @@ def test_a_worker_that_says_done_without_a_result_swallows_no_job(new_bus):
             assert {worker for _, worker, _ in source._state["done"]} == {"good"}
             assert sorted(set(good._state)) == list(range(8)) and len(empty._state) < 8
         await asyncio.to_thread(liar.close)
+
+    asyncio.run(main())
+
+
+def test_a_worker_of_a_release_that_counted_no_results_is_believed_and_one_of_ours_is_not():
+    hub = Hub()
+
+    def worker(name, release):
+        bus = LocalBus(hub)
+        run_key, live_key = worker_keys(ENCODE, name)
+        bus.serve(f"{run_key}/*", lambda request: request.reply(b"done"))
+        status = ServiceStatus(
+            **{field.name: 0 for field in msgspec.structs.fields(ServiceStatus) if field.required}
+            | {"service": "worker", "instance": name, "robot": "*", "topics": [], "waiting_for": [], "release": release}
+        )
+        bus.serve(status_key("*", name), lambda request: request.reply(encode(status)))
+        bus.announce(live_key)
+
+    ended = []
+    pool = JobPool(LocalBus(hub), ENCODE, "r", time.monotonic, ended.append)
+    worker("ours", "0.1.0")
+    pool.submit(("r", 0), encode(keyframe(0)))
+    assert ended == []
+    worker("old", "")
+    assert [(job.id, job.worker, job.error) for job in ended] == [(("r", 0), "old", "")]
+    pool.close()
+
+
+def test_a_job_that_was_done_is_answered_again_without_being_done_again_unless_that_is_wished(new_bus):
+    async def main():
+        async with running(new_bus, (MAKER, Config(), "good")) as (worker,):
+            asking = await asyncio.to_thread(new_bus)
+            answers = []
+            wished = msgspec.structs.replace(keyframe(1), space="s")
+            for sent in (keyframe(0), keyframe(0), keyframe(1), wished, wished):
+                asking.call(job_key(ENCODE, "good", "r"), encode(sent), 10.0, answers.append)
+                number = len(answers)
+                await until(lambda number=number: len(answers) > number or len(answers) == 5)
+            await until(lambda: len(answers) == 5)
+            assert [answer.payload for answer in answers] == [b"done 1"] * 5
+            assert worker._state == [0, 1, 1, 1]
+            await asyncio.to_thread(asking.close)
 
     asyncio.run(main())

@@ -52,6 +52,7 @@ class Spaces:
     left: set[str] = field(default_factory=set)
     ticks: int = 0
     still_ticks: int = 0  # since the space in force was last heard
+    asked: int = 0  # wishes for keyframes
 
 
 def hear(spaces: Spaces, pyramid: Pyramid, in_force: FrameArchive, cfg: SpacesConfig) -> bool:
@@ -91,16 +92,21 @@ def move(spaces: Spaces, frame_id: int, world_from_camera: np.ndarray) -> None:
         rival.archive.move(frame_id, world_from_camera)
 
 
-def questions(spaces: Spaces, in_force: FrameArchive, robot: str, cfg: SpacesConfig) -> Iterator[Backfill]:
+def questions(spaces: Spaces, in_force: FrameArchive, robot: str, epoch: int, cfg: SpacesConfig) -> Iterator[Backfill]:
     """Ask for keyframes: what this process has missed, after its start and whenever the stream rests; and for newcomers
     until they cover."""
     started, rests = spaces.ticks == cfg.backfill_ticks, spaces.still_ticks == cfg.backfill_ticks
+    lacking: list[tuple[str, FrameArchive, bool]] = []
     if rests or (started and len(in_force)):
-        yield _backfill(spaces.force, in_force, robot, rests)
+        lacking.append((spaces.force, in_force, rests))
     for name, rival in spaces.rivals.items():
         due = rival.ticks >= cfg.backfill_ticks and (rival.ticks - cfg.backfill_ticks) % cfg.repeat_ticks == 0
         if due and _comes(rival, cfg) and not in_force.frame_ids <= rival.archive.frame_ids:
-            yield _backfill(name, rival.archive, robot, rival.still_ticks >= cfg.backfill_ticks)
+            lacking.append((name, rival.archive, rival.still_ticks >= cfg.backfill_ticks))
+    for space, archive, settled in lacking:
+        spaces.asked += 1
+        frame_ids = np.array(sorted(archive.frame_ids), np.int64)
+        yield Backfill(robot=robot, space=space, frame_ids=frame_ids, settled=settled, epoch=epoch, number=spaces.asked)
 
 
 def successor(spaces: Spaces, in_force: FrameArchive, cfg: SpacesConfig) -> str | None:
@@ -136,8 +142,3 @@ def succeed(spaces: Spaces, name: str) -> FrameArchive:
 
 def _comes(rival: Rival, cfg: SpacesConfig) -> bool:
     return not rival.waits or rival.heard >= cfg.silent_frames
-
-
-def _backfill(space: str, archive: FrameArchive, robot: str, settled: bool) -> Backfill:
-    frame_ids = np.array(sorted(archive.frame_ids), np.int64)
-    return Backfill(robot=robot, space=space, frame_ids=frame_ids, settled=settled)
