@@ -62,6 +62,10 @@ PRIORITIES = {
     "data": Priority.DATA,
     "bulk": Priority.DATA_LOW,
 }
+LOGGED = "error"
+LOGGED_BEYOND = (
+    f"{LOGGED},zenoh_link_tls=warn,zenoh::net::routing::interceptor::access_control=info"  # who is not let in
+)
 TRANSPORT: dict[str, Any] = {
     "link": {
         "tx": {"lease": LEASE_MS, "keep_alive": 4},
@@ -139,7 +143,7 @@ def check_router(endpoint: str, beyond: Beyond | None) -> None:
 def open_router(endpoint: str, beyond: Beyond | None = None) -> Callable[[], None]:
     """Start a router in this process; returns the function that stops it. Raises BusError."""
     check_router(endpoint, beyond)
-    zenoh.init_log_from_env_or("error")
+    zenoh.init_log_from_env_or(LOGGED_BEYOND if beyond else LOGGED)
     try:
         session = zenoh.open(zenoh.Config.from_json5(json.dumps(router_settings(endpoint, beyond))))
     except zenoh.ZError as error:
@@ -206,7 +210,7 @@ class ZenohBus:
     """One session. Raises BusError when no router answers within `wait_s`."""
 
     def __init__(self, endpoint: str, wait_s: float = 10.0) -> None:
-        zenoh.init_log_from_env_or("error")
+        zenoh.init_log_from_env_or(LOGGED)
         self._session = self._open(endpoint, wait_s)
         self._publishers: dict[str, Any] = {}
         self._lock = threading.Lock()

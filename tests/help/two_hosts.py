@@ -92,8 +92,8 @@ class TwoHosts:
                     assert command(shlex.split(line)[1:]) == 0
             elif line.startswith("prior-sg up"):
                 self._up(line)
-            else:
-                said = self.edge.run(*self._words(line), env=self.environment)
+            else:  # the timeout is for busy machines
+                said = self.edge.run(*self._words(line), "--timeout", 600, env=self.environment, timeout_s=700)
                 assert said.returncode == 0, said.stdout + said.stderr
         return said.stdout
 
@@ -115,7 +115,7 @@ class TwoHosts:
         """What the edge's store holds now; None before it holds anything."""
         database = self.folder / "edge1" / "out" / "scene.sqlite"
         with contextlib.suppress(PriorSgError), open_history(database) as history:
-            return history.scene(ROBOT).message if ROBOT in history.robots() else None
+            return history.scene(ROBOT).message if ROBOT in history.robots else None
         return None
 
     def mapped(self, number):
