@@ -64,7 +64,7 @@ PRIORITIES = {
 }
 LOGGED = "error"
 LOGGED_BEYOND = (
-    f"{LOGGED},zenoh_link_tls=warn,zenoh::net::routing::interceptor::access_control=info"  # who is not let in
+    f"{LOGGED},zenoh_link_tls::unicast=warn,zenoh::net::routing::interceptor::access_control=info"  # who is not let in
 )
 TRANSPORT: dict[str, Any] = {
     "link": {

@@ -193,7 +193,7 @@ def _(stage):
 def _(stage):
     act = put("psg/B/places", b"\xff" * 64)
     return at_the_service(
-        stage, act, ("scene_store", PLACE_DELTA), "malformed", "PlaceDelta:", bundle=stage.own.bundle("B")
+        stage, act, ("scene_store", PLACE_DELTA), "malformed", "malformed message dropped", bundle=stage.own.bundle("B")
     )
 
 
