@@ -15,15 +15,16 @@ ROBOTS = ("robotA", "robotB")
 PARTICIPANTS = (("edge", "edge1"), *(("robot", name) for name in ROBOTS), ("viewer", "anna"), ("operator", "otto"))
 
 
-def beyond(folder, listen=(), join=()):
+def beyond(folder, listen=(), join=(), thin_bps=0):
     bundle = read_bundle(folder)
-    return Beyond(bundle=bundle, access=access_control(bundle.about.participants, ["lo"]), listen=listen, join=join)
+    access = access_control(bundle.about.participants, ["lo"])
+    return Beyond(bundle=bundle, access=access, listen=listen, join=join, thin_bps=thin_bps)
 
 
 class Fleet:
     """Two authorities, an edge's router and one of robotA, and the ends of the bus that tests ask for."""
 
-    def __init__(self, folder):
+    def __init__(self, folder, thin_bps=0):
         self.own, self.foreign = Authority.create(folder / "own"), Authority.create(folder / "foreign")
         for role, name in PARTICIPANTS:
             self.own.add(role, name)
@@ -35,8 +36,8 @@ class Fleet:
         self.own.rotate("robotB")
         self.own.revoke("stolen")
         self.tls, self.local, self.robot = (free_endpoint(f"{kind}/127.0.0.1:0") for kind in ("tls", "tcp", "tcp"))
-        edge = beyond(self.own.bundle("edge1"), listen=(self.tls,))
-        robot = beyond(self.own.bundle("robotA"), join=(self.tls,))
+        edge = beyond(self.own.bundle("edge1"), listen=(self.tls,), thin_bps=thin_bps)
+        robot = beyond(self.own.bundle("robotA"), join=(self.tls,), thin_bps=thin_bps)
         self.stops = [open_router(self.local, edge), open_router(self.robot, robot)]
 
     def bus(self, folder, patch, wait_s=0.1):
