@@ -3,6 +3,7 @@
 python -m tests.help.intruder_rows
 """
 
+import contextlib
 import itertools
 import json
 import logging
@@ -13,12 +14,11 @@ import zlib
 from pathlib import Path
 from unittest import mock
 
-import msgspec
 import numpy as np
 import psutil
 import zenoh
 
-from prior_sg.schemas.codec import encode
+from prior_sg.schemas.codec import decode_plain, encode, encode_plain
 from prior_sg.schemas.frames import Intrinsics, Keyframe
 from prior_sg.schemas.priors import PriorClaim, Task
 from prior_sg.schemas.topics import (
@@ -79,7 +79,7 @@ def task(robot="A", stamp_ns=1):
 
 def forged(message, **fields):
     """The bytes of a message with fields that no message can have."""
-    return msgspec.msgpack.encode(msgspec.to_builtins(message) | fields)
+    return encode_plain(decode_plain(encode(message), type(message).__name__) | fields)
 
 
 def places(**changes):
@@ -285,7 +285,7 @@ def _(stage):
 @row("a program on a host", "a keyframe that says it has 30 000 x 30 000 pixels")
 def _(stage):
     large = {"width_px": 30_000, "height_px": 30_000, "fx_px": 1.0, "fy_px": 1.0, "cx_px": 1.0, "cy_px": 1.0}
-    act = put("psg/A/keyframe", forged(keyframe(), intrinsics=list(large.values())))
+    act = put("psg/A/keyframe", forged(keyframe(), intrinsics=large))
     return at_the_service(stage, act, ("place_graph", KEYFRAME), "malformed", "image size 30000 x 30000")
 
 
@@ -301,23 +301,19 @@ def _(stage):
 
 
 def table(folder):
-    """All rows, on one stage."""
+    """All rows, on one stage, as they come."""
     logging.getLogger("prior_sg").setLevel(logging.INFO)
-    with mock.patch.object(zenoh_bus, "CONNECT_MS", 1500):
-        stage = Stage(folder)
-        try:
-            return [Row(who, tried, *does(stage)) for who, tried, does in ROWS]
-        finally:
-            stage.close()
+    with mock.patch.object(zenoh_bus, "CONNECT_MS", 1500), contextlib.closing(Stage(folder)) as stage:
+        for who, tried, does in ROWS:
+            yield Row(who, tried, *does(stage))
 
 
 def main():
-    with tempfile.TemporaryDirectory() as name:
-        rows = table(Path(name))
     print("| intruder | what is tried | what happens | logged by |\n|---|---|---|---|")
-    for one in rows:
-        said = f": `{one.said.strip()[-140:]}`" if one.said else ""
-        print(f"| {one.who} | {one.tried} | {one.happened} | {one.logged}{said} |")
+    with tempfile.TemporaryDirectory() as name:
+        for one in table(Path(name)):
+            said = f": `{one.said.strip()[-140:]}`" if one.said else ""
+            print(f"| {one.who} | {one.tried} | {one.happened} | {one.logged}{said} |", flush=True)
 
 
 if __name__ == "__main__":

@@ -7,7 +7,7 @@ from tests.help.intruder_rows import ROWS, table
 
 @pytest.mark.timeout(900)
 def test_intruders_are_refused_and_told(tmp_path):
-    rows = table(tmp_path)
+    rows = list(table(tmp_path))
     assert len(rows) == len(ROWS) >= 25
     for one in rows:
         assert one.happened.startswith(("not connected", "refused by", "dropped by", "not mapped")), one
