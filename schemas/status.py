@@ -88,6 +88,7 @@ class TopicCount(msgspec.Struct, frozen=True, kw_only=True):
     skipped: int = 0  # superseded by a newer sample before it was read (`latest`)
     duplicate: int = 0  # seen before, dropped
     missed: int = 0  # known to exist, never arrived
+    limited: int = 0  # too many on one key; dropped
     last_age_ms: float = -1.0  # age of the newest consumed sample when it was consumed
 
 

@@ -6,6 +6,10 @@ Delivery is one word:
 - `every`: nothing may be lost: publisher cache, history for late readers, recovery of missed samples. A reader that
   finds a gap in the revisions asks the writer for a snapshot.
 - `job`: each message goes to one worker of a pool, at least once; results are idempotent.
+
+So is priority, which counts where a link is slower than what is sent: `now` overtakes `soon`, which overtakes `data`,
+which overtakes `bulk`. No topic of `every` is `bulk`: Zenoh counts its samples by messages of `data`, which must not
+overtake them. What may be sent on a key is bounded as well, far above what any service writes.
 """
 
 import re
@@ -41,7 +45,11 @@ prepare()  # every process imports this table before it opens a bus, whose threa
 ROOT = "psg"
 WAITING = "0"  # in place of an epoch
 FLEET = "fleet"  # in place of a robot
+KB, MB = 2**10, 2**20
+LARGEST = 256 * MB  # bytes of any message; a larger one is not put together by routers and clients
+BURST_S = 10.0  # for how long a writer may send twice what it may send for ever
 Delivery = Literal["latest", "every", "job"]
+Priority = Literal["now", "soon", "data", "bulk"]
 
 
 @dataclass(frozen=True)
@@ -55,6 +63,16 @@ class Topic:
     rate_hz: float  # typical
     recorded: bool
     cache: int = 0  # samples a publisher keeps for late and lossy readers (`every`)
+    priority: Priority = "data"
+    most_bytes: int = 64 * MB  # of one message
+    most_hz: float = 300  # on one key, for ever
+    beyond_hz: float = 0  # at most, over a thin link; 0 = all
+    rises: tuple[str, ...] = ()  # fields that are higher in each message of a writer than in the one before
+
+    @property
+    def most_at_once(self) -> int:
+        """Messages on one key that may come at once: what is kept for late readers, or what a link has held up."""
+        return int(max(2 * self.cache, BURST_S * self.most_hz))
 
     def key_of(self, message: Message) -> str:
         """The key this message is published on. Raises ValueError where a field cannot be part of one."""
@@ -66,6 +84,10 @@ class Topic:
     def fault_of(self, key: str, message: Message) -> str:
         """Why this message has no business on the key it came on, as a sentence; empty when it belongs there."""
         return _fault_of(key, lambda: self.key_of(message))
+
+    def budget_key(self, key: str) -> str:
+        """What the rate of messages on a key counts for: the key, or the topic where keys tell no robots apart."""
+        return key if "{robot}" in self.key else self.name
 
     def pattern(self, robot: str) -> str:
         """The key expression that matches this topic of `robot` (`*` = of all robots)."""
@@ -80,6 +102,9 @@ class Query:
     request: type[Message]
     reply: type[Message]
     key: str
+    priority: Priority = "soon"
+    most_bytes: int = 256 * KB  # of a request
+    most_reply_bytes: int = 64 * MB
 
     def key_of(self, request: Message) -> str:
         """The key this request is asked on. Raises ValueError where a field cannot be part of one."""
@@ -99,30 +124,67 @@ def _fault_of(key: str, own_key: Callable[[], str]) -> str:
     return "" if key == own else f"it came on {key} and says it belongs on {own}"
 
 
-KEYFRAME = Topic("KEYFRAME", Keyframe, f"{ROOT}/{{robot}}/keyframe", "every", 2, recorded=True, cache=32)
-POSE_UPDATE = Topic("POSE_UPDATE", PoseUpdate, f"{ROOT}/{{robot}}/pose_update", "every", 0.01, recorded=True, cache=16)
-CAMERA_STATE = Topic("CAMERA_STATE", CameraState, f"{ROOT}/{{robot}}/camera", "latest", 30, recorded=False)
-INGEST_STATE = Topic("INGEST_STATE", IngestState, f"{ROOT}/{{robot}}/ingest", "latest", 5, recorded=False)
-PLACE_DELTA = Topic("PLACE_DELTA", PlaceDelta, f"{ROOT}/{{robot}}/places", "every", 2, recorded=True, cache=256)
-ENCODE = Topic("ENCODE", Keyframe, f"{ROOT}/jobs/encode", "job", 2, recorded=False)
+DELTA = ("epoch", "revision")
+KEYFRAME = Topic(
+    "KEYFRAME", Keyframe, f"{ROOT}/{{robot}}/keyframe", "every", 2, recorded=True, cache=32,
+    rises=("frame_id",),
+)  # fmt: skip
+POSE_UPDATE = Topic(
+    "POSE_UPDATE", PoseUpdate, f"{ROOT}/{{robot}}/pose_update", "every", 0.01, recorded=True, cache=16,
+    priority="soon", most_hz=30, rises=DELTA,
+)  # fmt: skip
+CAMERA_STATE = Topic(
+    "CAMERA_STATE", CameraState, f"{ROOT}/{{robot}}/camera", "latest", 30, recorded=False,
+    priority="now", most_bytes=16 * KB, most_hz=1000, beyond_hz=5,
+)  # fmt: skip
+INGEST_STATE = Topic(
+    "INGEST_STATE", IngestState, f"{ROOT}/{{robot}}/ingest", "latest", 5, recorded=False,
+    priority="now", most_bytes=MB, beyond_hz=2,
+)  # fmt: skip
+PLACE_DELTA = Topic(
+    "PLACE_DELTA", PlaceDelta, f"{ROOT}/{{robot}}/places", "every", 2, recorded=True, cache=256, rises=DELTA
+)
+ENCODE = Topic("ENCODE", Keyframe, f"{ROOT}/jobs/encode", "job", 2, recorded=False, priority="bulk")
 PYRAMID = Topic("PYRAMID", Pyramid, f"{ROOT}/{{robot}}/pyramid", "every", 2, recorded=True, cache=256)
 DETECTIONS = Topic("DETECTIONS", Detections, f"{ROOT}/{{robot}}/detections", "every", 2, recorded=True, cache=256)
-BACKFILL = Topic("BACKFILL", Backfill, f"{ROOT}/{{robot}}/backfill", "every", 0.01, recorded=True, cache=4)
-TASK = Topic("TASK", Task, f"{ROOT}/{{robot}}/task", "every", 0.01, recorded=True, cache=4)
-PRIOR = Topic("PRIOR", Prior, f"{ROOT}/fleet/prior/{{digest}}", "every", 0.01, recorded=True, cache=4)
+BACKFILL = Topic(
+    "BACKFILL", Backfill, f"{ROOT}/{{robot}}/backfill", "every", 0.01, recorded=True, cache=4,
+    priority="soon", most_bytes=4 * MB, most_hz=30,
+)  # fmt: skip
+TASK = Topic(
+    "TASK", Task, f"{ROOT}/{{robot}}/task", "every", 0.01, recorded=True, cache=4,
+    priority="soon", most_bytes=MB, most_hz=10, rises=("stamp_ns",),
+)  # fmt: skip
+PRIOR = Topic(
+    "PRIOR", Prior, f"{ROOT}/fleet/prior/{{digest}}", "every", 0.01, recorded=True, cache=4,
+    priority="soon", most_bytes=16 * MB, most_hz=30,
+)  # fmt: skip
 PRIOR_CLAIM = Topic(
-    "PRIOR_CLAIM", PriorClaim, f"{ROOT}/fleet/prior_claim/{{question}}", "every", 0.1, recorded=True, cache=4
-)
+    "PRIOR_CLAIM", PriorClaim, f"{ROOT}/fleet/prior_claim/{{question}}", "every", 0.1, recorded=True, cache=4,
+    priority="soon", most_bytes=64 * KB, most_hz=30,
+)  # fmt: skip
 PRIOR_EVIDENCE = Topic(
-    "PRIOR_EVIDENCE", PriorEvidence, f"{ROOT}/{{robot}}/prior_evidence", "every", 0.05, recorded=True, cache=4
-)
+    "PRIOR_EVIDENCE", PriorEvidence, f"{ROOT}/{{robot}}/prior_evidence", "every", 0.05, recorded=True, cache=4,
+    most_bytes=16 * MB, most_hz=30,
+)  # fmt: skip
 PRIOR_REVISION = Topic(
-    "PRIOR_REVISION", PriorRevision, f"{ROOT}/fleet/prior_revision", "every", 0.001, recorded=True, cache=1
+    "PRIOR_REVISION", PriorRevision, f"{ROOT}/fleet/prior_revision", "every", 0.001, recorded=True, cache=1,
+    priority="soon", most_bytes=16 * MB, most_hz=10,
+)  # fmt: skip
+REGION_DELTA = Topic(
+    "REGION_DELTA", RegionDelta, f"{ROOT}/{{robot}}/regions", "every", 2, recorded=True, cache=256, rises=DELTA
 )
-REGION_DELTA = Topic("REGION_DELTA", RegionDelta, f"{ROOT}/{{robot}}/regions", "every", 2, recorded=True, cache=256)
-OBJECT_DELTA = Topic("OBJECT_DELTA", ObjectDelta, f"{ROOT}/{{robot}}/objects", "every", 1, recorded=True, cache=256)
-SCENE_REVISION = Topic("SCENE_REVISION", SceneRevision, f"{ROOT}/{{robot}}/scene", "latest", 4, recorded=False)
-JOURNAL = Topic("JOURNAL", Consumed, f"{ROOT}/{{robot}}/journal", "every", 20, recorded=True, cache=1024)
+OBJECT_DELTA = Topic(
+    "OBJECT_DELTA", ObjectDelta, f"{ROOT}/{{robot}}/objects", "every", 1, recorded=True, cache=256, rises=DELTA
+)
+SCENE_REVISION = Topic(
+    "SCENE_REVISION", SceneRevision, f"{ROOT}/{{robot}}/scene", "latest", 4, recorded=False,
+    priority="now", most_bytes=MB, beyond_hz=2,
+)  # fmt: skip
+JOURNAL = Topic(
+    "JOURNAL", Consumed, f"{ROOT}/{{robot}}/journal", "every", 20, recorded=True, cache=1024,
+    most_bytes=LARGEST, most_hz=5000,
+)  # fmt: skip
 
 TOPICS = (
     KEYFRAME,
@@ -155,20 +217,22 @@ def topic_of(message_type: type[Message]) -> Topic | None:
     return _TOPIC_OF.get(message_type)
 
 
-ARCHIVE = Query("ARCHIVE", ArchiveRequest, ArchiveReply, f"{ROOT}/{{robot}}/ask/keyframes")
-PLACE_SNAPSHOT = Query("PLACE_SNAPSHOT", SnapshotRequest, PlaceDelta, f"{ROOT}/{{robot}}/ask/places")
-VOXEL_MAP = Query("VOXEL_MAP", MapRequest, VoxelMap, f"{ROOT}/{{robot}}/ask/voxels")
-REGION_SNAPSHOT = Query("REGION_SNAPSHOT", SnapshotRequest, RegionDelta, f"{ROOT}/{{robot}}/ask/regions")
-OBJECT_SNAPSHOT = Query("OBJECT_SNAPSHOT", SnapshotRequest, ObjectDelta, f"{ROOT}/{{robot}}/ask/objects")
+ARCHIVE = Query(
+    "ARCHIVE", ArchiveRequest, ArchiveReply, f"{ROOT}/{{robot}}/ask/keyframes", "bulk", most_reply_bytes=LARGEST
+)
+PLACE_SNAPSHOT = Query("PLACE_SNAPSHOT", SnapshotRequest, PlaceDelta, f"{ROOT}/{{robot}}/ask/places", "data")
+VOXEL_MAP = Query("VOXEL_MAP", MapRequest, VoxelMap, f"{ROOT}/{{robot}}/ask/voxels", "bulk", most_reply_bytes=LARGEST)
+REGION_SNAPSHOT = Query("REGION_SNAPSHOT", SnapshotRequest, RegionDelta, f"{ROOT}/{{robot}}/ask/regions", "data")
+OBJECT_SNAPSHOT = Query("OBJECT_SNAPSHOT", SnapshotRequest, ObjectDelta, f"{ROOT}/{{robot}}/ask/objects", "data")
 POSTERIOR = Query("POSTERIOR", PosteriorRequest, PosteriorReply, f"{ROOT}/{{robot}}/ask/posterior")
 TASK_IN_FORCE = Query("TASK_IN_FORCE", TaskRequest, TaskInForce, f"{ROOT}/{{robot}}/ask/task")
-SCENE = Query("SCENE", SceneRequest, Scene, f"{ROOT}/{{robot}}/ask/scene")
+SCENE = Query("SCENE", SceneRequest, Scene, f"{ROOT}/{{robot}}/ask/scene", "data", most_reply_bytes=LARGEST)
 HISTORY = Query("HISTORY", HistoryRequest, RevisionList, f"{ROOT}/{{robot}}/ask/history")
 SCENE_QUERY = Query("SCENE_QUERY", SceneQuery, SceneAnswer, f"{ROOT}/{{robot}}/ask/query")
-TEXT = Query("TEXT", TextRequest, TextEmbeddings, f"{ROOT}/encoder/{{space}}/text")
+TEXT = Query("TEXT", TextRequest, TextEmbeddings, f"{ROOT}/encoder/{{space}}/text", most_bytes=4 * MB)
 EPOCH = Query("EPOCH", EpochRequest, EpochKnown, f"{ROOT}/{{robot}}/ask/epoch/{{topic}}/{{keeper}}")
 PRIORS = Query("PRIORS", PriorRequest, PriorList, f"{ROOT}/fleet/ask/prior")
-EVIDENCE = Query("EVIDENCE", EvidenceRequest, Evidence, f"{ROOT}/{{robot}}/ask/evidence")
+EVIDENCE = Query("EVIDENCE", EvidenceRequest, Evidence, f"{ROOT}/{{robot}}/ask/evidence", "bulk")
 
 QUERIES = (
     ARCHIVE,
@@ -188,8 +252,8 @@ QUERIES = (
 )
 
 STATUS = Query("STATUS", StatusRequest, ServiceStatus, f"{ROOT}/status")
-YIELD = Query("YIELD", YieldRequest, Bequest, f"{ROOT}/{{robot}}/yield")
-SWAP = Query("SWAP", SwapRequest, Swapped, f"{ROOT}/fleet/swap")
+YIELD = Query("YIELD", YieldRequest, Bequest, f"{ROOT}/{{robot}}/yield", most_reply_bytes=LARGEST)
+SWAP = Query("SWAP", SwapRequest, Swapped, f"{ROOT}/fleet/swap", most_bytes=MB)
 
 
 def alive_key(service: str, instance: str) -> str:
@@ -223,16 +287,27 @@ def swap_key(service: str, instance: str) -> str:
 
 
 _FIELD = re.compile(r"\\{\w+\\}")  # as `re.escape` leaves it
-_CALLS: tuple[tuple[re.Pattern[str], type[Message], type[Message] | None], ...] = (
-    *((re.compile(_FIELD.sub(".+", re.escape(q.key))), q.request, q.reply) for q in QUERIES),
-    *((re.compile(f"{_FIELD.sub('.+', re.escape(q.key))}/.+"), q.request, q.reply) for q in (STATUS, YIELD, SWAP)),
-    *((re.compile(f"{topic.key}/run/.+"), topic.type, None) for topic in TOPICS if topic.delivery == "job"),
+_CALLS: tuple[tuple[re.Pattern[str], Query | Topic], ...] = (
+    *((re.compile(_FIELD.sub(".+", re.escape(q.key))), q) for q in QUERIES),
+    *((re.compile(f"{_FIELD.sub('.+', re.escape(q.key))}/.+"), q) for q in (STATUS, YIELD, SWAP)),
+    *((re.compile(f"{topic.key}/run/.+"), topic) for topic in TOPICS if topic.delivery == "job"),
 )
+
+
+def called_on(key: str) -> Query | Topic | None:
+    """The question asked, or the job given, on this key or key expression; None = neither of the table."""
+    return next((called for pattern, called in _CALLS if pattern.fullmatch(key)), None)
 
 
 def called_with(key: str) -> tuple[type[Message] | None, type[Message] | None]:
     """Types of request and reply of a call on this key or key expression; None = not a message of the table."""
-    return next(((request, reply) for pattern, request, reply in _CALLS if pattern.fullmatch(key)), (None, None))
+    match called_on(key):
+        case Query() as query:
+            return query.request, query.reply
+        case Topic() as job:
+            return job.type, None
+        case _:
+            return None, None
 
 
 def worker_keys(job: Topic, worker: str, group: str = "") -> tuple[str, str]:

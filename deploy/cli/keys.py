@@ -133,7 +133,7 @@ def _router(arguments: argparse.Namespace) -> int:
     from prior_sg.deploy.keys.routing import beyond_this_host
     from prior_sg.services.runtime.zenoh_bus import check_router, open_router, router_settings
 
-    beyond = beyond_this_host(arguments.listen, arguments.join)
+    beyond = beyond_this_host(arguments.listen, arguments.join, arguments.thin_link)
     if arguments.write is not None:
         check_router(arguments.connect, beyond)
         with writing(arguments.write):

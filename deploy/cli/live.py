@@ -104,13 +104,17 @@ def _stay_up(arguments: argparse.Namespace, names: list[str]) -> int:
     from prior_sg.deploy.running.supervisor import Supervisor
     from prior_sg.deploy.running.swaps import RouterHere, Swaps
     from prior_sg.deploy.settings import check_settings
+    from prior_sg.schemas.topics import KEYFRAME
     from prior_sg.services.ingest.core.options import is_live
     from prior_sg.services.registry import BY_NAME
 
     require_files()
-    beyond = beyond_this_host(arguments.listen, arguments.join)
+    beyond = beyond_this_host(arguments.listen, arguments.join, arguments.thin_link)
     if beyond is not None and (own := beyond.bundle.own).role == "robot" and own.name != arguments.robot:
         raise UserError(f"these keys are of {own.name}, which writes nothing of {arguments.robot}; use --robot")
+    mappers = [name for name in names if KEYFRAME in BY_NAME[name].reads]
+    if arguments.thin_link and mappers and "ingest" not in names:
+        raise UserError(f"{mappers[0]} needs every keyframe, and a thin link carries none: run it where ingest runs")
     if beyond is not None and arguments.no_router:
         raise UserError("--listen and --join are of the router that `up` starts; leave out --no-router")
     settings = [

@@ -3,6 +3,7 @@
 import argparse
 import contextlib
 import math
+import re
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -69,6 +70,22 @@ def add_router(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--join", action="append", default=[], metavar="tls/HOST:PORT", help="join this router to that of an edge"
     )
+    parser.add_argument(
+        "--thin-link",
+        type=rate_in,
+        default=0.0,
+        metavar="RATE",
+        help="bits per second that links to other hosts carry, as 2M or 500k, at both ends: what is urgent overtakes, "
+        "states come less often, keyframes stay on their host",
+    )
+
+
+def rate_in(text: str) -> float:
+    """Bits per second in what a user wrote. Raises ArgumentTypeError."""
+    match = re.fullmatch(r"(\d+(?:\.\d+)?)([kMG]?)", text)
+    if match is None or not (bps := float(match[1]) * {"": 1, "k": 1e3, "M": 1e6, "G": 1e9}[match[2]]):
+        raise argparse.ArgumentTypeError(f"{text!r} is no rate; write bits per second as 2M or 500k")
+    return bps
 
 
 def add_settings(parser: argparse.ArgumentParser) -> None:

@@ -253,7 +253,7 @@ def _topic_line(count: "TopicCount") -> list[Part]:
         (count.duplicate, "repeated"),
     ]
     texts = [f"{number} {word}" for number, word in parts if number]
-    faults = [(count.malformed, "malformed"), (count.missed, "missed")]
+    faults = [(count.malformed, "malformed"), (count.limited, "too many"), (count.missed, "missed")]
     styled: list[Part] = [*texts, *((f"{number} {word}", "red") for number, word in faults if number)]
     separated = [part for entry in styled for part in (", ", entry)]
     return [f"{count.topic} ", *(separated[1:] or ["-"])]

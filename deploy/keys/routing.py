@@ -12,9 +12,13 @@ from prior_sg.services.runtime.keys import Beyond, bundle_in_force
 LOOPBACK = ("127.0.0.1", "::1")
 
 
-def beyond_this_host(listen: Sequence[str], join: Sequence[str]) -> Beyond | None:
-    """How the router reaches others; None where it is to reach nobody. Raises UserError, BusError."""
+def beyond_this_host(listen: Sequence[str], join: Sequence[str], thin_bps: float = 0) -> Beyond | None:
+    """How the router reaches others, over links of `thin_bps` bits per second (0 = fast ones); None where it is to
+    reach nobody. Raises UserError, BusError.
+    """
     if not (listen or join):
+        if thin_bps:
+            raise UserError("--thin-link is of links to other hosts; name them with --listen or --join")
         return None
     bundle = bundle_in_force()
     if bundle is None:
@@ -22,7 +26,7 @@ def beyond_this_host(listen: Sequence[str], join: Sequence[str]) -> Beyond | Non
     if bundle.own.revoked:
         raise UserError(f"the keys of {bundle.own.name} are revoked; `prior-sg keys add` gives new ones")
     access = access_control(bundle.about.participants, _loopback_interfaces())
-    return Beyond(bundle=bundle, access=access, listen=tuple(listen), join=tuple(join))
+    return Beyond(bundle=bundle, access=access, listen=tuple(listen), join=tuple(join), thin_bps=thin_bps)
 
 
 def _loopback_interfaces() -> list[str]:

@@ -18,6 +18,7 @@ from prior_sg.services.errors import PriorSgError
 
 HEADER = struct.Struct("<Qq")
 WRITER = re.compile(r"[\w.:-]+(/[\w.:-]+)*")
+LONGEST_WRITER = 256  # bytes of a writer's name
 
 
 class BusError(PriorSgError):
@@ -113,7 +114,7 @@ def pack_header(writer: str, sequence: int, sent_ns: int) -> bytes:
 
 def unpack_header(header: bytes | None) -> tuple[str, int, int]:
     """Writer, sequence and time of sending; an absent or damaged header gives an unknown writer."""
-    if header is None or len(header) <= HEADER.size:
+    if header is None or not HEADER.size < len(header) <= HEADER.size + LONGEST_WRITER:
         return "", -1, 0
     sequence, sent_ns = HEADER.unpack_from(header)
     writer = header[HEADER.size :].decode(errors="replace")

@@ -58,6 +58,11 @@ class Bundle(msgspec.Struct, frozen=True, kw_only=True):
         """Whose bundle it is."""
         return next(one for one in self.about.participants if one.name == self.about.name)
 
+    @property
+    def robots(self) -> list[str]:
+        """Those who take part."""
+        return sorted(one.name for one in self.about.participants if one.role == "robot" and not one.revoked)
+
     def transport(self) -> dict[str, Any]:
         """Zenoh's settings of TLS. Only an edge's certificate lets it listen: who joins checks that."""
         key, certificate = str(self.folder / KEY_FILE), str(self.folder / CERTIFICATE_FILE)
@@ -80,6 +85,7 @@ class Beyond(msgspec.Struct, frozen=True, kw_only=True):
     access: dict[str, Any]  # Zenoh's access_control
     listen: tuple[str, ...] = ()
     join: tuple[str, ...] = ()
+    thin_bps: float = 0  # bits per second that the link carries; 0 = more than is sent
 
 
 def bundle_in_force() -> Bundle | None:

@@ -18,9 +18,9 @@ import zenoh
 from zenoh import CongestionControl, ConsolidationMode, Priority, QueryTarget, SampleKind
 from zenoh import ext as zx
 
-from prior_sg.schemas.codec import Message, schema_name
+from prior_sg.schemas.codec import Message, Refused, schema_name
 from prior_sg.schemas.migrations import received
-from prior_sg.schemas.topics import Topic, called_with
+from prior_sg.schemas.topics import LARGEST, MB, Query, Topic, called_on, called_with
 from prior_sg.services.runtime.bus import (
     Answer,
     BusError,
@@ -46,6 +46,7 @@ from prior_sg.services.runtime.endpoints import (
     without_places,
 )
 from prior_sg.services.runtime.keys import Beyond, Bundle, bundle_in_force
+from prior_sg.services.runtime.shaping import size_filters, thinned
 
 log = logging.getLogger(__name__)
 HEARTBEAT_S = 0.3
@@ -54,8 +55,22 @@ LEASE_MS = 2000
 ATTEMPTS = 5
 CONNECT_MS = 3000
 RETRY = {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 1.5}
+HEAD_BYTES = 65536  # of key, header and encoding beside a message
+PRIORITIES = {
+    "now": Priority.INTERACTIVE_HIGH,
+    "soon": Priority.INTERACTIVE_LOW,
+    "data": Priority.DATA,
+    "bulk": Priority.DATA_LOW,
+}
+LOGGED = "error"
+LOGGED_BEYOND = (
+    f"{LOGGED},zenoh_link_tls::unicast=warn,zenoh::net::routing::interceptor::access_control=info"  # who is not let in
+)
 TRANSPORT: dict[str, Any] = {
-    "link": {"tx": {"lease": LEASE_MS, "keep_alive": 4}, "rx": {"buffer_size": 4194304}},
+    "link": {
+        "tx": {"lease": LEASE_MS, "keep_alive": 4},
+        "rx": {"buffer_size": 4194304, "max_message_size": LARGEST + HEAD_BYTES},
+    },
     "shared_memory": {"enabled": False},  # asks for a /dev/shm that can be written, which containers may lack
 }
 
@@ -99,10 +114,13 @@ def router_settings(endpoint: str, beyond: Beyond | None = None) -> dict[str, An
         "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": beyond is None}},
         "timestamping": {"enabled": True},
         "transport": _transport(beyond.bundle if beyond else None),
+        "low_pass_filter": size_filters(),
     }
     if beyond is not None:
         joined = {"endpoints": list(beyond.join), "timeout_ms": 0, "exit_on_failure": False, "retry": RETRY}
         settings |= {"access_control": beyond.access, "connect": joined}
+        if beyond.thin_bps:
+            settings = thinned(settings, beyond.thin_bps, beyond.bundle.robots)
     return settings
 
 
@@ -125,7 +143,7 @@ def check_router(endpoint: str, beyond: Beyond | None) -> None:
 def open_router(endpoint: str, beyond: Beyond | None = None) -> Callable[[], None]:
     """Start a router in this process; returns the function that stops it. Raises BusError."""
     check_router(endpoint, beyond)
-    zenoh.init_log_from_env_or("error")
+    zenoh.init_log_from_env_or(LOGGED_BEYOND if beyond else LOGGED)
     try:
         session = zenoh.open(zenoh.Config.from_json5(json.dumps(router_settings(endpoint, beyond))))
     except zenoh.ZError as error:
@@ -168,10 +186,17 @@ class ZenohRequest:
         self._query = query
         self.key = str(query.key_expr)
         request, self._reply = called_with(self.key)
-        self.payload = _payload(request, query.payload, query.encoding)
+        called = called_on(self.key)
+        self._most_bytes = called.most_reply_bytes if isinstance(called, Query) else LARGEST
+        self.payload = _payload(request, query.payload, query.encoding, called.most_bytes if called else LARGEST)
 
     def reply(self, payload: bytes) -> None:
-        """Answer; a caller that has gone away is no error."""
+        """Answer; a caller that has gone away is no error. What no router would carry is said instead."""
+        if len(payload) > self._most_bytes:
+            self.refuse(
+                f"the answer has {len(payload) / MB:.0f} MB, and {self._most_bytes / MB:.0f} are carried: ask for less"
+            )
+            return
         with self._query:
             quietly(lambda: self._query.reply(self.key, payload, encoding=_encoding(self._reply)))
 
@@ -185,7 +210,7 @@ class ZenohBus:
     """One session. Raises BusError when no router answers within `wait_s`."""
 
     def __init__(self, endpoint: str, wait_s: float = 10.0) -> None:
-        zenoh.init_log_from_env_or("error")
+        zenoh.init_log_from_env_or(LOGGED)
         self._session = self._open(endpoint, wait_s)
         self._publishers: dict[str, Any] = {}
         self._lock = threading.Lock()
@@ -212,7 +237,9 @@ class ZenohBus:
                 time.sleep(0.2)
 
     def put(self, topic: Topic, key: str, payload: bytes, header: bytes) -> None:
-        """Publish one sample."""
+        """Publish one sample. Raises BusError for one that no router and no reader would take."""
+        if len(payload) > topic.most_bytes:
+            raise BusError(f"{topic.name}: a message of {len(payload)} bytes, and at most {topic.most_bytes} are taken")
         with self._lock:
             publisher = self._publishers.get(key)
             if publisher is None:
@@ -223,15 +250,19 @@ class ZenohBus:
         encoding = _encoding(topic.type)
         if topic.delivery == "latest":
             return self._session.declare_publisher(
-                key, encoding=encoding, congestion_control=CongestionControl.DROP, priority=Priority.INTERACTIVE_HIGH
+                key, encoding=encoding, congestion_control=CongestionControl.DROP, priority=PRIORITIES[topic.priority]
             )
         return zx.declare_advanced_publisher(
             self._session,
             key,
             encoding=encoding,
             congestion_control=CongestionControl.BLOCK,
+            priority=PRIORITIES[topic.priority],
             cache=zx.CacheConfig(
-                topic.cache, replies_config=zx.RepliesConfig(congestion_control=CongestionControl.BLOCK)
+                topic.cache,
+                replies_config=zx.RepliesConfig(
+                    congestion_control=CongestionControl.BLOCK, priority=PRIORITIES[topic.priority]
+                ),
             ),
             sample_miss_detection=zx.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=HEARTBEAT_S),
             publisher_detection=True,
@@ -243,7 +274,7 @@ class ZenohBus:
         def receive(sample: zenoh.Sample) -> None:
             if sample.kind == SampleKind.PUT:
                 header = sample.attachment.to_bytes() if sample.attachment is not None else None
-                payload = _payload(topic.type, sample.payload, sample.encoding)
+                payload = _payload(topic.type, sample.payload, sample.encoding, topic.most_bytes)
                 on_sample(Sample(topic, str(sample.key_expr), payload, *unpack_header(header)))
 
         if topic.delivery == "latest":
@@ -278,12 +309,14 @@ class ZenohBus:
     def call(self, key: str, payload: bytes, timeout_s: float, on_answer: OnAnswer) -> None:
         """Ask the nearest server of the key."""
         request, reply = called_with(key)
+        called = called_on(key)
         self._session.get(
             key,
             _answer_once(reply, on_answer),
             target=QueryTarget.BEST_MATCHING,
             consolidation=ConsolidationMode.NONE,
             congestion_control=CongestionControl.BLOCK,
+            priority=PRIORITIES[called.priority] if called else Priority.DATA,
             timeout=timeout_s,
             payload=payload,
             encoding=_encoding(request),
@@ -325,8 +358,12 @@ def _encoding(kind: type[Message] | None) -> zenoh.Encoding:
     return encoding if kind is None else encoding.with_schema(schema_name(kind))
 
 
-def _payload(kind: type[Message] | None, payload: zenoh.ZBytes | None, encoding: zenoh.Encoding | None) -> bytes:
-    """What has arrived, in our version where it is a message."""
+def _payload(
+    kind: type[Message] | None, payload: zenoh.ZBytes | None, encoding: zenoh.Encoding | None, most_bytes: int = LARGEST
+) -> bytes:
+    """What has arrived, in our version where it is a message; what is too large is refused before it is looked at."""
+    if payload is not None and len(payload) > most_bytes:
+        return Refused(f"it has {len(payload)} bytes, and at most {most_bytes} are taken there")
     data = b"" if payload is None else payload.to_bytes()
     schema = "" if encoding is None else str(encoding).partition(";")[2]
     return data if kind is None or not data else received(kind, data, schema)

@@ -471,6 +471,7 @@ EXAMPLES: list[Message] = [
                 skipped=5,
                 duplicate=6,
                 missed=7,
+                limited=9,
                 last_age_ms=8.5,
             )
         ],

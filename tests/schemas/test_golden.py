@@ -97,6 +97,13 @@ def test_what_was_wished_before_wishes_were_numbered_has_no_number():
     assert decode(type(message), msgpack.packb(fields)) == msgspec.structs.replace(message, epoch=0, number=0)
 
 
+def test_what_was_written_before_messages_were_limited_counts_none():
+    message = next(example for example in EXAMPLES if by_name(example) == "ServiceStatus")
+    fields = msgpack.unpackb(encode(message), ext_hook=msgpack.ExtType)
+    del fields["topics"][0]["limited"]
+    assert decode(type(message), msgpack.packb(fields)).topics[0].limited == 0
+
+
 def test_what_was_asked_before_routes_could_begin_here_begins_elsewhere():
     asked = msgpack.packb({"point_m": [1.0, 2.0, 3.0], "what": None, "id": None, "label": ""})
     assert msgspec.msgpack.decode(asked, type=Spot) == Spot(point_m=(1.0, 2.0, 3.0))

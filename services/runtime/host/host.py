@@ -42,6 +42,7 @@ from prior_sg.services.runtime.host.items import LastWord, Question, Work
 from prior_sg.services.runtime.host.lease import Fence, Lease
 from prior_sg.services.runtime.host.outbox import Outbox
 from prior_sg.services.runtime.host.port import Fed, Port
+from prior_sg.services.runtime.host.replays import Replays
 from prior_sg.services.runtime.host.succession import Predecessor, Standby
 from prior_sg.services.runtime.host.timing import Timing
 from prior_sg.services.runtime.host.yielding import Yielding
@@ -53,6 +54,7 @@ from prior_sg.services.runtime.service import Ask, Identity, Service
 
 log = logging.getLogger(__name__)
 FEW_INPUTS = 4  # that may wait in a process that has caught up
+MOST_QUESTIONS = 256  # that wait in one service
 
 
 class Host:
@@ -89,11 +91,12 @@ class Host:
         self._thread = ThreadPoolExecutor(1, thread_name_prefix=service.name)
         self._asks = Asks(bus, self.inbox, self.stopping)
         self._pools: dict[Topic, JobPool] = {}
-        self._slots = threading.Semaphore(CREDITS)
+        self._slots, self._asked = threading.Semaphore(CREDITS), threading.Semaphore(MOST_QUESTIONS)
         self._done = Done()
         self._progress = Progress()
         self._outbox = Outbox(service.name, identity, bus, self._progress)
         self._timing = Timing()
+        self._replays = Replays()
         self._state: Any = None
 
     async def run(self) -> None:
@@ -280,7 +283,10 @@ class Host:
             name=topic.name,
             key=key,
             fault_of=lambda message: (
-                topic.fault_of(key, message) or fault_of_writer(self._fence, message) or fault_of_clock(message)
+                topic.fault_of(key, message)
+                or fault_of_writer(self._fence, message)
+                or fault_of_clock(message)
+                or self._replays.fault_of(sample, message)
             ),
             writer=sample.writer,
         )
@@ -320,6 +326,7 @@ class Host:
 
     def _handle_question(self, question: Question) -> None:
         query, key = question.query, question.request.key
+        self._asked.release()
         fault_of = partial(query.fault_of, key)
         request = self._door.admitted(
             query.request, question.request.payload, name=query.name, key=key, fault_of=fault_of
@@ -368,7 +375,10 @@ class Host:
 
     def _queue_question(self, query: Query, request: Request) -> None:
         """Questions come first: they change nothing, and whoever asks waits."""
-        self.inbox.put(Question(query, request), first=True)
+        if self._asked.acquire(blocking=False):
+            self.inbox.put(Question(query, request), first=True)
+        else:
+            request.refuse(f"{MOST_QUESTIONS} questions wait here already; ask again later")
 
     def _offer_work(self, request: Request) -> None:
         job = self.service.job
@@ -449,6 +459,8 @@ class Host:
         log.warning("samples lost", extra={"topic": topic.name, "number": number})
 
     def _saw_consumed(self, sample: Sample) -> None:
+        if not self.inbox.allows(sample):
+            return
         admitted = partial(self._door.admitted, name=JOURNAL.name, key=sample.key, writer=sample.writer)
         match admitted(Consumed, sample.payload, fault_of=partial(JOURNAL.fault_of, sample.key)):
             case Consumed(topic="START") as entry:

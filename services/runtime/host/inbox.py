@@ -5,6 +5,7 @@ dropped and gaps counted by each writer's own sequence numbers. What comes when 
 the revisions of deltas make good for it.
 """
 
+import logging
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Hashable
@@ -13,7 +14,9 @@ from itertools import count
 from typing import Any
 
 from prior_sg.services.runtime.bus import Sample
+from prior_sg.services.runtime.host.limits import Limits
 
+log = logging.getLogger(__name__)
 MOST_WAITING = 20_000  # inputs: hours of a stream, seconds of a flood
 MOST_WRITERS = 4096  # whose newest sequence numbers are known, by key
 
@@ -26,6 +29,7 @@ class Counts:
     consumed: int = 0
     published: int = 0
     malformed: int = 0
+    limited: int = 0
     skipped: int = 0
     duplicate: int = 0
     missed: int = 0
@@ -42,6 +46,7 @@ class Inbox:
     _waiting: "OrderedDict[Hashable, Any]" = field(default_factory=OrderedDict)
     _sequences: dict[tuple[str, str], int] = field(default_factory=dict)
     _ids: count = field(default_factory=count)
+    _limits: Limits = field(default_factory=Limits)
 
     def of(self, topic: str) -> Counts:
         """The counts of a topic."""
@@ -54,6 +59,11 @@ class Inbox:
             counts.received += 1
             if not self._is_new(sample, counts):
                 counts.duplicate += 1
+                if counts.duplicate.bit_count() == 1:  # the first, second, fourth, …: repeats must fill no log
+                    about = {"topic": sample.topic.name, "key": sample.key, "writer": sample.writer}
+                    log.info("message seen before dropped", extra=about | {"repeats": counts.duplicate})
+                return
+            if not self._allows(sample):
                 return
             if sample.topic.delivery == "latest":
                 place: Hashable = (sample.topic.name, sample.key)
@@ -65,6 +75,11 @@ class Inbox:
             else:
                 place = next(self._ids)
             self._put(place, sample)
+
+    def allows(self, sample: Sample) -> bool:
+        """Whether a sample is not one of too many on its key; those are counted."""
+        with self._lock:
+            return self._allows(sample)
 
     def put(self, item: Any, once: Hashable | None = None, first: bool = False) -> None:
         """Take in anything else; with `once`, only if no item of that name is waiting; with `first`, before all."""
@@ -92,6 +107,11 @@ class Inbox:
 
     def __len__(self) -> int:
         return len(self._waiting)
+
+    def _allows(self, sample: Sample) -> bool:
+        allowed = self._limits.allow(sample)
+        self.of(sample.topic.name).limited += not allowed
+        return allowed
 
     def _put(self, place: Hashable, item: Any) -> None:
         was_empty = not self._waiting

@@ -52,5 +52,14 @@ def test_a_router_for_others_needs_keys_and_can_be_written_for_zenohd(said, tmp_
     assert config.get_json("access_control/default_permission") == '"deny"'
     assert config.get_json("transport/shared_memory/enabled") == "false"
     assert os.environ[VARIABLE] == str(bundles / "edge1")
+    assert said(*words, "--keys", str(bundles / "edge1"), "--thin-link", "500k")[0] == 0
+    assert zenoh.Config.from_file(str(file)).get_json("transport/link/tls/so_sndbuf") == "15625"
+    assert "--thin-link is of links to other hosts" in said("router", "--thin-link", "2M")[1]
+    mapper = ("up", "place_graph", "--listen", "tls/127.0.0.1:7448", "--thin-link", "2M")
+    assert (
+        "run it where ingest runs" in said(*mapper, "--keys", str(bundles / "edge1"), "--out", str(tmp_path / "o"))[1]
+    )
+    with pytest.raises(SystemExit):
+        said("router", "--thin-link", "fast")
     words = ("up", "ingest", "--robot", "robot8", "--join", "tls/127.0.0.1:7448", "--out", str(tmp_path / "out"))
     assert "these keys are of robot7" in said(*words, "--keys", str(bundles / "robot7"))[1]

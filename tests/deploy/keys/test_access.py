@@ -8,7 +8,7 @@ import msgspec
 import pytest
 import zenoh
 
-from prior_sg.deploy.keys.access import access_control, grants_of
+from prior_sg.deploy.keys.access import grants_of
 from prior_sg.deploy.keys.authority import Authority, KeysError
 from prior_sg.schemas.codec import encode
 from prior_sg.schemas.priors import Task
@@ -30,51 +30,9 @@ from prior_sg.schemas.topics import (
 from prior_sg.services.runtime import zenoh_bus
 from prior_sg.services.runtime.bus import BusError, pack_header
 from prior_sg.services.runtime.endpoints import free_endpoint
-from prior_sg.services.runtime.keys import VARIABLE, Beyond, read_bundle
+from prior_sg.services.runtime.keys import VARIABLE, read_bundle
 from prior_sg.services.runtime.zenoh_bus import ZenohBus, client_config, open_router
-
-ROBOTS = ("robotA", "robotB")
-PARTICIPANTS = (("edge", "edge1"), *(("robot", name) for name in ROBOTS), ("viewer", "anna"), ("operator", "otto"))
-
-
-def beyond(folder, listen=(), join=()):
-    bundle = read_bundle(folder)
-    return Beyond(bundle=bundle, access=access_control(bundle.about.participants, ["lo"]), listen=listen, join=join)
-
-
-class Fleet:
-    """Two authorities, an edge's router and one of robotA, and the ends of the bus that tests ask for."""
-
-    def __init__(self, folder):
-        self.own, self.foreign = Authority.create(folder / "own"), Authority.create(folder / "foreign")
-        for role, name in PARTICIPANTS:
-            self.own.add(role, name)
-        self.own.add("viewer", "late", days=0)
-        self.own.add("robot", "stolen")
-        self.foreign.add("robot", "robotA")
-        self.old = folder / "old"
-        self.own.bundle("robotB").rename(self.old)
-        self.own.rotate("robotB")
-        self.own.revoke("stolen")
-        self.tls, self.local, self.robot = (free_endpoint(f"{kind}/127.0.0.1:0") for kind in ("tls", "tcp", "tcp"))
-        edge = beyond(self.own.bundle("edge1"), listen=(self.tls,))
-        robot = beyond(self.own.bundle("robotA"), join=(self.tls,))
-        self.stops = [open_router(self.local, edge), open_router(self.robot, robot)]
-
-    def bus(self, folder, patch, wait_s=0.1):
-        patch.setenv(VARIABLE, str(folder))
-        bus = ZenohBus(self.tls, wait_s)
-        self.stops.append(bus.close)
-        return bus
-
-    def at(self, endpoint):
-        bus = ZenohBus(endpoint, 2.0)
-        self.stops.append(bus.close)
-        return bus
-
-    def close(self):
-        for stop in reversed(self.stops):
-            stop()
+from tests.help.fleet import Fleet, beyond, until, without_certificate
 
 
 @pytest.fixture(scope="module")
@@ -82,13 +40,6 @@ def fleet(tmp_path_factory):
     made = Fleet(tmp_path_factory.mktemp("fleet"))
     yield made
     made.close()
-
-
-def until(condition, timeout_s=10.0):
-    end_s = time.monotonic() + timeout_s
-    while not condition():
-        assert time.monotonic() < end_s, "did not happen"
-        time.sleep(0.02)
 
 
 def task(robot, text):
@@ -111,14 +62,6 @@ def answered(bus, key, timeout_s=1.0):
     bus.call(key, encode(task("robotA", "x")), timeout_s, lambda answer: (got.append(answer), done.set()))
     assert done.wait(timeout_s + 2)
     return got[0].payload
-
-
-def without_certificate(fleet):
-    """A client that knows the authority and has no certificate of its own."""
-    settings = json.loads(client_config(fleet.tls, read_bundle(fleet.own.bundle("anna"))).get_json("transport"))
-    tls = {"root_ca_certificate": settings["link"]["tls"]["root_ca_certificate"], "verify_name_on_connect": False}
-    config = {"mode": "client", "connect": {"endpoints": [fleet.tls], "timeout_ms": 500}}
-    return zenoh.Config.from_json5(json.dumps(config | {"transport": {"link": {"tls": tls}}}))
 
 
 @pytest.fixture

@@ -1,0 +1,36 @@
+"""A robot and an edge as two hosts, as docs/security.md sets them up, and a link that is cut in mid-stream."""
+
+import time
+
+import pytest
+
+from tests.help.hosts import Network
+from tests.help.two_hosts import TwoHosts, alone, differences
+
+FRAMES, CUT_S = 8, 10.0
+
+
+@pytest.fixture
+def pair(tmp_path):
+    with Network() as network:
+        yield TwoHosts(tmp_path, network, FRAMES, speed=0.5)
+
+
+@pytest.mark.timeout(1800)
+def test_two_hosts_by_the_documented_commands_lose_nothing_to_a_link_that_is_cut(pair, tmp_path):
+    assert "regions for 'serve drinks' after" in pair.begin()
+    pair.mapped(3)
+    pair.link.cut = True
+    before = len(pair.scene().trajectory)
+    time.sleep(CUT_S)
+    during = len(pair.scene().trajectory)
+    pair.link.cut = False
+    assert during <= before + 1 < FRAMES  # what was under way
+    scene = pair.settled()
+    different, labels = differences(scene, alone(tmp_path, pair.source))
+    assert different == [] and labels < 0.1
+    health = pair.health()
+    assert health["segmenter"]["PYRAMID"]["consumed"] >= FRAMES
+    for service, topics in health.items():
+        assert not any(count["malformed"] or count["limited"] for count in topics.values()), (service, topics)
+    assert sum(pair.link.lost) > 0
