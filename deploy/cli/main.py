@@ -26,6 +26,7 @@ def build_parser() -> argparse.ArgumentParser:
         ros,
         tools,
         view,
+        watching,
     )
     from prior_sg.deploy.cli.shared import Commands, Parser, with_example
 
@@ -52,6 +53,7 @@ def build_parser() -> argparse.ArgumentParser:
         priors,
         encoders,
         keys,
+        watching,
     ):
         module.add_commands(commands)
     return parser

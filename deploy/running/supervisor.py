@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from prior_sg.deploy.errors import UserError
+from prior_sg.deploy.running.crashes import crashes
 from prior_sg.deploy.running.serve import EXIT_HOPELESS, EXIT_SUPERSEDED
 from prior_sg.services.registry import BY_NAME
 
@@ -102,6 +103,11 @@ class Supervisor:
     config: str = ""
     children: list[Child] = field(default_factory=list)
 
+    @property
+    def crash_folder(self) -> Path:
+        """Where services leave how they died: beside the logs."""
+        return self.log_folder.parent / "crashes"
+
     def start(self, service: str, copies: int = 1) -> None:
         """Start one service, or several workers of it."""
         self.log_folder.mkdir(parents=True, exist_ok=True)
@@ -109,7 +115,7 @@ class Supervisor:
         threads = max(1, (os.cpu_count() or 1) // copies) if BY_NAME[service].job is not None else 1
         for number in range(copies):
             instance = f"{service}-{number + 1}"
-            arguments = ["--robot", self.robot, "--connect", self.connect]
+            arguments = ["--robot", self.robot, "--connect", self.connect, "--crashes", str(self.crash_folder)]
             arguments += ["--config", self.config] if self.config else []
             for setting in self.settings:
                 arguments += ["--set", setting]
@@ -156,8 +162,12 @@ class Supervisor:
                 delay_s = min(RESTART_DELAY_S * 2 ** (child.deaths - 1), MAX_RESTART_DELAY_S)
                 child.process, child.restart_at_s = None, now_s + delay_s
                 why = f": {child.last_words()}" if code > 0 else ""
-                events.append(f"{child.instance} ended ({_reason(code)}){why}; restarting")
+                events.append(f"{child.instance} ended ({_reason(code)}){why}{self._report_of(child)}; restarting")
         return events
+
+    def _report_of(self, child: Child) -> str:
+        written = crashes(self.crash_folder, time.time())
+        return next((f"; report: {one.path}" for one in written if one.instance == child.unique), "")
 
     def stop(self) -> None:
         """Ask every process to end, in order; kill what does not."""

@@ -87,6 +87,7 @@ class Service(Generic[State, Config]):
     drive: Callable[[Any, Config], Awaitable[None]] | None = None
     key_fields: Callable[[Config], dict[str, str]] = lambda cfg: {}  # config values that appear in keys of `answers`
     losses: Callable[[State], list[Loss]] = lambda state: []  # what could not be used; also read during a step
+    figures: Callable[[State], dict[str, float]] = lambda state: {}  # what it tells of itself; read as `losses` is
     close: Callable[[State], None] = lambda state: None
     replay_tolerance: float = 1e-6  # by which floats of a replay may differ; networks differ with threads and machine
     replay_config: Callable[[Config], Config] = lambda cfg: cfg  # for a replay, which touches nothing outside

@@ -14,7 +14,6 @@ from functools import partial
 from typing import Any, cast
 
 import msgspec
-import psutil
 
 from prior_sg.schemas.codec import DecodeError, Message, decode, encode, versions
 from prior_sg.schemas.status import Consumed, JobDone, ServiceStatus, Started, StatusRequest, Tick, TopicCount
@@ -41,6 +40,7 @@ from prior_sg.services.runtime.host.lease import Fence, Lease
 from prior_sg.services.runtime.host.outbox import Outbox
 from prior_sg.services.runtime.host.port import Fed, Port
 from prior_sg.services.runtime.host.timing import Timing
+from prior_sg.services.runtime.host.trail import Trail
 from prior_sg.services.runtime.jobs.board import Ended
 from prior_sg.services.runtime.jobs.dispatcher import CREDITS
 from prior_sg.services.runtime.jobs.pool import JobPool, done
@@ -78,6 +78,7 @@ class Host:
         self._progress = Progress()
         self._outbox = Outbox(service.name, identity, bus, self._progress)
         self._timing = Timing()
+        self.trail = Trail(identity.robot)
         self._state: Any = None
 
     async def run(self) -> None:
@@ -175,7 +176,7 @@ class Host:
             case Sample():
                 self._handle_sample(item)
             case Tick():
-                self._step(item)
+                self._step(item, "Tick")
                 self._outbox.journal("Tick", inline=encode(item))
             case Reply():
                 self._handle_reply(item)
@@ -184,9 +185,9 @@ class Host:
             case Work():
                 self._handle_work(item)
             case JobDone():
-                self._step(item)
+                self._step(item, "JobDone")
             case Fed():
-                self._step(item.message)
+                self._step(item.message, "frame")
                 self._loop.call_soon_threadsafe(item.done)
 
     def _handle_sample(self, sample: Sample) -> None:
@@ -205,7 +206,7 @@ class Host:
             return
         counts = self.inbox.of(sample.topic.name)
         counts.last_age_ms = (time.time_ns() - sample.sent_ns) / 1e6 if sample.sent_ns else -1.0
-        self._take(message, sample.topic.name, sample.key, sample.writer)
+        self._take(message, sample.topic.name, sample.key, sample)
         counts.consumed += 1
         known = bool(sample.writer)
         self._outbox.journal(
@@ -232,7 +233,7 @@ class Host:
             self._asks.ask_later(reply.ask)
             return
         self._asks.answered(reply.ask)
-        self._take(message, query.name, query.key, "")
+        self._take(message, query.name, query.key)
         self._outbox.journal(query.name, inline=reply.payload)
 
     def _handle_question(self, question: Question) -> None:
@@ -269,7 +270,7 @@ class Host:
             self.service.prepare(self._state, [message, *self._waiting_jobs()], self.cfg)
         before = self._outbox.written
         try:
-            self._step(message)
+            self._step(message, job.name)
         except Exception as error:  # jobs are independent of each other: one that cannot be done ends no worker
             log.exception("job failed", extra={"topic": job.name, "frame_id": getattr(message, "frame_id", -1)})
             work.request.refuse(f"failed: {error}")
@@ -297,25 +298,27 @@ class Host:
         waiting = (item.message for item in self.inbox.waiting() if isinstance(item, Work))
         return [message for message in waiting if message is not None]
 
-    def _take(self, message: Message, name: str, key: str, writer: str) -> None:
+    def _take(self, message: Message, name: str, key: str, sample: Sample | None = None) -> None:
         """Step with an input from outside: an absurd one is counted and logged, and the service goes on."""
         try:
-            self._step(message)
+            self._step(message, name, sample)
         except InputRefused as error:
-            self._door.refused(name, key, str(error), writer)
+            self._door.refused(name, key, str(error), "" if sample is None else sample.writer)
 
-    def _step(self, message: Message) -> None:
+    def _step(self, message: Message, name: str, sample: Sample | None = None) -> None:
         started_s = self._timing.begins()
-        for output in self.service.step(self._state, message, self.cfg):
-            if isinstance(output, Ask):
-                self._ask(output)
-            else:
-                self._publish(*output)
+        with self.trail.passing(message, name, self.inbox.waited_s, sample):
+            for output in self.service.step(self._state, message, self.cfg):
+                if isinstance(output, Ask):
+                    self._ask(output)
+                else:
+                    self._publish(*output)
         self._timing.stepped(started_s)
 
     def _publish(self, topic: Topic, message: Message) -> None:
         self.service.check_write(topic)
         self.inbox.of(topic.name).published += 1
+        self.trail.published(topic, message)
         if topic.delivery == "job":
             job_id = (message.robot, message.frame_id)  # type: ignore[attr-defined]
             group = getattr(message, "space", "")  # of a back-fill, which gives way to the stream
@@ -373,35 +376,32 @@ class Host:
         self._progress.changed(self._loop)
 
     def _answer_status(self, request: Request) -> None:
-        if request.payload:
-            try:
-                decode(StatusRequest, request.payload)
-            except DecodeError:
-                self.inbox.of("STATUS").malformed += 1
-                request.refuse("the request is not a valid StatusRequest")
-                return
-        request.reply(encode(self.status()))
+        try:
+            asked = decode(StatusRequest, request.payload) if request.payload else StatusRequest()
+        except DecodeError:
+            self.inbox.of("STATUS").malformed += 1
+            request.refuse("the request is not a valid StatusRequest")
+            return
+        request.reply(encode(self.status(asked)))
 
-    def status(self) -> ServiceStatus:
+    def status(self, asked: StatusRequest = StatusRequest()) -> ServiceStatus:
         """Health of this process now."""
-        figures = self._timing.figures()
         return ServiceStatus(
             service=self.service.name,
             instance=self.identity.instance,
             robot=self.identity.robot,
             pid=os.getpid(),
-            uptime_s=figures.uptime_s,
             backlog=len(self.inbox),
-            busy_share=figures.busy_share,
-            step_ms_p50=figures.step_ms_p50,
-            step_ms_p99=figures.step_ms_p99,
-            step_s=figures.step_s,
-            resident_mb=psutil.Process().memory_info().rss / 1e6,
+            oldest_wait_s=self.inbox.oldest_wait_s,
             waiting_for=self._asks.waiting_for,
             topics=[TopicCount(topic=name, **vars(counts)) for name, counts in sorted(self.inbox.counts.items())],
             losses=self.service.losses(self._state),
             clock_ns=time.time_ns(),
             release=release(),
+            pools=[pool.count() for pool in self._pools.values()],
+            figures=self.service.figures(self._state),
+            passages=self.trail.asked(asked),
+            **self._timing.figures()._asdict(),
         )
 
     async def _on_thread(self, function: Callable[..., Any], *arguments: Any) -> Any:
