@@ -74,7 +74,10 @@ def _add_system(commands: Commands) -> None:
     health = commands.add("health", cmd_health, "show every running process and its topics", "prior-sg health --json")
     health.add_argument("--json", action="store_true", help="print JSON")
     health.add_argument(
-        "--seconds", type=float, default=1.0, help="look twice, so long apart, to see losses rise (default: %(default)s)"
+        "--seconds",
+        type=float,
+        default=1.0,
+        help="look twice, so long apart, to see losses rise (default: %(default)s)",
     )
     health.add_argument(
         "--out", type=Path, default=Path("out/up"), help="folder of `up`, for reports of crashes (default: %(default)s)"

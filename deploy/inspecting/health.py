@@ -140,8 +140,8 @@ def _without_workers(found: Found) -> Iterator[Remark]:
                 )
             elif pool.waiting and pool.oldest_wait_s > LONG_WAIT_S:
                 yield Remark(
-                    f"{pool.waiting} keyframes of {one.robot} wait for {sum(pool.workers.values())} workers, the oldest "
-                    f"for {pool.oldest_wait_s:.0f} s: start another, `prior-sg up feature_pyramid --no-router`",
+                    f"{pool.waiting} keyframes of {one.robot} wait for {sum(pool.workers.values())} workers, the "
+                    f"oldest for {pool.oldest_wait_s:.0f} s: start another, `prior-sg up feature_pyramid --no-router`",
                     True,
                     "PriorSgJobsWait",
                 )
@@ -153,7 +153,10 @@ def _losing(found: Found) -> Iterator[Remark]:
         earlier = found.before.get(one.instance)
         if earlier is None:
             continue
-        counts, losses = {count.topic: count for count in earlier.topics}, {(o.what, o.reason): o for o in earlier.losses}
+        counts, losses = (
+            {count.topic: count for count in earlier.topics},
+            {(o.what, o.reason): o for o in earlier.losses},
+        )
         for count in one.topics:
             known = counts.get(count.topic)
             for what in ("malformed", "missed"):

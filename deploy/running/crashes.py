@@ -66,7 +66,7 @@ def watched(folder: str, instance: str) -> Iterator[None]:
     path.unlink(missing_ok=True)
 
 
-def report(
+def report(  # noqa: PLR0917
     folder: str, service: str, identity: Identity, error: BaseException, cfg: Any, inputs: Sequence[Passage]
 ) -> str:
     """Write a report; returns its path, "" where there is no folder or it cannot be written."""

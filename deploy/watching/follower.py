@@ -12,6 +12,7 @@ from prior_sg.services.runtime.client import BusClient
 
 log = logging.getLogger(__name__)
 PERIOD_S = 2.0
+LONGEST_GAP_NS = 60_000_000_000  # of a process that was not heard: what it has passed before is not told any more
 OnPassages = Callable[[Sequence[tuple[ServiceStatus, Passage]]], None]
 
 
@@ -51,7 +52,8 @@ class Follower:
             self._stopping.wait(PERIOD_S)
 
     def _poll(self) -> None:
-        since_ns = min(self._known_ns.values(), default=self._since_ns)
+        known_ns = self._known_ns.values() or [self._since_ns]
+        since_ns = max(min(known_ns), max(known_ns) - LONGEST_GAP_NS)
         found = asked(self._client, StatusRequest(since_ns=since_ns))
         found.processes = [one for one in found.processes if self._robot in ("", one.robot) or one.robot == "*"]
         fresh = [
@@ -60,7 +62,9 @@ class Follower:
             for passage in status.passages
             if passage.ended_ns > self._known_ns.get(status.instance, self._since_ns)
         ]
-        self._known_ns = {  # a process tells its clock before it looks for passages
+        unheard = [name for one in found.silent if (name := one["instance"]) in self._known_ns]
+        self._known_ns = {name: self._known_ns[name] for name in unheard} | {
+            # a process tells its clock before it looks for passages
             one.instance: max([one.clock_ns, *(passage.ended_ns for passage in one.passages)])
             for one in found.processes
             if one.clock_ns

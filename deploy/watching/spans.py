@@ -1,7 +1,7 @@
 """Passages of keyframes as spans of traces (pure).
 
-The trace of a keyframe is named by a digest of its robot, number and stamp, so that nothing has to travel with it: every
-span can be made from what a process tells of itself. A context that came with a sample becomes a link.
+The trace of a keyframe is named by a digest of its robot, number and stamp, so that nothing has to travel with it:
+every span can be made from what a process tells of itself. A context that came with a sample becomes a link.
 """
 
 import hashlib
@@ -97,7 +97,9 @@ def _attributes(keyframe: Keyframe, passage: Passage) -> dict[str, str | int]:
     }
     others = {"prior_sg.revision": passage.revision, "prior_sg.sent_ns": passage.sent_ns or -1}
     found |= {name: value for name, value in others.items() if value >= 0}
-    return found | ({"prior_sg.worker": passage.worker, "prior_sg.attempts": passage.attempts} if passage.worker else {})
+    return found | (
+        {"prior_sg.worker": passage.worker, "prior_sg.attempts": passage.attempts} if passage.worker else {}
+    )
 
 
 def _digest(text: str, size: int) -> int:

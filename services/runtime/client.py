@@ -93,9 +93,7 @@ class BusClient:
     def _ask(self, key: str, reply_type: type[R], request: Message, name: str, timeout_s: float) -> R:
         return self._asked(key, reply_type, request, name, timeout_s)()
 
-    def _asked(
-        self, key: str, reply_type: type[R], request: Message, name: str, timeout_s: float
-    ) -> Callable[[], R]:
+    def _asked(self, key: str, reply_type: type[R], request: Message, name: str, timeout_s: float) -> Callable[[], R]:
         """Ask, and return what waits for the reply."""
         arrived = threading.Event()
         answers: list[Answer] = []

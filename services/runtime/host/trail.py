@@ -53,9 +53,7 @@ class Trail:
         """What a request for status wants to know, oldest first."""
         with self._lock:
             kept = list(self._passages)
-        return [
-            one for one in kept if (0 <= request.frame_id == one.frame_id) or (0 < request.since_ns < one.ended_ns)
-        ]
+        return [one for one in kept if (0 <= request.frame_id == one.frame_id) or (0 < request.since_ns < one.ended_ns)]
 
     def newest(self, number: int) -> list[Passage]:
         """Oldest first."""
