@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import msgspec
 import pytest
@@ -56,7 +57,7 @@ def test_a_report_says_what_happened_without_secrets(tmp_path):
     path = report(
         str(tmp_path), "maker", WHO, failed("bad ftp://a:b@c"), Settings(), [passage("KEYFRAME", 1, frame_id=7)]
     )
-    told = json.loads(open(path).read())
+    told = json.loads(Path(path).read_text())
     assert told["error"] == "ValueError: bad ftp://c" and "test_crashes.py" in told["traceback"]
     assert told["config"]["max_tokens"] == 5 and told["config"]["url"] == "http://host/v1"
     assert told["last_inputs"][0]["frame_id"] == 7 and told["versions"]["python"] == sys.version.split()[0]
@@ -99,8 +100,7 @@ def test_a_segmentation_fault_leaves_where_its_threads_were(tmp_path):
     assert died.returncode == -signal.SIGSEGV
     (one,) = crashes(tmp_path, time.time())
     assert (one.instance, one.error) == ("maker-1-abc", "Fatal Python error: Segmentation fault")
-    with open(one.path) as file:
-        assert "ctypes" in file.read()
+    assert "ctypes" in Path(one.path).read_text()
 
 
 @pytest.fixture

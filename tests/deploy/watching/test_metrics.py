@@ -111,7 +111,7 @@ def exported():
     latencies = Latencies()
     latencies.follow(passage for _, passage in journey())
     loss = Loss(what="w", reason="r", count=1, example="")
-    text, values = told(Found([everything(), status(losses=[loss])], [], standings()), latencies)
+    text, _ = told(Found([everything(), status(losses=[loss])], [], standings()), latencies)
     labels = {}
     for family in text_string_to_metric_families(text):
         for sample in family.samples:
