@@ -25,6 +25,7 @@ from prior_sg.services.runtime.client import BusClient
 from prior_sg.services.runtime.record import Logged, read_log
 
 BAR = 24  # characters
+LEAST_WIDTH = 110
 OF_A_LOG = (KEYFRAME, PLACE_DELTA, PYRAMID, DETECTIONS, REGION_DELTA, JOURNAL)
 
 
@@ -255,10 +256,15 @@ def _joined(seen: Sequence[Step]) -> list[Step]:
 
 
 def show(story: Story, console: Terminal) -> None:
-    """A table with a bar for each step, and what is missing."""
+    """A table, with a bar for each step where there is room, and what is missing."""
     begins = [one.received_ns or one.ended_ns for _, _, one in story.steps]
     first_ns, last_ns = min(begins), max(one.ended_ns for _, _, one in story.steps)
-    table = Table("after", "waited", "step", "process", "input", "what came of it", "", title=_title(story), box=None)
+    wide = console.width >= LEAST_WIDTH + BAR
+    table = Table(title=_title(story), title_justify="left", box=None, pad_edge=False)
+    for name in ("after", "waited", "step"):
+        table.add_column(name, justify="right", no_wrap=True)
+    for name in ("process", "input", "what came of it", *(("",) if wide else ())):
+        table.add_column(name, no_wrap=name != "what came of it")
     for step in story.steps:
         one = step.passage
         table.add_row(
@@ -268,9 +274,9 @@ def show(story: Story, console: Terminal) -> None:
             step.instance,
             one.topic,
             _outcome(one),
-            _bar(one, first_ns, last_ns),
+            *([_bar(one, first_ns, last_ns)] if wide else []),
         )
-    console.print(table)
+    console.print(table, width=max(console.width, LEAST_WIDTH), crop=False)  # a narrow terminal folds what it must
     for text in story.missing:
         console.print(line((text, "red")))
 

@@ -109,7 +109,7 @@ def test_the_running_system_is_asked(endpoint, capsys):
             service.bus.serve(status_key(name, one.instance), answer)
             service.bus.announce(alive_key(name, one.instance))
         assert main(["trace", "4", "--robot", "ada", "--connect", endpoint]) == 0
-        text = capsys.readouterr().out
+        text = " ".join(capsys.readouterr().out.split())
         assert "keyframe 4 of ada" in text and "feature_pyramid-1, 1 attempt" in text and "REGION_DELTA 3" in text
         assert main(["trace", "4", "--robot", "bob", "--connect", endpoint]) == 1
         assert "no process remembers keyframe 4 of bob" in capsys.readouterr().err
