@@ -27,7 +27,7 @@ def add_commands(commands: Commands) -> None:
     add_entrance(metrics, METRICS_PORT)
     add_trace(metrics)
     add_bus(metrics, robot=False)
-    metrics.add_argument("--robot", default="", help="only this robot's processes and the fleet's (default: all)")
+    metrics.add_argument("--robot", default=None, help="only this robot's processes and the fleet's (default: all)")
 
     trace = commands.add(
         "trace",
@@ -95,7 +95,7 @@ def cmd_metrics(arguments: argparse.Namespace) -> int:
 
     entry = entrance(arguments.host, arguments.token_file)
     with until_interrupted():
-        serve_metrics(arguments.connect, arguments.robot, entry, arguments.port, arguments.trace, say_until)
+        serve_metrics(arguments.connect, arguments.robot or "", entry, arguments.port, arguments.trace, say_until)
     return 0
 
 

@@ -73,7 +73,8 @@ def from_system(client: BusClient, robot: str, frame_id: int) -> Story:
 
 def from_log(path: Path, robot: str, frame_id: int) -> Story:
     """Puts together what a log holds. Raises LogError, UserError."""
-    seen, known = [], set()
+    seen: list[Step] = []
+    known: set[int] = set()
     for logged in read_log(path, OF_A_LOG):
         if logged.key.split("/")[1] == robot or logged.topic is JOURNAL:
             known.update(_number(logged, robot))
