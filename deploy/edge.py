@@ -44,7 +44,7 @@ def _no_text(argument: str) -> str:
 def check_arguments(arguments: argparse.Namespace) -> None:
     """Check, and bring to one spelling, what the options of any command name. Raises UserError."""
     given = vars(arguments)
-    if "robot" in given:
+    if given.get("robot") is not None:  # None = of all robots
         check_robot(arguments.robot)
     environments = given.get("environment") or ""
     for environment in [environments] if isinstance(environments, str) else environments:

@@ -4,7 +4,9 @@ from typing import ClassVar
 
 import msgspec
 
-from prior_sg.schemas.codec import Message, Number, NumberOrNone, Stamp
+from prior_sg.schemas.codec import Message, Number, NumberOrNone, Part, Stamp
+
+STEP_BOUNDS_S = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0)
 
 
 class Consumed(Message, frozen=True, kw_only=True):
@@ -101,8 +103,43 @@ class Loss(msgspec.Struct, frozen=True, kw_only=True):
     example: str  # the first, in full
 
 
+class PoolCount(msgspec.Struct, frozen=True, kw_only=True):
+    """Jobs that a process has given to workers, and those that wait for one."""
+
+    topic: str
+    waiting: int
+    running: int
+    oldest_wait_s: float  # of those that wait, since they were given
+    workers: dict[str, int]  # alive, by the work they do (an embedding space)
+
+
+class Passage(Part, frozen=True, kw_only=True):
+    """One input on its way through one process: a keyframe or what was made of it. Times are of this process's host,
+    but `sent_ns`, which is of the writer's.
+    """
+
+    robot: str
+    topic: str  # topic, job or message name
+    frame_id: NumberOrNone = -1  # of the input, else of what was published for it
+    revision: NumberOrNone = -1  # of a delta
+    stamp_ns: Stamp = 0  # when it was captured
+    sent_ns: Stamp = 0  # 0 = it did not come by a topic
+    received_ns: Stamp = 0
+    began_ns: Stamp = 0
+    ended_ns: Stamp = 0
+    writer: str = ""
+    traceparent: str = ""  # context of the writer, where it told one
+    published: dict[str, int] = {}  # topics, each with its last revision, -1 = it has none
+    worker: str = ""  # of a job that is over: who did it
+    attempts: int = 0
+    fault: str = ""  # why it could not be used, or was given up
+
+
 class StatusRequest(Message, frozen=True, kw_only=True):
-    """Ask a process for its health."""
+    """Ask a process for its health; also for its passages of one keyframe, or of all that ended after a time."""
+
+    frame_id: NumberOrNone = -1  # -1 = of none
+    since_ns: Stamp = 0  # 0 = of no time
 
 
 class ServiceStatus(Message, frozen=True, kw_only=True):
@@ -126,3 +163,10 @@ class ServiceStatus(Message, frozen=True, kw_only=True):
     step_s: float = 0.0  # since when it has been at one input
     clock_ns: Stamp = 0  # of its host when it answered; 0 = not told
     release: str = ""  # of the program it runs
+    cpu_s: float = 0.0  # processor time since it started
+    oldest_wait_s: float = 0.0  # of the inputs that wait
+    step_counts: list[int] = []  # steps by how long they took: as long as STEP_BOUNDS_S, and longer than all
+    step_sum_s: float = 0.0
+    pools: list[PoolCount] = []
+    figures: dict[str, float] = {}  # of the service itself
+    passages: list[Passage] = []  # oldest first, where they were asked for

@@ -10,6 +10,7 @@ from prior_sg.deploy.cli.jobs import add_run_options, settings_of
 from prior_sg.deploy.cli.ros_results import add_ros, bridge_arguments, check_ros
 from prior_sg.deploy.cli.shared import Commands, add_bus, add_router, console, open_client, until_interrupted, wait
 from prior_sg.deploy.cli.source_options import add_source_options, read_options
+from prior_sg.deploy.cli.watching import add_metrics, check_metrics, open_metrics
 from prior_sg.deploy.edge import names_in
 from prior_sg.deploy.errors import UserError
 from prior_sg.deploy.running import serve
@@ -46,6 +47,7 @@ def add_commands(commands: Commands) -> None:
         action="store_true",
         help="kill and start again what exists and is not heard; default: say so, for it may be stopped on purpose",
     )
+    add_metrics(up)
     add_ros(up)
     add_run_options(up)
     add_source_options(up)
@@ -91,6 +93,7 @@ def cmd_up(arguments: argparse.Namespace) -> int:
             raise UserError(f"there is no service {name!r}; known: {', '.join(BY_NAME)}")
     if arguments.api is not None:
         extras.require("api", "prior-sg up --api")
+    check_metrics(arguments)
     if arguments.ros is not None:
         check_ros(arguments)
     with claimed_folder(arguments.out):
@@ -146,6 +149,8 @@ def _stay_up(arguments: argparse.Namespace, names: list[str]) -> int:
                 supervisor.start(name, arguments.workers if BY_NAME[name].job is not None else 1)
             if arguments.api is not None:
                 _open_api(supervisor, arguments.api)
+            if arguments.metrics is not None:
+                open_metrics(supervisor, arguments.metrics, arguments.trace)
             if arguments.ros is not None:
                 supervisor.start_door("ros", "prior_sg.deploy.ros.process", bridge_arguments(arguments))
             listening = " and ".join((arguments.connect, *arguments.listen))

@@ -27,6 +27,7 @@ def build_parser() -> argparse.ArgumentParser:
         swap,
         tools,
         view,
+        watching,
     )
     from prior_sg.deploy.cli.shared import Commands, Parser, with_example
 
@@ -54,6 +55,7 @@ def build_parser() -> argparse.ArgumentParser:
         priors,
         encoders,
         keys,
+        watching,
     ):
         module.add_commands(commands)
     return parser

@@ -74,6 +74,15 @@ def _add_system(commands: Commands) -> None:
 
     health = commands.add("health", cmd_health, "show every running process and its topics", "prior-sg health --json")
     health.add_argument("--json", action="store_true", help="print JSON")
+    health.add_argument(
+        "--seconds",
+        type=float,
+        default=1.0,
+        help="look twice, so long apart, to see losses rise (default: %(default)s)",
+    )
+    health.add_argument(
+        "--out", type=Path, default=Path("out/up"), help="folder of `up`, for reports of crashes (default: %(default)s)"
+    )
     add_bus(health, robot=False)
 
     evaluation.add_arguments(
@@ -210,13 +219,18 @@ def cmd_topics(arguments: argparse.Namespace) -> int:
 def cmd_health(arguments: argparse.Namespace) -> int:
     """Every process: alive, busy, what it dropped."""
     from prior_sg.deploy.inspecting.health import look
+    from prior_sg.deploy.running.crashes import crashes, sentence
 
     with open_client(arguments.connect) as client:
-        found = look(client)
+        found = look(client, max(arguments.seconds, 0.0))
+    now_s = time.time()
+    died = [sentence(one, now_s) for one in crashes(arguments.out / "crashes", now_s)]
     if arguments.json:
-        print(json.dumps(found.plain()))
+        print(json.dumps(found.plain() | {"crashes": died}))
     else:
         _print_health(found)
+        for text in died:
+            console.print(text)
     return 0 if found.well else 1
 
 

@@ -16,6 +16,7 @@ from typing import Any
 from prior_sg import services
 from prior_sg.deploy.edge import check_arguments
 from prior_sg.deploy.errors import UserError
+from prior_sg.deploy.running import crashes
 from prior_sg.deploy.settings import DEFAULT_ROBOT, add_keys, connect_in_force, resolved_config, use_keys
 from prior_sg.deploy.terminal import complain
 from prior_sg.schemas.topics import EPOCH
@@ -58,6 +59,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--log-level", default="info", choices=("debug", "info", "warning", "error"))
     parser.add_argument("--parent", type=int, default=0, help="end when this process is gone")
+    parser.add_argument("--crashes", default="", metavar="FOLDER", help="write there how the service died, if it does")
 
 
 async def serve(arguments: argparse.Namespace, instance: str) -> bool:
@@ -68,14 +70,30 @@ async def serve(arguments: argparse.Namespace, instance: str) -> bool:
     cfg = resolved_config(service, arguments.config, arguments.set)
     robot = arguments.robot if service.scope == "robot" else "*"
     identity = Identity(robot, instance, time.time_ns())
-    return await stay(service, cfg, identity, arguments.connect, arguments.parent, succeeds=arguments.succeeds)
+    return await stay(
+        service,
+        cfg,
+        identity,
+        arguments.connect,
+        arguments.parent,
+        succeeds=arguments.succeeds,
+        crash_folder=arguments.crashes,
+    )
 
 
 async def stay(
-    service: Service, cfg: Any, identity: Identity, connect: str, parent: int = 0, *, succeeds: str = ""
+    service: Service,
+    cfg: Any,
+    identity: Identity,
+    connect: str,
+    parent: int = 0,
+    *,
+    succeeds: str = "",
+    crash_folder: str = "",
 ) -> bool:
     """Run a service on the bus of a router until a signal, until the parent, if there is one, is gone, or until another
-    takes over: then True. `succeeds` is the instance from which this process takes over.
+    takes over: then True. `succeeds` is the instance from which this process takes over. Where it fails by a fault of
+    its own, a report goes to the folder, if there is one.
     """
     bus = await asyncio.to_thread(ZenohBus, connect)
     stopping = asyncio.Event()
@@ -83,11 +101,21 @@ async def stay(
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, stopping.set)
     watcher = asyncio.create_task(_stop_with_parent(stopping, parent))
+    host = None
     try:
         host = await _unless(stopping, _in_charge(service, bus, cfg, identity, succeeds))
         if host is not None:
             await _stopped_by(stopping, host)
         return host is not None and host.yielded
+    except (*HOPELESS, SupersededError):
+        raise
+    except Exception as error:
+        if isinstance(error, ModuleNotFoundError) and extras.advice(error) is not None:
+            raise
+        inputs = host.trail.newest(crashes.LAST_INPUTS) if host is not None else []
+        if path := crashes.report(crash_folder, service.name, identity, error, cfg, inputs):
+            log.error("crash report written", extra={"path": path})
+        raise
     finally:
         watcher.cancel()
         bus.close()  # also when the service never got so far as to leave by itself
@@ -169,7 +197,8 @@ def run(arguments: argparse.Namespace) -> int:
             import uvloop
 
             asyncio.set_event_loop_policy(uvloop.EventLoopPolicy())
-        yielded = asyncio.run(serve(arguments, instance))
+        with crashes.watched(arguments.crashes, instance):
+            yielded = asyncio.run(serve(arguments, instance))
     except HOPELESS as error:
         log.error(str(error))
         return EXIT_HOPELESS

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from prior_sg.deploy.errors import UserError
+from prior_sg.deploy.running.crashes import crashes
 from prior_sg.deploy.running.serve import EXIT_HOPELESS, EXIT_SUPERSEDED
 from prior_sg.services.registry import BY_NAME
 
@@ -127,6 +128,11 @@ class Supervisor:
     hears: Callable[[str], bool] = lambda unique: True  # whether a process is seen on the bus
     exchanges: list[Exchange] = field(default_factory=list)
 
+    @property
+    def crash_folder(self) -> Path:
+        """Where services leave how they died: beside the logs."""
+        return self.log_folder.parent / "crashes"
+
     def start(self, service: str, copies: int = 1) -> None:
         """Start one service, or several workers of it."""
         self.log_folder.mkdir(parents=True, exist_ok=True)
@@ -138,7 +144,7 @@ class Supervisor:
     def _start(
         self, service: str, instance: str, threads: int, config: str, *, settings: Sequence[str], succeeds: str = ""
     ) -> Child:
-        arguments = ["--robot", self.robot, "--connect", self.connect]
+        arguments = ["--robot", self.robot, "--connect", self.connect, "--crashes", str(self.crash_folder)]
         arguments += ["--config", config] if config else []
         for setting in settings:
             arguments += ["--set", setting]
@@ -207,7 +213,7 @@ class Supervisor:
                 delay_s = min(RESTART_DELAY_S * 2 ** (child.deaths - 1), MAX_RESTART_DELAY_S)
                 child.process, child.restart_at_s = None, now_s + delay_s
                 why = f": {child.last_words()}" if code > 0 else ""
-                events.append(f"{child.instance} ended ({_reason(code)}){why}; restarting")
+                events.append(f"{child.instance} ended ({_reason(code)}){why}{self._report_of(child)}; restarting")
         return events
 
     def _exchanged(self) -> list[str]:
@@ -231,6 +237,10 @@ class Supervisor:
                 continue
             self.exchanges.remove(one)
         return events
+
+    def _report_of(self, child: Child) -> str:
+        written = crashes(self.crash_folder, time.time())
+        return next((f"; report: {one.path}" for one in written if one.instance == child.unique), "")
 
     def stop(self) -> None:
         """Ask every process to end, in order; kill what does not, and all of them when this is interrupted."""

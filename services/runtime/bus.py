@@ -18,7 +18,8 @@ from prior_sg.services.errors import PriorSgError
 
 HEADER = struct.Struct("<Qq")
 WRITER = re.compile(r"[\w.:-]+(/[\w.:-]+)*")
-LONGEST_WRITER = 256  # bytes of a writer's name
+LONGEST_WRITER = 256  # bytes of a writer's name and its context
+TRACEPARENT = re.compile(r"00-(?!0{32})[0-9a-f]{32}-(?!0{16})[0-9a-f]{16}-[0-9a-f]{2}")
 
 
 class BusError(PriorSgError):
@@ -38,6 +39,7 @@ class Sample:
     writer: str
     sequence: int
     sent_ns: int
+    traceparent: str = ""  # the sender's context, as W3C's Trace Context writes it; empty = it told none
 
 
 def message_in(sample: Sample) -> Any:
@@ -107,18 +109,21 @@ class Bus(Protocol):
         """Leave the bus."""
 
 
-def pack_header(writer: str, sequence: int, sent_ns: int) -> bytes:
-    """Who sent a sample and as which of its samples on that key."""
-    return HEADER.pack(sequence, sent_ns) + writer.encode()
+def pack_header(writer: str, sequence: int, sent_ns: int, traceparent: str = "") -> bytes:
+    """Who sent a sample and as which of its samples on that key, and in which context if it has one: an older program
+    then reads the sample as one of an unknown writer."""
+    return HEADER.pack(sequence, sent_ns) + (f"{writer};{traceparent}" if traceparent else writer).encode()
 
 
-def unpack_header(header: bytes | None) -> tuple[str, int, int]:
-    """Writer, sequence and time of sending; an absent or damaged header gives an unknown writer."""
+def unpack_header(header: bytes | None) -> tuple[str, int, int, str]:
+    """Writer, sequence, time of sending and context; an absent or damaged header gives an unknown writer."""
     if header is None or not HEADER.size < len(header) <= HEADER.size + LONGEST_WRITER:
-        return "", -1, 0
+        return "", -1, 0, ""
     sequence, sent_ns = HEADER.unpack_from(header)
-    writer = header[HEADER.size :].decode(errors="replace")
-    return (writer, sequence, sent_ns) if WRITER.fullmatch(writer) else ("", -1, 0)
+    writer, _, context = header[HEADER.size :].decode(errors="replace").partition(";")
+    if not WRITER.fullmatch(writer):
+        return "", -1, 0, ""
+    return writer, sequence, sent_ns, context if context and TRACEPARENT.fullmatch(context) else ""
 
 
 def key_matches(pattern: str, key: str) -> bool:

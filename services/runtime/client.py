@@ -72,12 +72,13 @@ class BusClient:
     ) -> None:
         self.bus.close()
 
-    def publish(self, topic: Topic, message: Message) -> int:
-        """Publish one message; returns which of ours on its key it is, from 0."""
+    def publish(self, topic: Topic, message: Message, traceparent: str = "") -> int:
+        """Publish one message, in the context of a trace if there is one; returns which of ours on its key it is, from
+        0."""
         key = topic.key_of(message)
         sequence = self._sequences.get(key, 0)
         self._sequences[key] = sequence + 1
-        self.bus.put(topic, key, encode(message), pack_header(self.writer, sequence, time.time_ns()))
+        self.bus.put(topic, key, encode(message), pack_header(self.writer, sequence, time.time_ns(), traceparent))
         return sequence
 
     def listen(self, topic: Topic, robot: str, on_sample: Callable[[Sample], None]) -> Callable[[], None]:
@@ -98,6 +99,10 @@ class BusClient:
         return self._ask(query.key_of(request), query.reply, request, query.name, timeout_s)
 
     def _ask(self, key: str, reply_type: type[R], request: Message, name: str, timeout_s: float) -> R:
+        return self._asked(key, reply_type, request, name, timeout_s)()
+
+    def _asked(self, key: str, reply_type: type[R], request: Message, name: str, timeout_s: float) -> Callable[[], R]:
+        """Ask, and return what waits for the reply."""
         arrived = threading.Event()
         answers: list[Answer] = []
 
@@ -105,17 +110,22 @@ class BusClient:
             answers.append(answer)
             arrived.set()
 
+        def reply() -> R:
+            if not arrived.wait(timeout_s + 1.0):
+                raise BusError(
+                    f"{name}: no answer within {timeout_s:.0f} s; is the service running (`prior-sg health`)?"
+                )
+            answer = answers[0]
+            if answer.payload is None:
+                kind = NobodyError if answer.reason == NOBODY else BusError
+                raise kind(f"{name}: {_explain(answer.reason)}")
+            try:
+                return decode(reply_type, answer.payload)
+            except DecodeError as error:
+                raise BusError(f"{name}: the answer is not valid: {error}") from error
+
         self.bus.call(key, encode(request), timeout_s, receive)
-        if not arrived.wait(timeout_s + 1.0):
-            raise BusError(f"{name}: no answer within {timeout_s:.0f} s; is the service running (`prior-sg health`)?")
-        answer = answers[0]
-        if answer.payload is None:
-            kind = NobodyError if answer.reason == NOBODY else BusError
-            raise kind(f"{name}: {_explain(answer.reason)}")
-        try:
-            return decode(reply_type, answer.payload)
-        except DecodeError as error:
-            raise BusError(f"{name}: the answer is not valid: {error}") from error
+        return reply
 
     def task_stamp_ns(self, robot: str) -> int:
         """The stamp of a task given now: after the one in force, whatever the clock of the host that gave it said.
@@ -203,6 +213,24 @@ class BusClient:
     def swap(self, service: str, instance: str, request: SwapRequest, timeout_s: float) -> Swapped:
         """Have a process exchanged by who started it. Raises BusError where nobody answers."""
         return self._ask(swap_key(service, instance), Swapped, request, f"exchange of {instance}", timeout_s)
+
+    def statuses(
+        self, request: StatusRequest = StatusRequest(), timeout_s: float = 3.0
+    ) -> tuple[list[ServiceStatus], dict[str, str]]:
+        """Health of all who are alive, asked at once, sorted by instance; why others did not answer, by instance."""
+        replies = {
+            instance: self._asked(
+                status_key(service, instance), ServiceStatus, request, f"status of {instance}", timeout_s
+            )
+            for instance, service in sorted(self.alive().items())
+        }
+        heard, silent = [], {}
+        for instance, reply in replies.items():
+            try:
+                heard.append(reply())
+            except BusError as error:
+                silent[instance] = str(error)
+        return heard, silent
 
     def _saw(self, key: str, alive: bool) -> None:
         service, instance = key.split("/")[-2:]

@@ -27,6 +27,7 @@ MODULES = {  # by extra; what the build file lists there, by the names that code
     "postgres": ("psycopg",),
     "api": ("litestar", "uvicorn"),
     "mcp": ("mcp",),
+    "ops": ("prometheus_client", "opentelemetry.sdk", "opentelemetry.exporter.otlp.proto.http", "uvicorn"),
     "view": ("viser",),
     "rerun": ("rerun",),
     "foxglove": ("foxglove",),
@@ -64,21 +65,28 @@ def release() -> str:
 def require(extra: str, user: str) -> None:
     """Raise ExtraMissing on behalf of `user` unless all packages of an extra are there; "" asks for none."""
     modules = [name for one in (extra, *CONTAINS.get(extra, ())) if one for name in MODULES[one]]
-    if absent := [name for name in modules if find_spec(name) is None]:
+    if absent := [name for name in modules if not _is_there(name)]:
         raise ExtraMissing(f"{user} needs {', '.join(absent)}: {remedy(extra)}")
 
 
 def require_module(module: str, user: str) -> None:
     """Raise ExtraMissing on behalf of `user` unless one package is there; it can do without its extra's others."""
-    if find_spec(module) is None:
+    if not _is_there(module):
         extra = next(extra for extra, modules in MODULES.items() if module in modules)
         raise ExtraMissing(f"{user} needs {module}: {remedy(extra)}, or `pip install {module}`")
+
+
+def _is_there(module: str) -> bool:
+    try:
+        return find_spec(module) is not None
+    except ModuleNotFoundError:  # not even the package around it
+        return False
 
 
 def advice(error: ModuleNotFoundError) -> str | None:
     """One sentence for a failed import; None where no extra would have brought the package."""
     module = (error.name or "").split(".")[0]
-    extra = next((extra for extra, modules in MODULES.items() if module in modules), None)
+    extra = next((extra for extra, names in MODULES.items() if module in {name.split(".")[0] for name in names}), None)
     return None if extra is None else f"{module} is not installed: {remedy(extra)}"
 
 

@@ -104,6 +104,7 @@ class Service(Generic[State, Config]):
     drive: Callable[[Any, Config], Awaitable[None]] | None = None
     key_fields: Callable[[Config], dict[str, str]] = lambda cfg: {}  # config values that appear in keys of `answers`
     losses: Callable[[State], list[Loss]] = lambda state: []  # what could not be used; also read during a step
+    figures: Callable[[State], dict[str, float]] = lambda state: {}  # what it tells of itself; read as `losses` is
     close: Callable[[State], None] = lambda state: None
     handover: Handover | None = None  # without: a successor begins anew
     beside: bool = False  # a successor serves before its predecessor ends; else, without `handover`, after

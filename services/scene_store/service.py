@@ -202,6 +202,12 @@ def answer_epoch(state: State, request: EpochRequest, cfg: core.Config) -> Epoch
     return EpochKnown(robot=request.robot, topic=request.topic, epoch=follower.epoch, revision=follower.revision)
 
 
+def figures(state: State) -> dict[str, float]:
+    """What is kept, and the room that is left for it."""
+    kept = {"revisions": sum(max(robot.graph.revision, 0) for robot in tuple(state.robots.values()))}
+    return kept | state.database.storage.room()
+
+
 def close(state: State) -> None:
     """Close the database."""
     state.database.close()
@@ -226,6 +232,7 @@ SERVICE = Service(
     key_fields=lambda cfg: {"keeper": "scene_store"},
     asks=(PLACE_SNAPSHOT, REGION_SNAPSHOT, OBJECT_SNAPSHOT),
     tick_s=CHECKPOINT_S,
+    figures=figures,
     close=close,
     replay_config=lambda cfg: msgspec.structs.replace(cfg, path=":memory:"),
 )

@@ -448,7 +448,7 @@ EXAMPLES: list[Message] = [
     status.JobDone(topic="T", frame_id=1, worker="w", attempts=2, error="e"),
     status.EpochRequest(robot="r", topic="T", keeper="k"),
     status.EpochKnown(robot="r", topic="T", epoch=1, revision=2),
-    status.StatusRequest(),
+    status.StatusRequest(frame_id=1, since_ns=2),
     status.ServiceStatus(
         service="s",
         instance="i",
@@ -479,6 +479,31 @@ EXAMPLES: list[Message] = [
         step_s=7.5,
         clock_ns=8,
         release="1",
+        cpu_s=9.5,
+        oldest_wait_s=10.5,
+        step_counts=[1, 2],
+        step_sum_s=11.5,
+        pools=[status.PoolCount(topic="T", waiting=1, running=2, oldest_wait_s=3.5, workers={"w": 4})],
+        figures={"f": 12.5},
+        passages=[
+            status.Passage(
+                robot="r",
+                topic="T",
+                frame_id=1,
+                revision=2,
+                stamp_ns=3,
+                sent_ns=4,
+                received_ns=5,
+                began_ns=6,
+                ended_ns=7,
+                writer="w",
+                traceparent="t",
+                published={"P": 8},
+                worker="v",
+                attempts=9,
+                fault="f",
+            )
+        ],
     ),
 ]
 

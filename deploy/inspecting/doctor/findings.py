@@ -4,14 +4,13 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from prior_sg.deploy.inspecting.health import Found
+from prior_sg.deploy.inspecting.health import LEAST_FREE_B, Found
 from prior_sg.deploy.limits import FILES_WANTED, fault_of_files
 from prior_sg.schemas.migrations import tells_of_versions
 from prior_sg.schemas.status import ServiceStatus
 from prior_sg.services.refusals import CLOCK_SET_NS
 
 CLOCK_LIMIT_S = 2.0  # by which clocks may differ, beyond what asking takes
-LEAST_FREE_B = 200e6  # a database, logs and a recording of some minutes
 UPDATE = "pip install --upgrade prior-sg"
 SET_CLOCK = "timedatectl set-ntp true"
 START = "prior-sg up"

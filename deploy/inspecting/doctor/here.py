@@ -12,6 +12,7 @@ from typing import Any
 from prior_sg.deploy.errors import UserError
 from prior_sg.deploy.inspecting.doctor.findings import UPDATE, Cache, Finding, Folder, Here, Keys
 from prior_sg.deploy.limits import check_memory, files_allowed
+from prior_sg.deploy.running.crashes import crashes, sentence
 from prior_sg.services import folders
 from prior_sg.services.errors import PriorSgError
 from prior_sg.services.runtime import extras
@@ -35,7 +36,7 @@ def of_this_host(asked: Asked) -> Here:
     """Changes nothing, not even by trying to write."""
     keys, told = _keys()
     return Here(
-        told=[*_limits(), *told, *_services(asked)],
+        told=[*_limits(), *told, *_services(asked), *_crashes(asked.out / "crashes", time.time())],
         clock_ns=time.time_ns(),
         keys=keys,
         folders=[_folder("results and logs", asked.out, "prior-sg up --out FOLDER")],
@@ -145,6 +146,11 @@ def _mend_of_store(path: str, said: str) -> str:
     if "is locked" in said:
         return f"fuser -v {path}"
     return f"mv {path} {path}.aside" if "move the file away" in said else "prior-sg up --set scene_store.path=PATH"
+
+
+def _crashes(folder: Path, now_s: float) -> Iterator[Finding]:
+    for one in crashes(folder, now_s):
+        yield Finding("crashes", f"{sentence(one, now_s)}; send it to who maintains this, then", f"rm -r {folder}")
 
 
 def _said(topic: str, error: PriorSgError, otherwise: str) -> Finding:

@@ -14,7 +14,6 @@ from functools import partial
 from typing import Any, cast
 
 import msgspec
-import psutil
 
 from prior_sg.schemas.codec import DecodeError, Message, decode, encode, versions
 from prior_sg.schemas.status import Consumed, JobDone, ServiceStatus, Started, StatusRequest, Tick, TopicCount
@@ -45,6 +44,7 @@ from prior_sg.services.runtime.host.port import Fed, Port
 from prior_sg.services.runtime.host.replays import Replays
 from prior_sg.services.runtime.host.succession import Predecessor, Standby
 from prior_sg.services.runtime.host.timing import Timing
+from prior_sg.services.runtime.host.trail import Trail
 from prior_sg.services.runtime.host.yielding import Yielding
 from prior_sg.services.runtime.jobs.board import Ended
 from prior_sg.services.runtime.jobs.dispatcher import CREDITS
@@ -97,6 +97,7 @@ class Host:
         self._outbox = Outbox(service.name, identity, bus, self._progress)
         self._timing = Timing()
         self._replays = Replays()
+        self.trail = Trail(identity.robot)
         self._state: Any = None
 
     async def run(self) -> None:
@@ -248,8 +249,9 @@ class Host:
             case Sample():
                 self._handle_sample(item)
             case Tick() | Succession() | TakesOver():
-                self._step(item)
-                self._outbox.journal(type(item).__name__, inline=encode(item))
+                name = type(item).__name__
+                self._step(item, name)
+                self._outbox.journal(name, inline=encode(item))
             case Reply():
                 self._handle_reply(item)
             case Question():
@@ -257,9 +259,9 @@ class Host:
             case Work():
                 self._handle_work(item)
             case JobDone():
-                self._step(item)
+                self._step(item, "JobDone")
             case Fed():
-                self._step(item.message)
+                self._step(item.message, "frame")
                 self._loop.call_soon_threadsafe(item.done)
             case LastWord():
                 self._say_last_word()
@@ -294,7 +296,7 @@ class Host:
             return
         counts = self.inbox.of(sample.topic.name)
         counts.last_age_ms = (time.time_ns() - sample.sent_ns) / 1e6 if sample.sent_ns else -1.0
-        self._take(message, sample.topic.name, sample.key, sample.writer)
+        self._take(message, sample.topic.name, sample.key, sample)
         counts.consumed += 1
         known = bool(sample.writer)
         self._outbox.journal(
@@ -321,7 +323,7 @@ class Host:
             self._asks.ask_later(reply.ask)
             return
         self._asks.answered(reply.ask)
-        self._take(message, query.name, query.key, "")
+        self._take(message, query.name, query.key)
         self._outbox.journal(query.name, inline=reply.payload)
 
     def _handle_question(self, question: Question) -> None:
@@ -363,7 +365,7 @@ class Host:
             self.service.prepare(self._state, [message, *self._waiting_jobs()], self.cfg)
         before = self._outbox.written
         try:
-            self._step(message)
+            self._step(message, job.name)
         except Exception as error:  # jobs are independent of each other: one that cannot be done ends no worker
             log.exception("job failed", extra={"topic": job.name, "frame_id": getattr(message, "frame_id", -1)})
             work.request.refuse(f"failed: {error}")
@@ -395,25 +397,27 @@ class Host:
         waiting = (item.message for item in self.inbox.waiting() if isinstance(item, Work))
         return [message for message in waiting if message is not None]
 
-    def _take(self, message: Message, name: str, key: str, writer: str) -> None:
+    def _take(self, message: Message, name: str, key: str, sample: Sample | None = None) -> None:
         """Step with an input from outside: an absurd one is counted and logged, and the service goes on."""
         try:
-            self._step(message)
+            self._step(message, name, sample)
         except InputRefused as error:
-            self._door.refused(name, key, str(error), writer)
+            self._door.refused(name, key, str(error), "" if sample is None else sample.writer)
 
-    def _step(self, message: Message) -> None:
+    def _step(self, message: Message, name: str, sample: Sample | None = None) -> None:
         started_s = self._timing.begins()
-        for output in self.service.step(self._state, message, self.cfg):
-            if isinstance(output, Ask):
-                self._ask(output)
-            else:
-                self._publish(*output)
+        with self.trail.passing(message, name, self.inbox.waited_s, sample):
+            for output in self.service.step(self._state, message, self.cfg):
+                if isinstance(output, Ask):
+                    self._ask(output)
+                else:
+                    self._publish(*output)
         self._timing.stepped(started_s)
 
     def _publish(self, topic: Topic, message: Message) -> None:
         self.service.check_write(topic)
         self.inbox.of(topic.name).published += 1
+        self.trail.published(topic, message)
         if topic.delivery == "job":
             job_id = (message.robot, message.frame_id)  # type: ignore[attr-defined]
             group = getattr(message, "space", "")  # of a back-fill, which gives way to the stream
@@ -477,35 +481,32 @@ class Host:
         self._progress.changed(self._loop)
 
     def _answer_status(self, request: Request) -> None:
-        if request.payload:
-            try:
-                decode(StatusRequest, request.payload)
-            except DecodeError:
-                self.inbox.of("STATUS").malformed += 1
-                request.refuse("the request is not a valid StatusRequest")
-                return
-        request.reply(encode(self.status()))
+        try:
+            asked = decode(StatusRequest, request.payload) if request.payload else StatusRequest()
+        except DecodeError:
+            self.inbox.of("STATUS").malformed += 1
+            request.refuse("the request is not a valid StatusRequest")
+            return
+        request.reply(encode(self.status(asked)))
 
-    def status(self) -> ServiceStatus:
+    def status(self, asked: StatusRequest = StatusRequest()) -> ServiceStatus:
         """Health of this process now."""
-        figures = self._timing.figures()
         return ServiceStatus(
             service=self.service.name,
             instance=self.identity.instance,
             robot=self.identity.robot,
             pid=os.getpid(),
-            uptime_s=figures.uptime_s,
             backlog=len(self.inbox),
-            busy_share=figures.busy_share,
-            step_ms_p50=figures.step_ms_p50,
-            step_ms_p99=figures.step_ms_p99,
-            step_s=figures.step_s,
-            resident_mb=psutil.Process().memory_info().rss / 1e6,
+            oldest_wait_s=self.inbox.oldest_wait_s,
             waiting_for=self._asks.waiting_for,
             topics=[TopicCount(topic=name, **vars(counts)) for name, counts in sorted(self.inbox.counts.items())],
             losses=self.service.losses(self._state),
             clock_ns=time.time_ns(),
             release=release(),
+            pools=[pool.count() for pool in self._pools.values()],
+            figures=self.service.figures(self._state),
+            passages=self.trail.asked(asked),
+            **self._timing.figures()._asdict(),
         )
 
     async def _on_thread(self, function: Callable[..., Any], *arguments: Any) -> Any:

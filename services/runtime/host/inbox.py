@@ -7,6 +7,7 @@ the revisions of deltas make good for it.
 
 import logging
 import threading
+import time
 from collections import OrderedDict
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field
@@ -43,7 +44,8 @@ class Inbox:
     wake: Callable[[], None]
     counts: dict[str, Counts] = field(default_factory=dict)
     _lock: threading.Lock = field(default_factory=threading.Lock)
-    _waiting: "OrderedDict[Hashable, Any]" = field(default_factory=OrderedDict)
+    waited_s: float = 0.0  # what was taken last
+    _waiting: "OrderedDict[Hashable, tuple[float, Any]]" = field(default_factory=OrderedDict)  # since when, what
     _sequences: dict[tuple[str, str], int] = field(default_factory=dict)
     _ids: count = field(default_factory=count)
     _limits: Limits = field(default_factory=Limits)
@@ -98,12 +100,23 @@ class Inbox:
     def take(self) -> Any | None:
         """The oldest item, or None."""
         with self._lock:
-            return self._waiting.popitem(last=False)[1] if self._waiting else None
+            if not self._waiting:
+                return None
+            since_s, item = self._waiting.popitem(last=False)[1]
+        self.waited_s = time.monotonic() - since_s
+        return item
 
     def waiting(self) -> list[Any]:
         """What waits, oldest first."""
         with self._lock:
-            return list(self._waiting.values())
+            return [item for _, item in self._waiting.values()]
+
+    @property
+    def oldest_wait_s(self) -> float:
+        """How long the input that waits longest has been waiting; 0 where none does."""
+        now_s = time.monotonic()
+        with self._lock:
+            return max((now_s - since_s for since_s, _ in self._waiting.values()), default=0.0)
 
     def __len__(self) -> int:
         return len(self._waiting)
@@ -115,7 +128,7 @@ class Inbox:
 
     def _put(self, place: Hashable, item: Any) -> None:
         was_empty = not self._waiting
-        self._waiting[place] = item
+        self._waiting[place] = (time.monotonic(), item)
         if was_empty:
             self.wake()
 

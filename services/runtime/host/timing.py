@@ -1,22 +1,31 @@
 """How busy a process is, and how long its steps take."""
 
 import time
+from bisect import bisect_left
 from collections import deque
 from statistics import quantiles
 from typing import NamedTuple
+
+import psutil
+
+from prior_sg.schemas.status import STEP_BOUNDS_S
 
 RECENT_STEPS = 512
 WINDOW_S = 10.0
 
 
 class Figures(NamedTuple):
-    """What the newest steps say."""
+    """What the newest steps say, and all of them; named as in ServiceStatus."""
 
     uptime_s: float
     busy_share: float
     step_ms_p50: float
     step_ms_p99: float
     step_s: float
+    step_counts: list[int]
+    step_sum_s: float
+    cpu_s: float
+    resident_mb: float
 
 
 class Timing:
@@ -26,6 +35,9 @@ class Timing:
         self._started_s = time.monotonic()
         self._began_s: float | None = None
         self._steps: deque[tuple[float, float]] = deque(maxlen=RECENT_STEPS)  # (end, duration), seconds
+        self._counts = [0] * (len(STEP_BOUNDS_S) + 1)
+        self._sum_s = 0.0
+        self._process = psutil.Process()
 
     def begins(self) -> float:
         """A step begins; its time."""
@@ -37,6 +49,8 @@ class Timing:
         ended_s = time.monotonic()
         self._began_s = None
         self._steps.append((ended_s, ended_s - started_s))
+        self._counts[bisect_left(STEP_BOUNDS_S, ended_s - started_s)] += 1
+        self._sum_s += ended_s - started_s
 
     def figures(self) -> Figures:
         """As of now."""
@@ -48,4 +62,16 @@ class Timing:
         busy_s = sum(duration_s for end_s, duration_s in steps if end_s > now_s - window_s)
         began_s = self._began_s
         step_s = now_s - began_s if began_s is not None else 0.0
-        return Figures(uptime_s, min(1.0, busy_s / window_s), cuts[49], cuts[98], step_s)
+        counts, sum_s = list(self._counts), self._sum_s
+        times, memory = self._process.cpu_times(), self._process.memory_info()
+        return Figures(
+            uptime_s=uptime_s,
+            busy_share=min(1.0, busy_s / window_s),
+            step_ms_p50=cuts[49],
+            step_ms_p99=cuts[98],
+            step_s=step_s,
+            step_counts=counts,
+            step_sum_s=sum_s,
+            cpu_s=times.user + times.system,
+            resident_mb=memory.rss / 1e6,
+        )

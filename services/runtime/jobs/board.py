@@ -52,6 +52,17 @@ class Board:
         return max((group.outstanding for group in self.groups.values()), default=0) + len(self._homeless)
 
     @property
+    def waiting(self) -> set[Hashable]:
+        """Jobs that some group has still to begin, those for later left out."""
+        lined = {job.id for group in self.groups.values() for job in group.line}
+        return lined | {job_id for job_id, _, later in self._homeless if not later}
+
+    @property
+    def running(self) -> int:
+        """Jobs that workers have now, once for each group."""
+        return sum(len(worker.running) for group in self.groups.values() for worker in group.workers.values())
+
+    @property
     def workers(self) -> int:
         """Workers alive, of all groups."""
         return len(self._group_of)

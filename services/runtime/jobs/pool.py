@@ -11,7 +11,7 @@ from collections.abc import Callable, Hashable
 from functools import partial
 
 from prior_sg.schemas.codec import DecodeError, decode, encode
-from prior_sg.schemas.status import ServiceStatus, StatusRequest
+from prior_sg.schemas.status import PoolCount, ServiceStatus, StatusRequest
 from prior_sg.schemas.topics import Topic, job_key, status_key, worker_keys
 from prior_sg.services.runtime.bus import Answer, Bus
 from prior_sg.services.runtime.jobs.board import Board, Ended
@@ -46,6 +46,7 @@ class JobPool:
         self._bus, self._topic, self._robot, self._clock_s, self._on_ended = bus, topic, robot, clock_s, on_ended
         self._timeout_s = timeout_s
         self._board = Board(limit=limit)
+        self._since_s: dict[Hashable, float] = {}  # when jobs that are not over were submitted
         self._lock = threading.RLock()
         self._timer: threading.Timer | None = None
         self._timer_at_s = 0.0
@@ -68,9 +69,22 @@ class JobPool:
     def submit(self, job_id: Hashable, payload: bytes, group: str = "", later: bool = False) -> None:
         """Line up one job, for one group or for all, and send what can be sent."""
         with self._lock:
+            self._since_s.setdefault(job_id, self._clock_s())
             ended = self._board.submit(job_id, payload, group, later)
         self._tell(ended)
         self._send()
+
+    def count(self) -> PoolCount:
+        """What waits and runs now, those for later left out."""
+        with self._lock:
+            now_s, waiting = self._clock_s(), self._board.waiting
+            return PoolCount(
+                topic=self._topic.name,
+                waiting=len(waiting),
+                running=self._board.running,
+                oldest_wait_s=max((now_s - self._since_s.get(job, now_s) for job in waiting), default=0.0),
+                workers={name: len(group.workers) for name, group in self._board.groups.items()},
+            )
 
     def close(self) -> None:
         """Send nothing more."""
@@ -131,6 +145,9 @@ class JobPool:
         self._send()
 
     def _tell(self, ended: list[Ended]) -> None:
+        with self._lock:
+            for job in ended:
+                self._since_s.pop(job.id, None)
         for job in ended:
             self._on_ended(job)
 

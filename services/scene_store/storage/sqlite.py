@@ -1,6 +1,7 @@
 """A store in one SQLite file, in WAL mode: what is committed survives a killed process, a torn tail is cut off."""
 
 import os
+import shutil
 import sqlite3
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager
@@ -263,6 +264,12 @@ class Sqlite(Storage):
             return 0
         path = Path(self.location)
         return sum(file.stat().st_size for file in (path, path.with_name(f"{path.name}-wal")) if file.exists())
+
+    def room(self) -> dict[str, float]:
+        if self.location == ":memory:":
+            return {}
+        free = shutil.disk_usage(Path(self.location).parent).free
+        return {"file_bytes": self.disk_bytes(), "disk_free_bytes": free}
 
     def close(self) -> None:
         """The last connection removes the write-ahead log."""

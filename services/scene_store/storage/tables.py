@@ -110,6 +110,10 @@ class Storage(ABC):
     def disk_bytes(self) -> int:
         """What it takes on disk."""
 
+    def room(self) -> dict[str, float]:
+        """Bytes of its file and bytes free beside it, where it is a file; asked by any thread."""
+        return {}
+
     @abstractmethod
     def close(self) -> None:
         """Let go of it."""

@@ -14,7 +14,7 @@ from prior_sg.deploy.running import roll as rolls
 from prior_sg.deploy.running import supervisor as supervisors
 from prior_sg.deploy.running.roll import Roll
 from prior_sg.deploy.running.supervisor import Child, Supervisor
-from prior_sg.schemas.status import ServiceStatus
+from prior_sg.schemas.status import Loss, PoolCount, ServiceStatus, TopicCount
 from prior_sg.schemas.topics import WAITING, alive_key, lease_key
 from prior_sg.services.runtime import client as clients
 from prior_sg.services.runtime.bus import BusError
@@ -100,7 +100,19 @@ def test_a_router_that_does_not_answer_is_not_one_on_which_nobody_is(monkeypatch
 def status(**changes):
     fields = {"service": "maker", "instance": "m1", "robot": "r", "pid": 7, "uptime_s": 1.0, "backlog": 3}
     fields |= {"busy_share": 0.0, "step_ms_p50": 0.0, "step_ms_p99": 0.0, "resident_mb": 1.0, "waiting_for": []}
-    return ServiceStatus(**fields, topics=[], **changes)
+    return ServiceStatus(**(fields | {"topics": []} | changes))
+
+
+def pool(waiting, workers):
+    return PoolCount(topic="ENCODE", waiting=waiting, running=0, oldest_wait_s=12.0, workers=workers)
+
+
+def count(**counts):
+    return TopicCount(topic="KEYFRAME", **counts)
+
+
+def loss(number):
+    return Loss(what="frames refused", reason="dark", count=number, example="frame 1: dark")
 
 
 def standings(*tokens):
@@ -123,6 +135,34 @@ def standings(*tokens):
         (Found([status()], [], standings(("5", "a"), (WAITING, "b"))), True, "b waits: a is in charge of maker of r"),
         (Found([status()], [], standings((WAITING, "b"))), False, "nobody is in charge of maker of r: b takes over"),
         (Found([status()], [], standings(("5", "a"), ("6", "b"))), False, "a and b are in charge of maker of r"),
+        (Found([status(oldest_wait_s=9.0)]), True, ""),
+        (Found([status(oldest_wait_s=11.0)]), False, "m1 is behind: 3 inputs wait, the oldest for 11 s"),
+        (
+            Found([status(pools=[pool(4, {})])]),
+            False,
+            "4 keyframes of r wait for a worker, the oldest for 12 s, and none",
+        ),
+        (Found([status(pools=[pool(4, {"a": 0, "b": 2})])]), False, "4 keyframes of r wait for 2 workers, the oldest"),
+        (Found([status(pools=[pool(0, {})])]), True, ""),
+        (Found([status(figures={"disk_free_bytes": 3e8})]), True, ""),
+        (Found([status(figures={"disk_free_bytes": 1e8})]), False, "m1 (pid 7) has 100 MB left for its database"),
+        (Found([status(topics=[count(missed=5)])]), True, ""),
+        (Found([status(topics=[count(missed=5)])], before={"m1": status(topics=[count(missed=5)])}), True, ""),
+        (
+            Found([status(topics=[count(missed=5)])], before={"m1": status(topics=[count(missed=2)])}),
+            False,
+            "m1 loses what it gets now: 3 more KEYFRAME missed",
+        ),
+        (
+            Found([status(topics=[count(malformed=2)])], before={"m1": status()}),
+            False,
+            "m1 loses what it gets now: 2 more KEYFRAME malformed; its log names the writer",
+        ),
+        (
+            Found([status(losses=[loss(3)])], before={"m1": status(losses=[loss(2)])}),
+            False,
+            "m1 loses what it gets now: 1 more frames refused (dark); `prior-sg check SOURCE`",
+        ),
     ],
 )
 def test_what_is_wrong_is_said_and_decides_whether_all_is_well(found, well, said):

@@ -26,7 +26,7 @@ class Stage:
 
     def __init__(self, endpoint, folder, monkeypatch):
         self.program, self.heard, self.answers = STAYS, set(), []
-        monkeypatch.setattr(Child, "start", lambda child: self.begin(child))
+        monkeypatch.setattr(Child, "start", lambda child: self.begin(child))  # noqa: PLW0108 - a method would be bound
         self.supervisor = Supervisor(endpoint, "robot1", folder, ["segmenter.beta=2"])
         self.supervisor.hears = lambda unique: unique in self.heard
         self.bus, self.client = ZenohBus(endpoint), BusClient(ZenohBus(endpoint))

@@ -192,7 +192,7 @@ def test_damaged_headers_mean_an_unknown_writer(header):
 
 
 def test_header_round_trip():
-    assert unpack_header(pack_header("segmenter/1/2", 5, 6)) == ("segmenter/1/2", 5, 6)
+    assert unpack_header(pack_header("segmenter/1/2", 5, 6)) == ("segmenter/1/2", 5, 6, "")
     assert KEYFRAME.pattern("*") == "psg/*/keyframe"
 
 

@@ -1,0 +1,1 @@
+"""A running system seen from outside: figures for Prometheus, traces for OpenTelemetry."""
