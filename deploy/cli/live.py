@@ -13,6 +13,7 @@ from prior_sg.deploy.cli.source_options import add_source_options, read_options
 from prior_sg.deploy.edge import names_in
 from prior_sg.deploy.errors import UserError
 from prior_sg.deploy.running import serve
+from prior_sg.deploy.running.notify import Watchdog
 from prior_sg.services.errors import PriorSgError
 from prior_sg.services.runtime import extras
 
@@ -133,7 +134,8 @@ def _stay_up(arguments: argparse.Namespace, names: list[str]) -> int:
                 supervisor.start_door("ros", "prior_sg.deploy.ros.process", bridge_arguments(arguments))
             listening = " and ".join((arguments.connect, *arguments.listen))
             console.print(f"router {listening}; logs in {supervisor.log_folder}; Ctrl-C stops")
-            wait(lambda: _tell(supervisor, roll, arguments.restart_hung))
+            watchdog = Watchdog()
+            wait(lambda: _tell(supervisor, roll, arguments.restart_hung, watchdog))
         return 0
     finally:
         supervisor.stop()
@@ -141,13 +143,14 @@ def _stay_up(arguments: argparse.Namespace, names: list[str]) -> int:
         stop_router()
 
 
-def _tell(supervisor: "Supervisor", roll: "Roll", restart_hung: bool) -> None:
+def _tell(supervisor: "Supervisor", roll: "Roll", restart_hung: bool, watchdog: Watchdog) -> None:
     """What has happened to the processes; those that hang are ended, to be started again, where that is wished."""
     silence, hung = roll.check(supervisor.children)
     for child in hung if restart_hung else ():
         child.kill()
     for event in (*silence, *supervisor.check()):
         console.print(event)
+    watchdog.alive()
 
 
 def _open_api(supervisor: "Supervisor", port: int) -> None:

@@ -73,6 +73,9 @@ def _add_system(commands: Commands) -> None:
 
     health = commands.add("health", cmd_health, "show every running process and its topics", "prior-sg health --json")
     health.add_argument("--json", action="store_true", help="print JSON")
+    only = health.add_mutually_exclusive_group()
+    only.add_argument("--here", action="store_true", help="only this user's processes on this host or in this container")
+    only.add_argument("--router", action="store_true", help="only whether the router answers")
     add_bus(health, robot=False)
 
     evaluation.add_arguments(
@@ -206,10 +209,14 @@ def cmd_topics(arguments: argparse.Namespace) -> int:
 
 def cmd_health(arguments: argparse.Namespace) -> int:
     """Every process: alive, busy, what it dropped."""
-    from prior_sg.deploy.inspecting.health import look
+    from prior_sg.deploy.inspecting.health import look, look_here
+    from prior_sg.deploy.running.here import processes_here
 
     with open_client(arguments.connect) as client:
-        found = look(client)
+        if arguments.router:
+            console.print(f"the router on {arguments.connect} answers")
+            return 0
+        found = look_here(client, processes_here()) if arguments.here else look(client)
     if arguments.json:
         print(json.dumps(found.plain()))
     else:
@@ -233,6 +240,8 @@ def _print_health(found: "Found") -> None:
         console.print(line("    ", *parts[1:]))
         for loss in status.losses:
             console.print(f"    {loss_line(loss)}")
+    for name in found.resting:
+        console.print(f"{name} waits for the end of the process that is in charge")
     for entry in found.silent:
         console.print(line((entry["error"], "red")))
     for remark in found.remarks:

@@ -5,11 +5,12 @@ import threading
 import time
 import uuid
 from collections.abc import Callable, Iterator
+from functools import cached_property
 from types import TracebackType
 from typing import Any, NamedTuple, TypeVar
 
 from prior_sg.schemas.codec import DecodeError, Message, decode, encode
-from prior_sg.schemas.priors import Prior, PriorRequest, Task, TaskInForce, TaskRequest
+from prior_sg.schemas.priors import Prior, PriorList, PriorRequest, Task, TaskInForce, TaskRequest
 from prior_sg.schemas.status import ServiceStatus, StatusRequest
 from prior_sg.schemas.topics import (
     PRIOR,
@@ -26,6 +27,7 @@ from prior_sg.schemas.topics import (
 from prior_sg.services.errors import PriorSgError
 from prior_sg.services.runtime.bus import Answer, Bus, BusError, Sample, message_in, pack_header
 from prior_sg.services.runtime.host.lease import Standing, standing
+from prior_sg.services.runtime.signatures import Unsigned, signatures_in_force
 
 R = TypeVar("R", bound=Message)
 POLL_S = 0.5
@@ -63,6 +65,11 @@ class BusClient:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.bus.close()
+
+    @cached_property
+    def signatures(self) -> Unsigned:
+        """What priors are checked by. Raises BusError, ExtraMissing."""
+        return signatures_in_force()
 
     def publish(self, topic: Topic, message: Message) -> int:
         """Publish one message; returns which of ours on its key it is, from 0."""
@@ -104,9 +111,12 @@ class BusClient:
         if answer.payload is None:
             raise BusError(f"{name}: {_explain(answer.reason)}")
         try:
-            return decode(reply_type, answer.payload)
+            reply = decode(reply_type, answer.payload)
         except DecodeError as error:
             raise BusError(f"{name}: the answer is not valid: {error}") from error
+        if isinstance(reply, PriorList) and (fault := self.signatures.fault_of(reply)):
+            raise BusError(f"{name}: {fault}")
+        return reply
 
     def task_stamp_ns(self, robot: str) -> int:
         """The stamp of a task given now: after the one in force, whatever the clock of the host that gave it said."""
@@ -121,13 +131,14 @@ class BusClient:
         """Publish a task and wait for the prior that answers it; a model may take minutes, and `waiting` is told why
         meanwhile. Raises NoPriorError, BusError."""
         found: list[Prior] = []
+        signatures = self.signatures
         arrived = threading.Event()
         given_ns = time.time_ns()
 
         def see(sample: Sample) -> None:
             with contextlib.suppress(DecodeError):
                 prior: Prior = message_in(sample)
-                if sample.sent_ns >= given_ns and prior.answers(task):
+                if sample.sent_ns >= given_ns and prior.answers(task) and not signatures.fault_of(prior):
                     found.append(prior)
                     arrived.set()
 

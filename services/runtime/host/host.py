@@ -45,6 +45,7 @@ from prior_sg.services.runtime.jobs.board import Ended
 from prior_sg.services.runtime.jobs.dispatcher import CREDITS
 from prior_sg.services.runtime.jobs.pool import JobPool, done
 from prior_sg.services.runtime.service import Ask, Identity, Service
+from prior_sg.services.runtime.signatures import signatures_in_force
 
 log = logging.getLogger(__name__)
 
@@ -68,6 +69,7 @@ class Host:
         self.inbox = Inbox(wake=self._wake)
         self._door = Door(self.inbox)
         self._lease, self._fence = lease, fence
+        self._signatures = signatures_in_force()
         self.stopping = asyncio.Event()
         self._loop = asyncio.get_running_loop()
         self._waiting = asyncio.Event()
@@ -197,7 +199,10 @@ class Host:
             name=topic.name,
             key=key,
             fault_of=lambda message: (
-                topic.fault_of(key, message) or fault_of_writer(self._fence, message) or fault_of_clock(message)
+                topic.fault_of(key, message)
+                or fault_of_writer(self._fence, message)
+                or fault_of_clock(message)
+                or self._signatures.fault_of(message)
             ),
             writer=sample.writer,
         )
@@ -225,7 +230,10 @@ class Host:
             name=query.name,
             key=query.key,
             fault_of=lambda told: (
-                fault_of_reply(reply.ask.request, told) or fault_of_writer(self._fence, told) or fault_of_clock(told)
+                fault_of_reply(reply.ask.request, told)
+                or fault_of_writer(self._fence, told)
+                or fault_of_clock(told)
+                or self._signatures.fault_of(told)
             ),
         )
         if message is None:
@@ -246,7 +254,7 @@ class Host:
             return
         self.inbox.of(query.name).consumed += 1
         try:
-            answer = encode(self.service.answers[query](self._state, request, self.cfg))
+            answer = encode(self._signatures.signed(self.service.answers[query](self._state, request, self.cfg)))
         except NotYet as error:
             question.request.refuse(f"{query.name}: {error}")
             return
@@ -323,7 +331,7 @@ class Host:
         else:
             if self._lease is not None and topic in DELTAS:
                 self._lease.tells(topic.name, message.revision)  # type: ignore[attr-defined]
-            self._outbox.put(topic, message)
+            self._outbox.put(topic, self._signatures.signed(message))
 
     def _ask(self, ask: Ask) -> None:
         self.service.check_ask(ask)
