@@ -22,12 +22,16 @@ class Remark(NamedTuple):
 
 @dataclass
 class Found:
-    """What there is: statuses of those that answered, why others did not, who is in charge, or why that is unknown."""
+    """What there is: statuses of those that answered, why others did not, who is in charge, or why that is unknown.
+
+    Of the processes of one host alone, `standings` are left out.
+    """
 
     processes: list[ServiceStatus] = field(default_factory=list)
     silent: list[dict[str, str]] = field(default_factory=list)
     standings: list[Standing] = field(default_factory=list)
     unknown: str = ""
+    resting: list[str] = field(default_factory=list)  # instances here that wait for another's end, as they should
 
     @property
     def remarks(self) -> list[Remark]:
@@ -38,13 +42,14 @@ class Found:
     @property
     def well(self) -> bool:
         """Whether something runs and nothing is wrong."""
-        return bool(self.processes) and not self.silent and not any(remark.fault for remark in self.remarks)
+        return bool(self.processes or self.resting) and not self.silent and not any(remark.fault for remark in self.remarks)
 
     def plain(self) -> dict[str, Any]:
         """For JSON."""
         return {
             "processes": msgspec.to_builtins(self.processes),
             "silent": self.silent,
+            "resting": self.resting,
             "in_charge": [
                 {"robot": one.robot, "service": one.service, "instance": one.instance, "epoch": one.holder.epoch}
                 for one in self.standings
@@ -98,13 +103,8 @@ class Found:
 
 def look(client: BusClient) -> Found:
     """Ask everybody."""
-    found = Found()
-    alive = client.alive()
-    for instance, service in sorted(alive.items()):
-        try:
-            found.processes.append(client.status(service, instance))
-        except BusError as error:
-            found.silent.append({"service": service, "instance": instance, "error": f"{instance}: {error}"})
+    found, alive = Found(), client.alive()
+    _ask_all(client, alive, found)
     try:
         found.standings, on_the_roll = client.standings(), client.on_the_roll()
     except BusError as error:
@@ -115,6 +115,33 @@ def look(client: BusClient) -> Found:
         if one.instance not in alive and one.instance not in waiting:
             found.silent.append({"service": one.service, "instance": one.instance, "error": _unheard(one)})
     return found
+
+
+def look_here(client: BusClient, pids: dict[str, int]) -> Found:
+    """Ask the processes of this host, by instance."""
+    alive = client.alive()
+    found = Found()
+    _ask_all(client, {name: service for name, service in alive.items() if name in pids}, found)
+    try:
+        waiting = {one.instance for one in client.standings() if one.holder is None}
+    except BusError as error:
+        found.unknown = str(error)
+        return found
+    for name, pid in pids.items():
+        if name in waiting:
+            found.resting.append(name)
+        elif name not in alive:
+            why = f"{name} (pid {pid}) runs here and is not heard: it is starting, hangs or was stopped"
+            found.silent.append({"service": "", "instance": name, "error": why})
+    return found
+
+
+def _ask_all(client: BusClient, alive: dict[str, str], found: Found) -> None:
+    for instance, service in sorted(alive.items()):
+        try:
+            found.processes.append(client.status(service, instance))
+        except BusError as error:
+            found.silent.append({"service": service, "instance": instance, "error": f"{instance}: {error}"})
 
 
 def _unheard(one: OnTheRoll) -> str:

@@ -16,6 +16,7 @@ from typing import Any
 from prior_sg import services
 from prior_sg.deploy.edge import check_arguments
 from prior_sg.deploy.errors import UserError
+from prior_sg.deploy.running.here import noted
 from prior_sg.deploy.settings import DEFAULT_ROBOT, add_keys, connect_in_force, resolved_config, use_keys
 from prior_sg.deploy.terminal import complain
 from prior_sg.schemas.topics import EPOCH
@@ -144,7 +145,8 @@ def run(arguments: argparse.Namespace) -> int:
             import uvloop
 
             asyncio.set_event_loop_policy(uvloop.EventLoopPolicy())
-        asyncio.run(serve(arguments, instance))
+        with noted(instance):
+            asyncio.run(serve(arguments, instance))
     except HOPELESS as error:
         log.error(str(error))
         return EXIT_HOPELESS
