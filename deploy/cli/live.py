@@ -135,7 +135,7 @@ def _stay_up(arguments: argparse.Namespace, names: list[str]) -> int:
             listening = " and ".join((arguments.connect, *arguments.listen))
             console.print(f"router {listening}; logs in {supervisor.log_folder}; Ctrl-C stops")
             watchdog = Watchdog()
-            wait(lambda: _tell(supervisor, roll, arguments.restart_hung, watchdog))
+            wait(lambda: (_tell(supervisor, roll, arguments.restart_hung), watchdog.alive()))
         return 0
     finally:
         supervisor.stop()
@@ -143,14 +143,13 @@ def _stay_up(arguments: argparse.Namespace, names: list[str]) -> int:
         stop_router()
 
 
-def _tell(supervisor: "Supervisor", roll: "Roll", restart_hung: bool, watchdog: Watchdog) -> None:
+def _tell(supervisor: "Supervisor", roll: "Roll", restart_hung: bool) -> None:
     """What has happened to the processes; those that hang are ended, to be started again, where that is wished."""
     silence, hung = roll.check(supervisor.children)
     for child in hung if restart_hung else ():
         child.kill()
     for event in (*silence, *supervisor.check()):
         console.print(event)
-    watchdog.alive()
 
 
 def _open_api(supervisor: "Supervisor", port: int) -> None:
