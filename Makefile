@@ -8,7 +8,7 @@ WORKERS ?= 2
 # One process compiles for all others, whatever the caller's shell says.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo test coverage test-llm check loops bench clean
+.PHONY: demo test coverage test-llm check loops bench manifests images sbom clean
 .DEFAULT_GOAL := demo
 
 demo: $(VENV)/installed
@@ -47,6 +47,19 @@ check: $(VENV)/installed-dev
 bench: $(VENV)/installed-dev
 	$(BIN)/prior-sg bench all --json
 
+# Compose, Helm and the schemas of Kubernetes, which take what deploys Prior-SG. Helm's library is large.
+manifests: $(VENV)/installed-manifests
+	PATH="$(abspath $(BIN)):$$PATH" $(BIN)/python -m pytest tests/deploy/test_compose.py tests/deploy/test_helm.py \
+		tests/deploy/test_systemd.py
+
+# Builds deploy/Dockerfile by Buildah, which needs root and no engine, and runs a service of the image.
+images: $(VENV)/installed-dev
+	PSG_TEST_IMAGES=1 $(BIN)/python -m pytest -v tests/deploy/test_images.py --timeout 3600
+
+sbom: $(VENV)/installed-audit
+	mkdir -p build
+	$(BIN)/cyclonedx-py environment $(BIN)/python --pyproject pyproject.toml --output-file build/sbom.json
+
 INSTALL := $(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt
 # Loops compiled for another version may name what it lacks now.
 FORGET_LOOPS := find schemas services deploy -name '*.nb[ci]' -delete
@@ -61,6 +74,14 @@ $(VENV)/installed-dev: pyproject.toml constraints.txt | $(BIN)/pip
 	$(INSTALL) --no-compile -e '.[dev]'
 	$(FORGET_LOOPS)
 	touch $(VENV)/installed $@
+
+$(VENV)/installed-manifests: $(VENV)/installed-dev
+	$(INSTALL) -e '.[manifests]'
+	touch $@
+
+$(VENV)/installed-audit: $(VENV)/installed
+	$(INSTALL) -e '.[audit]'
+	touch $@
 
 $(BIN)/pip: # one that finds versions in half the time of those that come with Python
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed; set PYTHON=...")'

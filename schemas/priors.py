@@ -163,8 +163,12 @@ class Prior(Message, frozen=True, kw_only=True, omit_defaults=True):
 
     def digest(self) -> str:
         """Content address, 128 bit in hexadecimal; of everything but the signature, which signs it."""
+        return hashlib.blake2b(encode(self.unsigned()), digest_size=16).hexdigest()
+
+    def unsigned(self) -> "Prior":
+        """The same without its signature."""
         bare = msgspec.structs.replace(self.provenance, signer="", signature="")
-        return hashlib.blake2b(encode(msgspec.structs.replace(self, provenance=bare)), digest_size=16).hexdigest()
+        return msgspec.structs.replace(self, provenance=bare)
 
     def answers(self, task: Task) -> bool:
         """Whether this prior was made for that task."""

@@ -3,3 +3,5 @@
 
 class PriorSgError(Exception):
     """What was asked cannot be done; the message is one sentence that says what to do."""
+
+    exit_status = 1  # of a command that ends with it

@@ -97,16 +97,17 @@ def _revoke(arguments: argparse.Namespace) -> int:
 
 
 def _told_others(arguments: argparse.Namespace) -> int:
-    """Routers know from their bundles who takes part."""
+    """Routers know from their bundles who takes part, and all who read priors whose signatures count."""
     from prior_sg.deploy.keys.authority import Authority
+    from prior_sg.services.runtime.signatures import SIGNERS
 
     authority = Authority(arguments.folder)
     there = [one for one in authority.participants.values() if one.name != arguments.name and not one.revoked]
-    edge = authority.participants[arguments.name].role == "edge"  # which robots' routers let in
-    others = [one.name for one in there if one.role == "edge" or (edge and one.role == "robot")]
+    signs = authority.participants[arguments.name].role in SIGNERS
+    others = [one.name for one in there if one.role == "edge" or signs]
     if others:
         files = ", ".join(str(authority.bundle(name) / "bundle.json") for name in others)
-        console.print(f"routers of {', '.join(others)} must know: copy {files} there and start them again")
+        console.print(f"{', '.join(others)} must know: copy {files} there and start routers again")
     return 0
 
 

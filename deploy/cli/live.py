@@ -14,6 +14,7 @@ from prior_sg.deploy.cli.watching import add_metrics, check_metrics, open_metric
 from prior_sg.deploy.edge import names_in
 from prior_sg.deploy.errors import UserError
 from prior_sg.deploy.running import serve
+from prior_sg.deploy.running.notify import Watchdog
 from prior_sg.services.errors import PriorSgError
 from prior_sg.services.runtime import extras
 
@@ -155,7 +156,8 @@ def _stay_up(arguments: argparse.Namespace, names: list[str]) -> int:
                 supervisor.start_door("ros", "prior_sg.deploy.ros.process", bridge_arguments(arguments))
             listening = " and ".join((arguments.connect, *arguments.listen))
             console.print(f"router {listening}; logs in {supervisor.log_folder}; Ctrl-C stops")
-            wait(lambda: _tell(supervisor, roll, arguments.restart_hung, swaps))
+            watchdog = Watchdog()
+            wait(lambda: (_tell(supervisor, roll, arguments.restart_hung, swaps), watchdog.alive()))
         return 0
     finally:
         supervisor.stop()

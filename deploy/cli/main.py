@@ -79,6 +79,7 @@ def main(argv: list[str] | None = None) -> int:
 def _told(argv: list[str] | None) -> int:
     from prior_sg.deploy.cli.faults import sentence_of
     from prior_sg.deploy.terminal import complain
+    from prior_sg.services.errors import PriorSgError
 
     try:
         return _run(argv)
@@ -88,7 +89,7 @@ def _told(argv: list[str] | None) -> int:
         if (sentence := sentence_of(error)) is None:
             raise
         complain(sentence)
-        return 1
+        return error.exit_status if isinstance(error, PriorSgError) else 1
 
 
 def _run(argv: list[str] | None) -> int:

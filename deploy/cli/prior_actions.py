@@ -26,6 +26,7 @@ from prior_sg.services.prior_gateway.outside.signing import Signer
 from prior_sg.services.registry import BY_NAME
 from prior_sg.services.runtime.bus import LocalBus, Sample, message_in
 from prior_sg.services.runtime.client import BusClient, NoPriorError
+from prior_sg.services.runtime.signatures import signatures_in_force
 
 LIBRARY_SIGN = "made by the curated library of this version"
 
@@ -87,7 +88,7 @@ def verdict(prior: Prior, cfg: Config, library: Library) -> str:
         except NoPrior:
             same = False
         return LIBRARY_SIGN if same else "not signed, and not what this version's library says"
-    return Signer(cfg.signing_key, cfg.trusted_keys).check(prior)[1]
+    return Signer(cfg).check(prior)[1]
 
 
 def make(arguments: argparse.Namespace, console: Terminal) -> int:
@@ -106,7 +107,7 @@ def make(arguments: argparse.Namespace, console: Terminal) -> int:
         gateway.stop()
     describe(prior, cfg, console)
     if arguments.out:
-        write(prior, arguments.out)
+        write(_signed(prior), arguments.out)
         console.print(f"written to {arguments.out}")
     return 0
 
@@ -129,18 +130,28 @@ def show(arguments: argparse.Namespace, console: Terminal) -> int:
 
 def export(arguments: argparse.Namespace, console: Terminal) -> int:
     """JSON that `import` reads."""
-    prior = wanted(arguments, settings(arguments))
+    prior = _signed(wanted(arguments, settings(arguments)))
     write(prior, arguments.out)
     console.print(f"prior {prior.digest()} written to {arguments.out}")
     return 0
+
+
+def _signed(prior: Prior) -> Prior:
+    """For others of the fleet, where keys are in force; else as it is: another signature may stand there."""
+    signed = signatures_in_force().signed(prior)
+    assert isinstance(signed, Prior)
+    return signed
 
 
 def bring(arguments: argparse.Namespace, console: Terminal) -> int:
     """A prior from elsewhere is checked like a model's."""
     cfg, prior = settings(arguments), read(arguments.file)
     said = verdict(prior, cfg, load())
-    if cfg.require_signature and not Signer(cfg.signing_key, cfg.trusted_keys).check(prior)[0]:
-        raise PriorError(f"{arguments.file}: {said}; prior_gateway.require_signature lets no such prior in")
+    signer = Signer(cfg)
+    if arguments.vouch:
+        said = "vouched for when it was imported"
+    elif signer.required and not signer.check(prior)[0]:
+        raise PriorError(f"{arguments.file}: {said}; if you have read it and stand for it, import it with --vouch")
     if not cfg.archive:
         raise PriorError("there is no archive to import into; set prior_gateway.archive to a folder")
     PriorShelf(cfg.archive).put(prior, PREFERRED, verdict=said)
@@ -219,10 +230,11 @@ def revise(arguments: argparse.Namespace, console: Terminal) -> int:
             prior: Prior = message_in(sample)
         except DecodeError:
             return
-        if prior.answers(task) and prior.provenance.parent_digest and sample.sent_ns > given_ns:
+        revised = prior.answers(task) and prior.provenance.parent_digest and sample.sent_ns > given_ns
+        if revised and not signatures.fault_of(prior):
             found.append(prior)
 
-    given_ns = time.time_ns()
+    given_ns, signatures = time.time_ns(), signatures_in_force()
     with open_client(arguments.connect) as client, console.status("revising"):
         client.listen(PRIOR, "*", see)
         client.publish(

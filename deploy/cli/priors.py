@@ -37,6 +37,7 @@ def add_commands(commands: Commands) -> None:
     diff.add_argument("--least", type=float, default=0.1, help="smallest difference told (default: %(default)s)")
     bring = action("import", "check a prior from a file and let it answer its task from now on", "import prior.json")
     bring.add_argument("file", type=Path, help="JSON as `export` writes it")
+    bring.add_argument("--vouch", action="store_true", help="stand for it, whoever has signed it or nobody")
     export = action(
         "export", "write a prior as JSON", 'export --environment "campus" --task "delivery" --out prior.json'
     )

@@ -83,6 +83,11 @@ def _add_system(commands: Commands) -> None:
     health.add_argument(
         "--out", type=Path, default=Path("out/up"), help="folder of `up`, for reports of crashes (default: %(default)s)"
     )
+    only = health.add_mutually_exclusive_group()
+    only.add_argument(
+        "--here", action="store_true", help="only this user's processes on this host or in this container"
+    )
+    only.add_argument("--router", action="store_true", help="only whether the router answers")
     add_bus(health, robot=False)
 
     evaluation.add_arguments(
@@ -218,11 +223,16 @@ def cmd_topics(arguments: argparse.Namespace) -> int:
 
 def cmd_health(arguments: argparse.Namespace) -> int:
     """Every process: alive, busy, what it dropped."""
-    from prior_sg.deploy.inspecting.health import look
+    from prior_sg.deploy.inspecting.health import look, look_here
     from prior_sg.deploy.running.crashes import crashes, sentence
+    from prior_sg.deploy.running.here import processes_here
 
     with open_client(arguments.connect) as client:
-        found = look(client, max(arguments.seconds, 0.0))
+        if arguments.router:
+            console.print(f"the router on {arguments.connect} answers")
+            return 0
+        seconds = max(arguments.seconds, 0.0)
+        found = look_here(client, processes_here()) if arguments.here else look(client, seconds)
     now_s = time.time()
     died = [sentence(one, now_s) for one in crashes(arguments.out / "crashes", now_s)]
     if arguments.json:
@@ -250,6 +260,8 @@ def _print_health(found: "Found") -> None:
         console.print(line("    ", *parts[1:]))
         for loss in status.losses:
             console.print(f"    {loss_line(loss)}")
+    for name in found.resting:
+        console.print(f"{name} waits for the end of the process that is in charge")
     for entry in found.silent:
         console.print(line((entry["error"], "red")))
     for remark in found.remarks:

@@ -29,13 +29,16 @@ class Remark(NamedTuple):
 @dataclass
 class Found:
     """What there is: statuses of those that answered, why others did not, who is in charge, or why that is unknown.
-    `before` are statuses of a moment earlier, by instance."""
+
+    `before` are statuses of a moment earlier, by instance. Of one host's processes alone, `standings` are left out.
+    """
 
     processes: list[ServiceStatus] = field(default_factory=list)
     silent: list[dict[str, str]] = field(default_factory=list)
     standings: list[Standing] = field(default_factory=list)
     unknown: str = ""
     before: dict[str, ServiceStatus] = field(default_factory=dict)
+    resting: list[str] = field(default_factory=list)  # instances here that wait for another's end, as they should
 
     @property
     def remarks(self) -> list[Remark]:
@@ -46,13 +49,18 @@ class Found:
     @property
     def well(self) -> bool:
         """Whether something runs and nothing is wrong."""
-        return bool(self.processes) and not self.silent and not any(remark.fault for remark in self.remarks)
+        return (
+            bool(self.processes or self.resting)
+            and not self.silent
+            and not any(remark.fault for remark in self.remarks)
+        )
 
     def plain(self) -> dict[str, Any]:
         """For JSON."""
         return {
             "processes": msgspec.to_builtins(self.processes),
             "silent": self.silent,
+            "resting": self.resting,
             "in_charge": [
                 {"robot": one.robot, "service": one.service, "instance": one.instance, "epoch": one.holder.epoch}
                 for one in self.standings
@@ -79,13 +87,8 @@ def look(client: BusClient, again_s: float = 0.0) -> Found:
 
 def asked(client: BusClient, request: StatusRequest, before: dict[str, ServiceStatus] | None = None) -> Found:
     """Ask everybody once."""
-    found = Found(before=before or {})
-    alive = client.alive()
-    found.processes, errors = client.statuses(request)
-    found.silent = [
-        {"service": alive.get(instance, ""), "instance": instance, "error": f"{instance}: {error}"}
-        for instance, error in errors.items()
-    ]
+    found, alive = Found(before=before or {}), client.alive()
+    _ask_all(client, alive, found, request)
     try:
         found.standings, on_the_roll = client.standings(), client.on_the_roll()
     except BusError as error:
@@ -96,6 +99,33 @@ def asked(client: BusClient, request: StatusRequest, before: dict[str, ServiceSt
         if one.instance not in alive and one.instance not in waiting:
             found.silent.append({"service": one.service, "instance": one.instance, "error": _unheard(one)})
     return found
+
+
+def look_here(client: BusClient, pids: dict[str, int]) -> Found:
+    """Ask the processes of this host, by instance."""
+    alive = client.alive()
+    found = Found()
+    _ask_all(client, {name: service for name, service in alive.items() if name in pids}, found)
+    try:
+        waiting = {one.instance for one in client.standings() if one.holder is None}
+    except BusError as error:
+        found.unknown = str(error)
+        return found
+    for name, pid in pids.items():
+        if name in waiting:
+            found.resting.append(name)
+        elif name not in alive:
+            why = f"{name} (pid {pid}) runs here and is not heard: it is starting, hangs or was stopped"
+            found.silent.append({"service": "", "instance": name, "error": why})
+    return found
+
+
+def _ask_all(client: BusClient, alive: dict[str, str], found: Found, request: StatusRequest = StatusRequest()) -> None:
+    found.processes, errors = client.statuses(request, among=alive)
+    found.silent = [
+        {"service": alive[instance], "instance": instance, "error": f"{instance}: {error}"}
+        for instance, error in errors.items()
+    ]
 
 
 def _unheard(one: OnTheRoll) -> str:

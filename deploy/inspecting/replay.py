@@ -13,6 +13,7 @@ import numpy as np
 from prior_sg.schemas.codec import DecodeError, Message, decode, encode
 from prior_sg.schemas.frames import Keyframe
 from prior_sg.schemas.migrations import journalled
+from prior_sg.schemas.priors import Prior
 from prior_sg.schemas.status import Consumed, Started, Tick
 from prior_sg.schemas.succession import Succession, TakesOver
 from prior_sg.schemas.topics import JOURNAL, KEYFRAME, QUERIES, TOPICS, Topic
@@ -179,7 +180,8 @@ def compare(log: Log, life: Life) -> Comparison:
         if len(new) != len(old) and (life.ended_cleanly or len(new) > len(old)):
             differences.append(f"{name}: {len(old)} recorded, {len(new)} replayed")
         for index, (before, after) in enumerate(zip(old, new, strict=False)):
-            differences += [f"{name}[{index}].{text}" for text in message_differences(before, after, tolerance)]
+            pair = map(_unsigned, (before, after))
+            differences += [f"{name}[{index}].{text}" for text in message_differences(*pair, tolerance)]
     return Comparison(
         life.instance,
         len(life.inputs),
@@ -187,6 +189,11 @@ def compare(log: Log, life: Life) -> Comparison:
         sum(map(len, recorded.values())),
         differences,
     )
+
+
+def _unsigned(message: Message) -> Message:
+    """As the service made it: a host signs what it publishes."""
+    return message.unsigned() if isinstance(message, Prior) else message
 
 
 def message_differences(before: Message, after: Message, tolerance: float = 0.0) -> list[str]:

@@ -1,7 +1,8 @@
-"""The topic graph, table and compose file, generated from the registry, and the check that they are up to date."""
+"""The topic graph, table and compose files, generated from the registry, and the check that they are up to date."""
 
 from pathlib import Path
 
+from prior_sg.deploy.inspecting.compose import COMPOSE, COMPOSE_CUDA, compose, compose_cuda
 from prior_sg.schemas.codec import schema_name
 from prior_sg.schemas.topics import JOURNAL, QUERIES, TOPICS
 from prior_sg.services.registry import OPERATOR_WRITES, SERVICES
@@ -9,7 +10,7 @@ from prior_sg.services.registry import OPERATOR_WRITES, SERVICES
 ROOT = Path(__file__).resolve().parents[2]
 BEGIN, END = "<!-- topics:begin (prior-sg topics --write) -->", "<!-- topics:end -->"
 DOCUMENTS = ("README.md", "docs/architecture.md")
-COMPOSE = "docker-compose.yml"
+FILES = {COMPOSE: compose, COMPOSE_CUDA: compose_cuda}  # generated as a whole
 ARROWS = {"every": "-->", "latest": "-.->", "job": "==>"}
 
 
@@ -62,41 +63,6 @@ def generated(document: str) -> str:
     return "\n".join([*parts, END])
 
 
-def compose() -> str:
-    """docker-compose.yml: a router and one container per service."""
-    lines = [
-        "# Generated from services/registry.py by `prior-sg topics --write`.",
-        "x-service: &service",
-        "  image: prior-sg:latest",
-        "  build: { context: ., dockerfile: deploy/Dockerfile }",
-        "  init: true",
-        "  restart: unless-stopped",
-        "  depends_on: [zenohd]",
-        "  network_mode: host  # the router listens on loopback only (docs/security.md)",
-        "  environment: { PSG_CONNECT: tcp/127.0.0.1:7447 }",
-        "",
-        "services:",
-        "  zenohd:",
-        "    image: eclipse/zenoh:1.10.2",
-        "    network_mode: host",
-        "    init: true",
-        "    restart: unless-stopped",
-        "    command: -c /config.json5",
-        "    volumes: ['./deploy/router.json5:/config.json5:ro']",
-    ]
-    for service in SERVICES:
-        robot = ", --robot, '${PSG_ROBOT:-robot1}'" if service.scope == "robot" else ""
-        lines += ["", f"  {service.name}:", "    <<: *service", f"    command: [serve, {service.name}{robot}]"]
-        if service.name == "ingest":
-            lines += ["    environment:", "      PSG_CONNECT: tcp/127.0.0.1:7447", "      PSG_INGEST__SOURCE: /data"]
-            lines += ["    volumes: ['${PSG_DATA:-./data}:/data:ro']"]
-        if service.name == "scene_store":
-            lines += ["    environment:", "      PSG_CONNECT: tcp/127.0.0.1:7447"]
-            lines += ["      PSG_SCENE_STORE__PATH: /var/lib/prior-sg/scene.sqlite"]
-            lines += ["    volumes: ['scene:/var/lib/prior-sg']"]
-    return "\n".join([*lines, "", "volumes:", "  scene:", ""])
-
-
 def replace_generated(text: str, document: str) -> str:
     """The document with its generated part renewed. Raises ValueError when the markers are missing."""
     if BEGIN not in text or END not in text:
@@ -106,7 +72,7 @@ def replace_generated(text: str, document: str) -> str:
 
 def in_checkout() -> bool:
     """Whether the documents are there, which no installed package has."""
-    return all((ROOT / file).exists() for file in (*DOCUMENTS, COMPOSE))
+    return all((ROOT / file).exists() for file in DOCUMENTS)
 
 
 def write() -> list[str]:
@@ -114,8 +80,9 @@ def write() -> list[str]:
     for document in DOCUMENTS:
         path = ROOT / document
         path.write_text(replace_generated(path.read_text(), document))
-    (ROOT / COMPOSE).write_text(compose())
-    return [*DOCUMENTS, COMPOSE]
+    for file, text in FILES.items():
+        (ROOT / file).write_text(text())
+    return [*DOCUMENTS, *FILES]
 
 
 def faults() -> list[str]:
@@ -135,6 +102,7 @@ def faults() -> list[str]:
         text = (ROOT / document).read_text()
         if generated(document) not in text:
             found.append(f"{document} is out of date; run `prior-sg topics --write`")
-    if (ROOT / COMPOSE).read_text() != compose():
-        found.append(f"{COMPOSE} is out of date; run `prior-sg topics --write`")
+    for file, text in FILES.items():
+        if not (ROOT / file).exists() or (ROOT / file).read_text() != text():
+            found.append(f"{file} is out of date; run `prior-sg topics --write`")
     return found

@@ -17,6 +17,7 @@ from cryptography.hazmat.primitives.serialization import (
     Encoding,
     NoEncryption,
     PrivateFormat,
+    PublicFormat,
     load_pem_private_key,
 )
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
@@ -98,8 +99,8 @@ class Authority:
 
     def _issue(self, name: str, role: Role, issue: int, days: int) -> Participant:
         until = (datetime.now(UTC) + timedelta(days=days)).date().isoformat()
-        participant = Participant(name=name, role=role, issue=issue, until=until)
         key = ec.generate_private_key(ec.SECP256R1())
+        participant = Participant(name=name, role=role, issue=issue, until=until, public_key=_point(key.public_key()))
         certificate = _built(
             participant.common_name, key, days, role=role, issuer=self._certificate.subject, issuer_key=self._key
         )
@@ -113,10 +114,20 @@ class Authority:
     def _note(self, participant: Participant) -> None:
         """Remember, and tell every bundle."""
         self.participants[participant.name] = participant
+        self.participants = {name: self._with_key(one) for name, one in self.participants.items()}
         everybody = list(self.participants.values())
         _write(self.folder / LIST_FILE, _json(everybody))
         for one in everybody:
             _write(self.bundle(one.name) / ABOUT_FILE, _json(About(name=one.name, participants=everybody)))
+
+    def _with_key(self, one: Participant) -> Participant:
+        """With the public key of its certificate, which older lists lack; without where its bundle is not here."""
+        path = self.bundle(one.name) / CERTIFICATE_FILE
+        if one.public_key or not path.exists():
+            return one
+        public = x509.load_pem_x509_certificate(path.read_bytes()).public_key()
+        assert isinstance(public, ec.EllipticCurvePublicKey)
+        return msgspec.structs.replace(one, public_key=_point(public))
 
 
 def check_name(name: str) -> None:
@@ -162,6 +173,10 @@ def _purposes(role: Role) -> Iterable[x509.ObjectIdentifier]:
 
 def _pem(key: ec.EllipticCurvePrivateKey) -> bytes:
     return key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
+
+
+def _point(public: ec.EllipticCurvePublicKey) -> str:
+    return public.public_bytes(Encoding.X962, PublicFormat.CompressedPoint).hex()
 
 
 def _json(value: object) -> bytes:

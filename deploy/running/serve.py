@@ -17,6 +17,7 @@ from prior_sg import services
 from prior_sg.deploy.edge import check_arguments
 from prior_sg.deploy.errors import UserError
 from prior_sg.deploy.running import crashes
+from prior_sg.deploy.running.here import noted
 from prior_sg.deploy.settings import DEFAULT_ROBOT, add_keys, connect_in_force, resolved_config, use_keys
 from prior_sg.deploy.terminal import complain
 from prior_sg.schemas.topics import EPOCH
@@ -197,7 +198,7 @@ def run(arguments: argparse.Namespace) -> int:
             import uvloop
 
             asyncio.set_event_loop_policy(uvloop.EventLoopPolicy())
-        with crashes.watched(arguments.crashes, instance):
+        with noted(instance), crashes.watched(arguments.crashes, instance):
             yielded = asyncio.run(serve(arguments, instance))
     except HOPELESS as error:
         log.error(str(error))

@@ -29,6 +29,12 @@ class ChildFailed(UserError):
     """A service keeps dying; the message says where its log is."""
 
 
+class ChildHopeless(ChildFailed):
+    """A service that would fail again: whoever starts this program again gains nothing."""
+
+    exit_status = EXIT_HOPELESS
+
+
 @dataclass
 class Child:
     """One service process and its history."""
@@ -209,7 +215,8 @@ class Supervisor:
                 child.deaths = 1 if stable else child.deaths + 1
                 if code == EXIT_HOPELESS or child.deaths >= GIVE_UP_AFTER:
                     died = child.last_words() if code >= 0 else f"it was ended by {_reason(code)}"
-                    raise ChildFailed(f"{child.instance} does not run: {died} (log: {child.log_path})")
+                    failed = ChildHopeless if code == EXIT_HOPELESS else ChildFailed
+                    raise failed(f"{child.instance} does not run: {died} (log: {child.log_path})")
                 delay_s = min(RESTART_DELAY_S * 2 ** (child.deaths - 1), MAX_RESTART_DELAY_S)
                 child.process, child.restart_at_s = None, now_s + delay_s
                 why = f": {child.last_words()}" if code > 0 else ""

@@ -4,12 +4,13 @@ import contextlib
 import threading
 import time
 import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
+from functools import cached_property
 from types import TracebackType
 from typing import Any, NamedTuple, TypeVar
 
 from prior_sg.schemas.codec import DecodeError, Message, decode, encode
-from prior_sg.schemas.priors import Prior, PriorRequest, Task, TaskInForce, TaskRequest
+from prior_sg.schemas.priors import Prior, PriorList, PriorRequest, Task, TaskInForce, TaskRequest
 from prior_sg.schemas.status import ServiceStatus, StatusRequest
 from prior_sg.schemas.succession import Swapped, SwapRequest
 from prior_sg.schemas.topics import (
@@ -28,6 +29,7 @@ from prior_sg.schemas.topics import (
 from prior_sg.services.errors import PriorSgError
 from prior_sg.services.runtime.bus import Answer, Bus, BusError, Sample, message_in, pack_header
 from prior_sg.services.runtime.host.lease import Standing, standing
+from prior_sg.services.runtime.signatures import Unsigned, signatures_in_force
 
 R = TypeVar("R", bound=Message)
 POLL_S = 0.5
@@ -71,6 +73,11 @@ class BusClient:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.bus.close()
+
+    @cached_property
+    def signatures(self) -> Unsigned:
+        """What priors are checked by. Raises BusError, ExtraMissing."""
+        return signatures_in_force()
 
     def publish(self, topic: Topic, message: Message, traceparent: str = "") -> int:
         """Publish one message, in the context of a trace if there is one; returns which of ours on its key it is, from
@@ -120,9 +127,12 @@ class BusClient:
                 kind = NobodyError if answer.reason == NOBODY else BusError
                 raise kind(f"{name}: {_explain(answer.reason)}")
             try:
-                return decode(reply_type, answer.payload)
+                told = decode(reply_type, answer.payload)
             except DecodeError as error:
                 raise BusError(f"{name}: the answer is not valid: {error}") from error
+            if isinstance(told, PriorList) and (fault := self.signatures.fault_of(told)):
+                raise BusError(f"{name}: {fault}")
+            return told
 
         self.bus.call(key, encode(request), timeout_s, receive)
         return reply
@@ -150,13 +160,14 @@ class BusClient:
         """Publish a task and wait for the prior that answers it; a model may take minutes, and `waiting` is told why
         meanwhile. Raises NoPriorError, BusError."""
         found: list[Prior] = []
+        signatures = self.signatures
         arrived = threading.Event()
         given_ns = time.time_ns()
 
         def see(sample: Sample) -> None:
             with contextlib.suppress(DecodeError):
                 prior: Prior = message_in(sample)
-                if sample.sent_ns >= given_ns and prior.answers(task):
+                if sample.sent_ns >= given_ns and prior.answers(task) and not signatures.fault_of(prior):
                     found.append(prior)
                     arrived.set()
 
@@ -215,14 +226,15 @@ class BusClient:
         return self._ask(swap_key(service, instance), Swapped, request, f"exchange of {instance}", timeout_s)
 
     def statuses(
-        self, request: StatusRequest = StatusRequest(), timeout_s: float = 3.0
+        self, request: StatusRequest = StatusRequest(), timeout_s: float = 3.0, among: Mapping[str, str] | None = None
     ) -> tuple[list[ServiceStatus], dict[str, str]]:
-        """Health of all who are alive, asked at once, sorted by instance; why others did not answer, by instance."""
+        """Health of all who are alive, or of those `among` them (services by instance), asked at once, sorted by
+        instance; why others did not answer, by instance."""
         replies = {
             instance: self._asked(
                 status_key(service, instance), ServiceStatus, request, f"status of {instance}", timeout_s
             )
-            for instance, service in sorted(self.alive().items())
+            for instance, service in sorted((self.alive() if among is None else among).items())
         }
         heard, silent = [], {}
         for instance, reply in replies.items():

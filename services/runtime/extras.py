@@ -1,5 +1,6 @@
 """Which extra of this distribution brings a package that is not installed."""
 
+from collections.abc import Iterable
 from functools import lru_cache
 from importlib import metadata
 from importlib.util import find_spec
@@ -64,7 +65,11 @@ def release() -> str:
 
 def require(extra: str, user: str) -> None:
     """Raise ExtraMissing on behalf of `user` unless all packages of an extra are there; "" asks for none."""
-    modules = [name for one in (extra, *CONTAINS.get(extra, ())) if one for name in MODULES[one]]
+    require_modules([name for one in (extra, *CONTAINS.get(extra, ())) if one for name in MODULES[one]], user, extra)
+
+
+def require_modules(modules: Iterable[str], user: str, extra: str) -> None:
+    """Raise ExtraMissing on behalf of `user` unless these packages, which an extra brings, are there."""
     if absent := [name for name in modules if not _is_there(name)]:
         raise ExtraMissing(f"{user} needs {', '.join(absent)}: {remedy(extra)}")
 

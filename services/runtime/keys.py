@@ -27,6 +27,7 @@ class Participant(msgspec.Struct, frozen=True, kw_only=True):
     issue: int
     until: str  # the day after which the certificate is not taken, as 2027-01-31
     revoked: bool = False
+    public_key: str = ""  # compressed point of P-256 in hexadecimal; empty in older lists
 
     @property
     def common_name(self) -> str:

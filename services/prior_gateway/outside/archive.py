@@ -146,7 +146,7 @@ def open_recall(cfg: Config, identity: Identity) -> Callable[[Recall], Awaitable
 def open_keep(cfg: Config, identity: Identity) -> Callable[[Keep], Awaitable[Kept]]:
     """The errand that keeps, dates and signs. Raises ServiceError for unusable keys."""
     shelf = PriorShelf(cfg.archive, cfg.learning.kept_maps)
-    signer = Signer(cfg.signing_key, cfg.trusted_keys)
+    signer = Signer(cfg)
 
     def keep_now(request: Keep) -> Kept:
         if request.evidence is not None:
@@ -156,7 +156,7 @@ def open_keep(cfg: Config, identity: Identity) -> Callable[[Keep], Awaitable[Kep
         if request.own:
             prior = signer.sign(_dated(prior, identity.instance))
         trusted, verdict = signer.check(prior)
-        if cfg.require_signature and not (trusted or request.own):
+        if signer.required and not (trusted or request.own):
             log.warning("a prior from elsewhere is not trusted: left out", extra={"why": verdict})
             return Kept(question=request.question, verdict=verdict)
         shelf.put(prior, PREFERRED if request.preferred else file_name(request.question), request.root, verdict)

@@ -1,6 +1,7 @@
-"""Signatures of priors: Ed25519 over the digest, so that a fleet can tell who made a prior.
+"""Signatures of priors in files: Ed25519 over the digest, for priors that go from one fleet or laboratory to another.
 
-Keys are PEM files as OpenSSL writes them (docs/operations.md). The signer's name is the stem of its key's file.
+Keys are PEM files as OpenSSL writes them (docs/priors.md). The signer's name is the stem of its key's file. Within a fleet
+with keys, hosts sign what they publish (services/runtime/signatures.py), and such signatures count here, too.
 """
 
 from pathlib import Path
@@ -12,22 +13,29 @@ from cryptography.hazmat.primitives.serialization import load_pem_private_key, l
 
 from prior_sg.schemas.priors import Prior
 from prior_sg.services.folders import expanded
+from prior_sg.services.prior_gateway.core.config import Config
 from prior_sg.services.runtime.service import ServiceError
+from prior_sg.services.runtime.signatures import Signatures, signatures_in_force
 
 PURPOSE = b"prior-sg prior "  # a signature of a prior is one of nothing else
 
 
 class Signer:
-    """Signs with one private key, if there is one, and checks against the trusted public keys."""
+    """Signs with one private key, if there is one, and checks against the trusted public keys and the fleet's list.
 
-    def __init__(self, key_file: str, trusted_folder: str) -> None:
+    Raises ServiceError for keys that cannot be used, BusError for a bundle that cannot.
+    """
+
+    def __init__(self, cfg: Config) -> None:
+        self._fleet = signatures_in_force()
+        self.required = cfg.require_signature or isinstance(self._fleet, Signatures)  # of what comes from elsewhere
         self.name, self._key = "", None
-        if key_file:
-            path = expanded(key_file)
+        if cfg.signing_key:
+            path = expanded(cfg.signing_key)
             self.name, self._key = path.stem, _private(path)
         self._trusted: dict[str, Ed25519PublicKey] = {}
-        if trusted_folder:
-            folder = expanded(trusted_folder)
+        if cfg.trusted_keys:
+            folder = expanded(cfg.trusted_keys)
             if not folder.is_dir():
                 raise ServiceError(f"prior_gateway.trusted_keys: {folder} is no folder")
             self._trusted = {path.stem: _public(path) for path in sorted(folder.glob("*.pub"))}
@@ -47,6 +55,9 @@ class Signer:
         made = prior.provenance
         if not made.signature:
             return False, "not signed"
+        if isinstance(self._fleet, Signatures) and made.signer not in self._trusted:
+            fault = self._fleet.fault_of(prior)
+            return not fault, fault or f"signed by {made.signer!r}, verified"
         key = self._trusted.get(made.signer)
         if key is None:
             return False, f"signed by {made.signer!r}, whose key is not among the trusted ones"

@@ -51,6 +51,7 @@ from prior_sg.services.runtime.jobs.dispatcher import CREDITS
 from prior_sg.services.runtime.jobs.memory import Done
 from prior_sg.services.runtime.jobs.pool import JobPool, done
 from prior_sg.services.runtime.service import Ask, Identity, Service
+from prior_sg.services.runtime.signatures import signatures_in_force
 
 log = logging.getLogger(__name__)
 FEW_INPUTS = 4  # that may wait in a process that has caught up
@@ -85,6 +86,7 @@ class Host:
         self._no_more = asyncio.Event()  # of a source
         self._yielding = Yielding(self.inbox, self._no_more, self._may_yield)
         self._driving = self._answers = False
+        self._signatures = signatures_in_force()
         self.stopping = asyncio.Event()
         self._loop = asyncio.get_running_loop()
         self._waiting = asyncio.Event()
@@ -289,6 +291,7 @@ class Host:
                 or fault_of_writer(self._fence, message)
                 or fault_of_clock(message)
                 or self._replays.fault_of(sample, message)
+                or self._signatures.fault_of(message)
             ),
             writer=sample.writer,
         )
@@ -316,7 +319,10 @@ class Host:
             name=query.name,
             key=query.key,
             fault_of=lambda told: (
-                fault_of_reply(reply.ask.request, told) or fault_of_writer(self._fence, told) or fault_of_clock(told)
+                fault_of_reply(reply.ask.request, told)
+                or fault_of_writer(self._fence, told)
+                or fault_of_clock(told)
+                or self._signatures.fault_of(told)
             ),
         )
         if message is None:
@@ -338,7 +344,7 @@ class Host:
             return
         self.inbox.of(query.name).consumed += 1
         try:
-            answer = encode(self.service.answers[query](self._state, request, self.cfg))
+            answer = encode(self._signatures.signed(self.service.answers[query](self._state, request, self.cfg)))
         except NotYet as error:
             question.request.refuse(f"{query.name}: {error}")
             return
@@ -425,7 +431,7 @@ class Host:
         else:
             if self._lease is not None and topic in DELTAS:
                 self._lease.tells(topic.name, message.revision)  # type: ignore[attr-defined]
-            self._outbox.put(topic, message)
+            self._outbox.put(topic, self._signatures.signed(message))
 
     def _ask(self, ask: Ask) -> None:
         self.service.check_ask(ask)
