@@ -8,7 +8,7 @@ WORKERS ?= 2
 # One process compiles for all others, whatever the caller's shell says.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo test coverage test-llm check loops bench clean
+.PHONY: demo test coverage test-llm check loops bench chaos clean
 .DEFAULT_GOAL := demo
 
 demo: $(VENV)/installed
@@ -46,6 +46,10 @@ check: $(VENV)/installed-dev
 
 bench: $(VENV)/installed-dev
 	$(BIN)/prior-sg bench all --json
+
+# Hundreds of faults on whole systems, about 40 minutes; CHAOS='--faults 20 --seed 7' for others. It goes on where it was.
+chaos: $(VENV)/installed-dev
+	$(BIN)/python -m tests.chaos $(CHAOS)
 
 INSTALL := $(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt
 # Loops compiled for another version may name what it lacks now.

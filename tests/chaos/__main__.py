@@ -63,7 +63,9 @@ def run(arguments: argparse.Namespace, wanted: list[str]) -> int:
             spent_s = time.monotonic() - began_s
             rate_s = spent_s / max(results.faults - before, 1)
             left_s = rate_s * max(arguments.faults - results.faults, 0)
-            print(f"{results.faults} of {arguments.faults} faults, {spent_s:.0f} s; about {left_s:.0f} s left", flush=True)
+            print(
+                f"{results.faults} of {arguments.faults} faults, {spent_s:.0f} s; about {left_s:.0f} s left", flush=True
+            )
     summary = results.summary()
     print(table(summary), flush=True)
     print(f"written to {arguments.out}: chaos.json, outcomes.jsonl", flush=True)
@@ -82,9 +84,7 @@ def _voyage(arguments: argparse.Namespace, results: Results, names: list[str]) -
     with contextlib.ExitStack() as ending:
         small = any(plan.fault == "full disk" for phase in phases for plan in phase)
         disk = ending.enter_context(machine.small_disk(folder / "disk")) if small else None
-        for outcome in sailed(
-            number, stream, known, phases, folder, disk=disk, lasting=arguments.lasting_ids
-        ):
+        for outcome in sailed(number, stream, known, phases, folder, disk=disk, lasting=arguments.lasting_ids):
             results.add(outcome)
             faulty = faulty or bool(outcome.problems)
             hits = ", ".join(f"{hit.fault} of {hit.target} {hit.recovered_s} s" for hit in outcome.hits)

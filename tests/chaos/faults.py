@@ -19,7 +19,7 @@ import zenoh
 from prior_sg.schemas.topics import TOPICS
 from prior_sg.services.runtime.bus import pack_header
 from tests.chaos.faketime import set_clock
-from tests.chaos.schedule import ROUTER, SERVICES, Planned
+from tests.chaos.schedule import ROUTER, Planned
 from tests.chaos.serve import Mode
 from tests.chaos.system import System
 from tests.chaos.watch import Watch, waited
@@ -30,7 +30,15 @@ RESET_EVERY_S = 0.4
 SENT_AGAIN_HZ = 150
 GARBAGE = (b"", b"\x00", b"\xff" * 64, bytes(range(256)) * 2)
 CLOCK_OFF_S = (2.0, 90.0, 7200.0, 86_400.0 * 3)
-HOG = "import os,sys\nwith open(sys.argv[1],'wb') as f:\n while True:\n  f.seek(0);f.write(os.urandom(1<<23));f.flush();os.fsync(f)"
+HOG = """
+import os, sys
+with open(sys.argv[1], "wb") as file:
+    while True:
+        file.seek(0)
+        file.write(os.urandom(1 << 23))
+        file.flush()
+        os.fsync(file)
+"""
 SPIN = "while True: pass"
 COME_S = 60.0  # for a process that is started again
 
@@ -300,7 +308,7 @@ def _bind(system: System, cores: set[int]) -> None:
 @contextmanager
 def netem(system: System, watch: Watch, plan: Planned) -> Iterator[None]:
     """Loopback of this network namespace loses, delays, repeats and reorders packets."""
-    kinds = "delay 20ms 10ms loss 2% duplicate 1% reorder 5%".split()
+    kinds = ["delay", "20ms", "10ms", "loss", "2%", "duplicate", "1%", "reorder", "5%"]
     subprocess.run(["tc", "qdisc", "replace", "dev", "lo", "root", "netem", *kinds], check=True)
     try:
         yield
@@ -372,5 +380,3 @@ def done(system: System, watch: Watch, plan: Planned, over: Callable[[], None]) 
     with FAULTS[plan.fault](system, watch, plan):
         time.sleep(plan.lasts_s)
     over()
-
-

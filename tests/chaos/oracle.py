@@ -29,7 +29,9 @@ def likeness(one: Scene, other: Scene) -> dict[str, float]:
         "edges": _jaccard(map(tuple, one.edges.tolist()), map(tuple, other.edges.tolist())),
         "cameras": _share(int((~moved).sum()), max(len(one.trajectory), len(other.trajectory))),
         "labels": _share(sum(a == b for a, b in zip(*labels, strict=True)), len(rows)),
-        "regions": _partition(one, other, dict(zip(one.place_ids[first].tolist(), zip(*regions, strict=True), strict=True))),
+        "regions": _partition(
+            one, other, dict(zip(one.place_ids[first].tolist(), zip(*regions, strict=True), strict=True))
+        ),
         "region_ids": _share(sum(a == b for a, b in zip(*regions, strict=True)), len(rows)),
         "objects": _share(pairs, max(len(one.objects), len(other.objects))),
         "object_ids": _share(ids, max(len(one.objects), len(other.objects))),

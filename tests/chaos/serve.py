@@ -104,9 +104,7 @@ def disturbed(mode: ModeNow) -> type[ZenohBus]:
         def put(self, topic: Topic, key: str, payload: bytes, header: bytes) -> None:
             super().put(topic, key, spoken(topic.type, payload, dialect), header)
 
-        def subscribe(
-            self, topic: Topic, pattern: str, on_sample: OnSample, on_missed: OnMissed
-        ) -> Callable[[], None]:
+        def subscribe(self, topic: Topic, pattern: str, on_sample: OnSample, on_missed: OnMissed) -> Callable[[], None]:
             return super().subscribe(topic, pattern, Ear(mode, topic, on_sample), on_missed)
 
     return Disturbed
@@ -138,7 +136,9 @@ def main() -> int:
     if (file := mode().faketime) and "LD_PRELOAD" not in os.environ:
         told = {"LD_PRELOAD": LIBRARY, "FAKETIME_TIMESTAMP_FILE": file, "FAKETIME_CACHE_DURATION": "1"}
         clock = {"FAKETIME_DONT_FAKE_MONOTONIC": "1", "DONT_FAKE_MONOTONIC": "1"}
-        os.execve(sys.executable, [sys.executable, "-P", "-m", "tests.chaos.serve", *sys.argv[1:]], os.environ | told | clock)
+        os.execve(
+            sys.executable, [sys.executable, "-P", "-m", "tests.chaos.serve", *sys.argv[1:]], os.environ | told | clock
+        )
     FAMILIES["painted/"] = "tests.chaos.painted"
     loaded = sources.recording.load
     sources.recording.load = lambda *arguments: Gate(folder / "gate").around(loaded(*arguments))

@@ -27,6 +27,7 @@ from tests.help.paths import ROOT
 
 START_S = 120.0
 CHECK_S = 0.1
+TASK = "look around"
 MARK = "CHAOS_MARK"  # in the environment of every process of one system
 SETTINGS = (
     f"feature_pyramid.space={painted.SPACE}",
@@ -127,11 +128,15 @@ class System:
             MARK: self.mark,
             serve.FOLDER: str(self.folder),
             painted.LABELS: json.dumps(self.stream.labels),
-            "PYTHONPATH": os.pathsep.join(filter(None, (str(ROOT), str(ROOT / "src"), os.environ.get("PYTHONPATH", "")))),
+            "PYTHONPATH": os.pathsep.join(
+                filter(None, (str(ROOT), str(ROOT / "src"), os.environ.get("PYTHONPATH", "")))
+            ),
         }
         with contextlib.ExitStack() as ending:
             ending.callback(self.proxies.close)
-            self.router = Kept(ROUTER, [*self._command, "router", "--connect", self.endpoint], self.folder / "router.log")
+            self.router = Kept(
+                ROUTER, [*self._command, "router", "--connect", self.endpoint], self.folder / "router.log"
+            )
             ending.callback(self.router.end)
             self.router.check()
             self.client = BusClient(ZenohBus(self.endpoint, START_S))
@@ -163,7 +168,7 @@ class System:
             robot=ROBOT,
             stamp_ns=time.time_ns(),
             environment=self.stream.environment,
-            task="look around",
+            task=TASK,
             regions=regions,
         )
         self.client.give_task(task, START_S)

@@ -3,7 +3,7 @@
 import contextlib
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import msgspec
@@ -80,9 +80,7 @@ def reference(stream: Stream, folder: Path, say: Callable[[str], None] = lambda 
     return found
 
 
-def _undisturbed(
-    stream: Stream, folder: Path, points: Sequence[int]
-) -> tuple[dict[int, Scene], dict[str, float]]:
+def _undisturbed(stream: Stream, folder: Path, points: Sequence[int]) -> tuple[dict[int, Scene], dict[str, float]]:
     scenes: dict[int, Scene] = {}
     with System(stream, folder) as system, Watch(system.endpoint) as watch:
         for point in points:
@@ -108,12 +106,12 @@ def _rest(watch: Watch, frames: int, patience_s: float = PATIENCE_S) -> None:
 class Voyage:
     """Runs the phases of one system. Iterate `outcomes`; a system that cannot go on ends them early."""
 
-    def __init__(self, number: int, stream: Stream, known: Reference, system: System, watch: Watch, lasting: bool) -> None:
-        self.number, self.stream, self.known, self.lasting = number, stream, known, lasting
+    def __init__(self, number: int, system: System, watch: Watch, known: Reference, *, lasting: bool = False) -> None:
+        self.number, self.stream, self.known, self.lasting = number, system.stream, known, lasting
         self.system, self.watch = system, watch
         self._gate = 0
 
-    def outcomes(self, phases: Sequence[Phase]):
+    def outcomes(self, phases: Sequence[Phase]) -> Iterator[Outcome]:
         """What came of each phase, while there is stream left."""
         self._to(GRID)
         _rest(self.watch, GRID)
@@ -126,7 +124,7 @@ class Voyage:
         said_before, expected_before = len(self.system.said), len(self.system.expected)
         problems: list[str] = []
         hits = self._disturbed(phase, problems)
-        point = min(-(-self._gate // GRID) * GRID, self.stream.frames)
+        point = min(frames for frames in self.known.scenes if frames >= self._gate)
         self._to(point)
         alike: Mapping[str, float] = {}
         try:
@@ -221,12 +219,12 @@ def sailed(
     *,
     disk: Path | None = None,
     lasting: bool = False,
-):
+) -> Iterator[Outcome]:
     """The outcomes of one voyage; afterwards nothing of it may be left, and its logs must be readable."""
     last: Outcome | None = None
     system = System(stream, folder, disk)
     with system, Watch(system.endpoint) as watch:
-        for outcome in Voyage(number, stream, known, system, watch, lasting).outcomes(phases):
+        for outcome in Voyage(number, system, watch, known, lasting=lasting).outcomes(phases):
             if last is not None:
                 yield last
             last = outcome
