@@ -26,13 +26,14 @@ from prior_sg.services.runtime.host.host import Host
 from prior_sg.services.runtime.host.lease import Fence, Lease, SupersededError
 from prior_sg.services.runtime.logs import start_logging
 from prior_sg.services.runtime.record import LogError
-from prior_sg.services.runtime.service import Identity, Service, ServiceError
+from prior_sg.services.runtime.service import Identity, LaterError, Service, ServiceError
 from prior_sg.services.runtime.zenoh_bus import ZenohBus
 
 log = logging.getLogger(__name__)
 PARENT_CHECK_S = 1.0
 HOPELESS = (ConfigError, BusError, ServiceError, LogError)  # their messages say what to do
 EXIT_HOPELESS = 2  # starting again would fail again
+EXIT_LATER = 4  # it lacks what can come back: started again, it goes on as soon as that has
 EXIT_SUPERSEDED = 3  # another is in charge: started again, it waits for that one's end
 
 
@@ -145,6 +146,9 @@ def run(arguments: argparse.Namespace) -> int:
 
             asyncio.set_event_loop_policy(uvloop.EventLoopPolicy())
         asyncio.run(serve(arguments, instance))
+    except LaterError as error:
+        log.error(str(error))
+        return EXIT_LATER
     except HOPELESS as error:
         log.error(str(error))
         return EXIT_HOPELESS

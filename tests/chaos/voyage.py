@@ -24,6 +24,7 @@ FRAME_S = 0.25  # between two frames of the stream
 AHEAD = 24  # frames let through beyond the newest that is mapped
 PATIENCE_S = 90.0  # until the stream is followed again, and until the system rests
 FIRST_PATIENCE_S = 400.0  # of an undisturbed one, which may have to compile its loops
+LATE_S = 20.0  # in which what seemed at rest may still become equal: what is missing is asked for again
 LEFT_MB = 150.0  # more than undisturbed that a process may hold
 
 
@@ -46,6 +47,7 @@ class Outcome(msgspec.Struct, frozen=True, kw_only=True):
     hits: list[Hit]
     likeness: dict[str, float]
     problems: list[str]  # empty = the scene is equal, all live, nothing was lost
+    late_s: float = 0.0  # after it seemed at rest until the scene was equal
     beside: list[str] = []  # who ended without being hit
     resident_mb: dict[str, float] = {}
 
@@ -127,11 +129,18 @@ class Voyage:
         point = min(frames for frames in self.known.scenes if frames >= self._gate)
         self._to(point)
         alike: Mapping[str, float] = {}
+        late_s = 0.0
         try:
             _rest(self.watch, point)
-            alike = likeness(self.known.scene(point), self.watch.scene())
-            problems += differences(alike, self.known.tolerance, self.lasting)
-            problems += self.watch.lost()[:3]
+            rested_s = time.monotonic()
+            while True:
+                alike = likeness(self.known.scene(point), self.watch.scene())
+                differs = differences(alike, self.known.tolerance, self.lasting)
+                late_s = time.monotonic() - rested_s
+                if not differs or late_s > LATE_S:
+                    break
+                time.sleep(0.5)
+            problems += [*differs, *self.watch.lost()[:3]]
         except (TimeoutError, BusError) as error:
             problems.append(str(error))
         resident_mb = self.system.resident_mb()
@@ -152,6 +161,7 @@ class Voyage:
             hits=hits,
             likeness=dict(alike) or dict.fromkeys(ASPECTS, 0.0),
             problems=problems,
+            late_s=round(late_s, 1),
             beside=[text for text in ended if text.split()[0].rsplit("-", 1)[0] not in expected],
             resident_mb=resident_mb,
         )

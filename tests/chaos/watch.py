@@ -8,7 +8,7 @@ from collections import defaultdict, deque
 
 from prior_sg.deploy.running.recorder import TICKS_AFTER
 from prior_sg.schemas.codec import DecodeError
-from prior_sg.schemas.frames import IngestState
+from prior_sg.schemas.features import Pyramid
 from prior_sg.schemas.places import PlaceDelta
 from prior_sg.schemas.regions import RegionDelta
 from prior_sg.schemas.scene import HistoryRequest, Scene, SceneRequest, SceneRevision, StoredRevision
@@ -16,7 +16,6 @@ from prior_sg.schemas.status import Consumed, ServiceStatus
 from prior_sg.schemas.topics import (
     DETECTIONS,
     HISTORY,
-    INGEST_STATE,
     JOURNAL,
     KEYFRAME,
     OBJECT_DELTA,
@@ -32,7 +31,7 @@ from prior_sg.services.runtime.zenoh_bus import ZenohBus
 from tests.chaos.schedule import SERVICES
 from tests.chaos.streams import ROBOT
 
-HEARD = (KEYFRAME, PLACE_DELTA, PYRAMID, DETECTIONS, REGION_DELTA, OBJECT_DELTA, JOURNAL, INGEST_STATE, SCENE_REVISION)
+HEARD = (KEYFRAME, PLACE_DELTA, PYRAMID, DETECTIONS, REGION_DELTA, OBJECT_DELTA, JOURNAL, SCENE_REVISION)
 STREAM = frozenset(topic.name for topic in HEARD[:6])
 REST_S = 0.7  # after the last delta, beside the segmenter's ticks
 KEPT = 300  # samples that a fault may send again
@@ -48,7 +47,7 @@ class Watch:
         self.recent: deque[Sample] = deque(maxlen=KEPT)
         self.announced: dict[int, set[Figures]] = defaultdict(set)  # by revision
         self.mapped = self.seen = -1  # the newest frame in a place delta, and in an input of the segmenter
-        self.encoded = 0
+        self.encoded: set[int] = set()  # frames with a pyramid
         self.regions_s = self.stored_s = self.changed_s = time.monotonic()
         self._rested: dict[str, int] = {}  # of services that work on ticks: how many since their last input
         self._lock = threading.Lock()
@@ -71,8 +70,8 @@ class Watch:
         with self._lock:
             waits_s = REST_S - (time.monotonic() - self.changed_s)
             ticks = {name: TICKS_AFTER[name] - self._rested.get(name, 0) for name in ("segmenter",)}
-            told = f"mapped {self.mapped}, segmented {self.seen}, encoded {self.encoded} of {frames}"
-        if min(self.mapped, self.seen) < frames - 1 or self.encoded < frames:
+            told = f"mapped {self.mapped}, segmented {self.seen}, encoded {len(self.encoded)} of {frames}"
+        if min(self.mapped, self.seen) < frames - 1 or len(self.encoded) < frames:
             return told
         if waits_s > 0 or max(ticks.values()) > 0:
             return "it still changes"
@@ -149,8 +148,8 @@ class Watch:
             case SceneRevision():
                 self.stored_s = now_s
                 self.announced[message.revision].add((message.places, message.edges, message.regions))
-            case IngestState():
-                self.encoded = message.encoded
+            case Pyramid():
+                self.encoded.add(message.frame_id)
             case Consumed(topic="Tick"):
                 self._rested[message.service] = self._rested.get(message.service, 0) + 1
             case Consumed() if message.writer:
