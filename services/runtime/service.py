@@ -20,7 +20,7 @@ class ServiceError(PriorSgError):
 
 
 class LaterError(ServiceError):
-    """A running service lacks what can come back, such as room on a disk: it is started again for as long as it takes."""
+    """A running service lacks what can come back, such as room on a disk: it is started again until it has it."""
 
 
 class UndeclaredError(Exception):

@@ -59,7 +59,11 @@ def run(arguments: argparse.Namespace, wanted: list[str]) -> int:
     before = results.faults
     with contextlib.suppress(KeyboardInterrupt):
         while results.faults < arguments.faults:
+            done = results.faults
             _voyage(arguments, results, names)
+            if results.faults == done:
+                print("no fault could be done: the system did not come to rest before the first", flush=True)
+                break
             spent_s = time.monotonic() - began_s
             rate_s = spent_s / max(results.faults - before, 1)
             left_s = rate_s * max(arguments.faults - results.faults, 0)

@@ -248,6 +248,7 @@ def _exchanged(system: System, target: str) -> None:
 def full_disk(system: System, watch: Watch, plan: Planned) -> Iterator[None]:
     """Nothing more can be written where the store and the recorder write."""
     filler = system.disk / "filler"
+    system.expected += ["scene_store", RECORDER]
     with filler.open("wb", buffering=0) as file:
         block = 1 << 20
         while block:

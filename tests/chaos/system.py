@@ -27,6 +27,7 @@ from tests.help.paths import ROOT
 
 START_S = 120.0
 CHECK_S = 0.1
+KEPT_DELAY_S = 0.5  # before the router or the recorder is started again
 TASK = "look around"
 MARK = "CHAOS_MARK"  # in the environment of every process of one system
 SETTINGS = (
@@ -45,6 +46,7 @@ class Kept:
         self.name, self.log_path, self._command = name, log_path, command
         self.away = False
         self.starts = 0
+        self._ended_s = 0.0
         self.process: subprocess.Popen | None = None
 
     @property
@@ -56,6 +58,11 @@ class Kept:
         """Start it where it is to run; what happened."""
         code = None if self.process is None else self.process.poll()
         if self.away or (self.process is not None and code is None):
+            self._ended_s = 0.0
+            return []
+        now_s = time.monotonic()
+        self._ended_s = self._ended_s or now_s
+        if self.process is not None and now_s - self._ended_s < KEPT_DELAY_S:
             return []
         said = [] if self.process is None else [f"{self.name} ended (exit status {code}); started again"]
         command = [part.format(start=self.starts) for part in self._command]
@@ -124,7 +131,7 @@ class System:
     def __enter__(self) -> "System":
         self.folder.mkdir(parents=True, exist_ok=True)
         self.open_gate(0)
-        os.environ |= {
+        told = {
             MARK: self.mark,
             serve.FOLDER: str(self.folder),
             painted.LABELS: json.dumps(self.stream.labels),
@@ -132,7 +139,10 @@ class System:
                 filter(None, (str(ROOT), str(ROOT / "src"), os.environ.get("PYTHONPATH", "")))
             ),
         }
+        before = {name: os.environ.get(name) for name in told}
+        os.environ |= told
         with contextlib.ExitStack() as ending:
+            ending.callback(_restore, before)
             ending.callback(self.proxies.close)
             self.router = Kept(
                 ROUTER, [*self._command, "router", "--connect", self.endpoint], self.folder / "router.log"
@@ -255,3 +265,11 @@ class System:
     def _end_keeper(self) -> None:
         self._stopping.set()
         self._keeper.join()
+
+
+def _restore(environment: dict[str, str | None]) -> None:
+    for name, value in environment.items():
+        if value is None:
+            del os.environ[name]
+        else:
+            os.environ[name] = value

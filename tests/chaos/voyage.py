@@ -1,6 +1,5 @@
 """One system, one stream, a sequence of faults: after each, the scene must be that of the undisturbed system there."""
 
-import contextlib
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -151,7 +150,7 @@ class Voyage:
         ]
         if self.system.failed:
             problems.append(self.system.failed)
-        expected = set(self.system.expected[expected_before:])
+        expected = {*self.system.expected[expected_before:], *(plan.target for plan in phase)}
         ended = [text for text in self.system.said[said_before:] if " ended " in text]
         return Outcome(
             voyage=self.number,
@@ -230,22 +229,21 @@ def sailed(
     disk: Path | None = None,
     lasting: bool = False,
 ) -> Iterator[Outcome]:
-    """The outcomes of one voyage; afterwards nothing of it may be left, and its logs must be readable."""
-    last: Outcome | None = None
+    """The outcomes of one voyage, and one without hits where it could not go on, left something behind or left a log
+    that cannot be read."""
     system = System(stream, folder, disk)
-    with system, Watch(system.endpoint) as watch:
-        for outcome in Voyage(number, system, watch, known, lasting=lasting).outcomes(phases):
-            if last is not None:
-                yield last
-            last = outcome
-    if last is None:
-        raise TimeoutError(system.failed or f"voyage {number} had no phase: its stream has too few frames")
-    left = [f"{process.pid} {' '.join(process.cmdline()[:6])}" for process in system.processes()]
-    faults = [f"left behind: {one}" for one in left]
+    faults = []
+    try:
+        with system, Watch(system.endpoint) as watch:
+            yield from Voyage(number, system, watch, known, lasting=lasting).outcomes(phases)
+    except (TimeoutError, BusError) as error:
+        faults.append(f"the voyage ended early: {error}")
+    faults += [f"left behind: {process.pid}" for process in system.processes()]
     for log in sorted(system.disk.glob("log-*.mcap")):
-        with contextlib.suppress(FileNotFoundError):
-            try:
-                summary(log)
-            except LogError as error:
-                faults.append(f"{log.name} cannot be read: {error}")
-    yield msgspec.structs.replace(last, problems=[*last.problems, *faults])
+        try:
+            summary(log)
+        except LogError as error:
+            faults.append(f"{log.name} cannot be read: {error}")
+    if faults:
+        alike = dict.fromkeys(ASPECTS, 1.0)
+        yield Outcome(voyage=number, phase=-1, stream=stream.name, frames=0, hits=[], likeness=alike, problems=faults)
