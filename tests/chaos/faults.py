@@ -19,7 +19,7 @@ import zenoh
 from prior_sg.schemas.topics import TOPICS
 from prior_sg.services.runtime.bus import pack_header
 from tests.chaos.faketime import set_clock
-from tests.chaos.schedule import ROUTER, Planned
+from tests.chaos.schedule import RECORDER, ROUTER, Planned
 from tests.chaos.serve import Mode
 from tests.chaos.system import System
 from tests.chaos.watch import Watch, waited

@@ -19,6 +19,7 @@ from prior_sg.deploy.running import serve
 from prior_sg.schemas.topics import DELTAS, Topic
 from prior_sg.services.feature_pyramid.encoders.base import FAMILIES
 from prior_sg.services.ingest import sources
+from prior_sg.services.ingest.core.frames import BadFrame, RawFrame
 from prior_sg.services.runtime.bus import OnMissed, OnSample, Sample
 from prior_sg.services.runtime.zenoh_bus import ZenohBus
 from tests.chaos.dialects import spoken
@@ -119,11 +120,13 @@ class Gate:
 
     def around(self, source: sources.Source) -> sources.Source:
         """The source behind this gate."""
-        return replace(source, frames=lambda: self._frames(source), close=self._closed.set)
+        bare = source.thinned
+        thinned = None if bare is None else lambda wanted: self._through(bare(wanted))
+        return replace(source, frames=lambda: self._through(source.frames()), thinned=thinned, close=self._closed.set)
 
-    def _frames(self, source: sources.Source) -> Iterator:
-        for number, frame in enumerate(source.frames()):
-            while int(self._path.read_text() or 0) <= number:
+    def _through(self, frames: Iterator[RawFrame | BadFrame]) -> Iterator[RawFrame | BadFrame]:
+        for frame in frames:
+            while int(self._path.read_text() or 0) <= frame.index:
                 if self._closed.wait(POLL_S):
                     return
             yield frame
