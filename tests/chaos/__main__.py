@@ -53,7 +53,8 @@ def run(arguments: argparse.Namespace, wanted: list[str]) -> int:
     names = [name for name in wanted if BY_NAME[name].needs in ({""} | there)]
     if missing := sorted(set(wanted) - set(names)):
         print(f"left out, for this machine does not allow them: {', '.join(missing)}", flush=True)
-    signal.signal(signal.SIGTERM, lambda *_: signal.raise_signal(signal.SIGINT))
+    for number in (signal.SIGINT, signal.SIGTERM):  # also where the shell has started us in the background
+        signal.signal(number, signal.default_int_handler)
     arguments.out.mkdir(parents=True, exist_ok=True)
     results, began_s, before = Results(arguments.out), time.monotonic(), 0
     before = results.faults

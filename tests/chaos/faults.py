@@ -28,6 +28,7 @@ Fault = Callable[[System, Watch, Planned], contextlib.AbstractContextManager[Non
 DELAY_S, RATE_B_S = 0.1, 200_000.0
 RESET_EVERY_S = 0.4
 SENT_AGAIN_HZ = 150
+GARBAGE_EVERY_S = 0.1  # a hundred messages and more
 GARBAGE = (b"", b"\x00", b"\xff" * 64, bytes(range(256)) * 2)
 CLOCK_OFF_S = (2.0, 90.0, 7200.0, 86_400.0 * 3)
 HOG = """
@@ -160,7 +161,7 @@ def garbage(system: System, watch: Watch, plan: Planned) -> Iterator[None]:
     over = threading.Event()
 
     def send() -> None:
-        while not over.wait(0.02):
+        while not over.wait(GARBAGE_EVERY_S):
             cut = [sample.payload[: len(sample.payload) // 2] for sample in tuple(watch.recent)[-3:]]
             for topic in TOPICS:
                 if topic.delivery != "job":

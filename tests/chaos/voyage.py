@@ -20,7 +20,7 @@ from tests.chaos.watch import Watch, waited
 
 GRID = 8  # frames between two points of comparison
 FRAME_S = 0.25  # between two frames of the stream
-AHEAD = 24  # frames let through beyond the newest that is mapped
+AHEAD = 4  # frames let through beyond the newest that is mapped
 PATIENCE_S = 90.0  # until the stream is followed again, and until the system rests
 FIRST_PATIENCE_S = 400.0  # of an undisturbed one, which may have to compile its loops
 LATE_S = 20.0  # in which what seemed at rest may still become equal: what is missing is asked for again
