@@ -8,7 +8,7 @@ WORKERS ?= 2
 # One process compiles for all others, whatever the caller's shell says.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo test coverage test-llm check loops bench manifests images sbom clean
+.PHONY: demo test coverage test-llm check loops bench manifests images sbom chaos clean
 .DEFAULT_GOAL := demo
 
 demo: $(VENV)/installed
@@ -59,6 +59,10 @@ images: $(VENV)/installed-dev
 sbom: $(VENV)/installed-audit
 	mkdir -p build
 	$(BIN)/cyclonedx-py environment $(BIN)/python --pyproject pyproject.toml --output-file build/sbom.json
+
+# Hundreds of faults on whole systems, about 40 minutes; CHAOS='--faults 20 --seed 7' for others. It goes on where it was.
+chaos: $(VENV)/installed-dev
+	$(BIN)/python -m tests.chaos $(CHAOS)
 
 INSTALL := $(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt
 # Loops compiled for another version may name what it lacks now.

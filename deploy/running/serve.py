@@ -29,7 +29,7 @@ from prior_sg.services.runtime.host.lease import Fence, Lease, SupersededError
 from prior_sg.services.runtime.host.succession import Predecessor, Standby
 from prior_sg.services.runtime.logs import start_logging
 from prior_sg.services.runtime.record import LogError
-from prior_sg.services.runtime.service import Identity, Service, ServiceError
+from prior_sg.services.runtime.service import Identity, LaterError, Service, ServiceError
 from prior_sg.services.runtime.zenoh_bus import ZenohBus
 
 log = logging.getLogger(__name__)
@@ -38,6 +38,7 @@ HOPELESS = (ConfigError, BusError, ServiceError, LogError)  # their messages say
 EXIT_HOPELESS = 2  # starting again would fail again
 EXIT_SUPERSEDED = 3  # another is in charge: started again, it waits for that one's end
 EXIT_YIELDED = 4  # another has taken over: not to be started again
+EXIT_LATER = 5  # it lacks what can come back: started again, it goes on as soon as that has
 
 
 def service_names() -> list[str]:
@@ -200,6 +201,9 @@ def run(arguments: argparse.Namespace) -> int:
             asyncio.set_event_loop_policy(uvloop.EventLoopPolicy())
         with noted(instance), crashes.watched(arguments.crashes, instance):
             yielded = asyncio.run(serve(arguments, instance))
+    except LaterError as error:
+        log.error(str(error))
+        return EXIT_LATER
     except HOPELESS as error:
         log.error(str(error))
         return EXIT_HOPELESS

@@ -14,11 +14,12 @@ from pathlib import Path
 
 from prior_sg.deploy.errors import UserError
 from prior_sg.deploy.running.crashes import crashes
-from prior_sg.deploy.running.serve import EXIT_HOPELESS, EXIT_SUPERSEDED
+from prior_sg.deploy.running.serve import EXIT_HOPELESS, EXIT_LATER, EXIT_SUPERSEDED
 from prior_sg.services.registry import BY_NAME
 
 RESTART_DELAY_S = 0.5
 MAX_RESTART_DELAY_S = 10.0
+LATER_DELAY_S = 3.0  # of one that lacks what can come back
 STABLE_AFTER_S = 20.0
 GIVE_UP_AFTER = 5
 STOP_TIMEOUT_S = 10.0
@@ -50,6 +51,7 @@ class Child:
     deaths: int = 0
     restarts: int = 0
     restart_at_s: float = 0.0
+    later: bool = False  # it ran, and lacks what can come back
     unique: str = ""  # its name on the bus
     succeeds: str = ""  # the instance that it is to take over from, until it has
 
@@ -211,13 +213,15 @@ class Supervisor:
                     child.start()
                     events.append(f"{child.instance} restarted")
             elif (code := child.process.poll()) is not None:
-                stable = now_s - child.started_s > STABLE_AFTER_S or code == EXIT_SUPERSEDED
+                child.later = code == EXIT_LATER or (code == EXIT_HOPELESS and child.later)
+                stable = now_s - child.started_s > STABLE_AFTER_S or code == EXIT_SUPERSEDED or child.later
                 child.deaths = 1 if stable else child.deaths + 1
-                if code == EXIT_HOPELESS or child.deaths >= GIVE_UP_AFTER:
+                if (code == EXIT_HOPELESS and not child.later) or child.deaths >= GIVE_UP_AFTER:
                     died = child.last_words() if code >= 0 else f"it was ended by {_reason(code)}"
                     failed = ChildHopeless if code == EXIT_HOPELESS else ChildFailed
                     raise failed(f"{child.instance} does not run: {died} (log: {child.log_path})")
-                delay_s = min(RESTART_DELAY_S * 2 ** (child.deaths - 1), MAX_RESTART_DELAY_S)
+                growing_s = min(RESTART_DELAY_S * 2 ** (child.deaths - 1), MAX_RESTART_DELAY_S)
+                delay_s = LATER_DELAY_S if child.later else growing_s
                 child.process, child.restart_at_s = None, now_s + delay_s
                 why = f": {child.last_words()}" if code > 0 else ""
                 events.append(f"{child.instance} ended ({_reason(code)}){why}{self._report_of(child)}; restarting")

@@ -20,6 +20,10 @@ class ServiceError(PriorSgError):
     """A service cannot run as it is configured; the message is one sentence that says what to do."""
 
 
+class LaterError(ServiceError):
+    """A running service lacks what can come back, such as room on a disk: it is started again until it has it."""
+
+
 class UndeclaredError(Exception):
     """A service wrote or asked what its declaration does not name: a fault in the service."""
 

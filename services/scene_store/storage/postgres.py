@@ -16,6 +16,7 @@ from prior_sg.services.scene_store.storage.tables import (
     Indexed,
     Point,
     Storage,
+    StoreAway,
     StoreError,
     words_of,
 )
@@ -155,6 +156,11 @@ class Postgres(Storage):
     def _refused(self) -> Iterator[None]:
         try:
             yield
+        except (psycopg.OperationalError, psycopg.InterfaceError) as error:
+            raise StoreAway(
+                f"{self.location} cannot be read or written ({_line(error)}); start the server or free its disk: the "
+                "store then goes on."
+            ) from error
         except psycopg.Error as error:
             raise StoreError(
                 f"{self.location} cannot be read or written ({_line(error)}); see the server's log, then restart."

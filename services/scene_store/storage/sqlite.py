@@ -17,12 +17,14 @@ from prior_sg.services.scene_store.storage.tables import (
     Indexed,
     Point,
     Storage,
+    StoreAway,
     StoreError,
     words_of,
 )
 from prior_sg.services.scene_store.storage.writing import begin
 
 APPLICATION_ID = 0x70736753  # "psgS", in the header of the file
+AWAY = ("SQLITE_FULL", "SQLITE_IOERR")  # what a full disk, or one that is not there, makes of reads and writes
 FIRST_RADIUS_M, LAST_RADIUS_M = 1.0, 1e7  # of the search for what is nearest
 
 _RECORDS = """
@@ -209,8 +211,12 @@ class Sqlite(Storage):
                 raise StoreError(
                     f"{self.location} is written by another scene_store; stop it or name another."
                 ) from error
+            if getattr(error, "sqlite_errorname", "").startswith(AWAY):
+                raise StoreAway(
+                    f"{self.location} cannot be read or written ({error}); free the disk: the store then goes on."
+                ) from error
             raise StoreError(
-                f"{self.location} cannot be read or written ({error}); free the disk or the file, then restart."
+                f"{self.location} cannot be read or written ({error}); free the file, then restart."
             ) from error
 
     def nearest(self, robot: int, kind: Indexed, point_m: Point, count: int) -> list[Found]:

@@ -11,7 +11,7 @@ from contextlib import AbstractContextManager
 from typing import Any, Literal, NamedTuple
 
 from prior_sg.schemas.scene import StoredRevision
-from prior_sg.services.runtime.service import ServiceError
+from prior_sg.services.runtime.service import LaterError, ServiceError
 from prior_sg.services.scene_store.core.events import DELTAS
 from prior_sg.services.scene_store.core.keeping import Mark, Thinned
 
@@ -32,6 +32,10 @@ _COUNTS = "places, edges, regions, objects"
 
 class StoreError(ServiceError):
     """The database cannot be used; the message says what to do."""
+
+
+class StoreAway(StoreError, LaterError):
+    """The database was there and cannot be used now: its disk is full, or its server has gone."""
 
 
 class Record(NamedTuple):

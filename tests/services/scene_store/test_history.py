@@ -17,7 +17,7 @@ from prior_sg.services.scene_store.core import graph as core
 from prior_sg.services.scene_store.core import keeping
 from prior_sg.services.scene_store.core.image import graph_of, image_of
 from prior_sg.services.scene_store.database import Database
-from prior_sg.services.scene_store.storage.tables import StoreError
+from prior_sg.services.scene_store.storage.tables import StoreAway, StoreError
 from tests.help.databases import new_database
 from tests.services.scene_store.test_scene_store import (
     ROBOT,
@@ -225,6 +225,29 @@ def test_a_second_connection_reads_while_the_first_writes(place):
         reader.put_task(core.Graph(ROBOT), Task(robot=ROBOT, stamp_ns=1, environment="e", task="t"))
     reader.close()
     store.runner.close()
+
+
+def test_a_full_disk_costs_nothing_that_was_committed(tmp_path):
+    store = Store(str(tmp_path / "scene.sqlite"))
+    store.feed(place_delta(0, [(1, 0, 0, 0, 1)]))
+    pages = store.state.database.storage.run("PRAGMA page_count")[0][0]
+    store.state.database.storage.run(f"PRAGMA max_page_count = {pages}")
+    with pytest.raises(StoreAway, match=r"disk is full\); free the disk: the store then goes on"):
+        for revision in range(1, 200):
+            store.feed(place_delta(revision, [(revision + 1, revision, 0, 0, 1)]))
+    store = store.reopened()
+    assert len(store.scene(ROBOT).place_ids) == revision
+    store.feed(place_delta(revision, [(revision + 1, revision, 0, 0, 1)]))
+    assert len(store.scene(ROBOT).place_ids) == revision + 1
+    store.runner.close()
+
+
+def test_a_server_that_has_gone_is_one_that_can_come_back(postgres):
+    store = Store(new_database(postgres))
+    store.feed(place_delta(0, [(1, 0, 0, 0, 1)]))
+    store.state.database.storage.connection.close()
+    with pytest.raises(StoreAway, match="start the server"):
+        store.feed(place_delta(1, [(2, 0, 0, 0, 1)]))
 
 
 def brute_nearest(entries, point_m, count):
