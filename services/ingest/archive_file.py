@@ -90,7 +90,8 @@ class ArchiveFile:
             if checkpoint is None:
                 return None
             rows = self._sql.execute("SELECT payload, schema, owed FROM keyframes ORDER BY frame_id")
-            keyframes, owed = [], set()
+            keyframes: list[Keyframe] = []
+            owed: set[int] = set()
             for payload, schema, is_owed in rows:
                 keyframes.append(decode(Keyframe, current(Keyframe, payload, schema)))
                 if is_owed:
