@@ -18,6 +18,7 @@ from prior_sg.services.runtime.keys import Beyond
 from prior_sg.services.runtime.zenoh_bus import EndpointTakenError, open_router
 
 ROUTER = "router"
+MOST_ASKED = 16  # exchanges that wait to be begun
 REOPEN_S = 10.0  # in which the port of a router that has ended can be had again
 REOPEN_POLL_S = 0.05
 ANSWERED_S = 0.5  # in which an answer passes the router that is asked to be started again
@@ -57,11 +58,11 @@ class Swaps:
 
     def __init__(self, bus: Bus, supervisor: Supervisor, folder: Path, router: RouterHere | None) -> None:
         self._bus, self._supervisor, self._folder, self._router = bus, supervisor, folder, router
-        self._asked: queue.SimpleQueue[tuple[str, Request]] = queue.SimpleQueue()
+        self._asked: queue.Queue[tuple[str, Request]] = queue.Queue(MOST_ASKED)
         self._served: dict[str, Callable[[], None]] = {}
         self._router_at_s = math.inf  # when it is to be started again
         if router is not None:
-            bus.serve(swap_key(ROUTER, ROUTER), lambda request: self._asked.put((ROUTER, request)))
+            bus.serve(swap_key(ROUTER, ROUTER), partial(self._ask, ROUTER))
 
     def check(self) -> list[str]:
         """Do what was asked; returns what happened, for the user."""
@@ -104,7 +105,10 @@ class Swaps:
             self._served.pop(name)()
 
     def _ask(self, name: str, request: Request) -> None:
-        self._asked.put((name, request))
+        try:
+            self._asked.put_nowait((name, request))
+        except queue.Full:
+            request.refuse("too many exchanges are asked for at once")
 
 
 def _tell(request: Request, successor: str, error: str) -> None:
