@@ -1,5 +1,6 @@
 """Where a supervisor is asked to exchange one of its processes, or its router, in mid-run."""
 
+import math
 import queue
 import time
 from collections.abc import Callable, Iterable
@@ -17,8 +18,10 @@ from prior_sg.services.runtime.keys import Beyond
 from prior_sg.services.runtime.zenoh_bus import EndpointTakenError, open_router
 
 ROUTER = "router"
+MOST_ASKED = 16  # exchanges that wait to be begun
 REOPEN_S = 10.0  # in which the port of a router that has ended can be had again
 REOPEN_POLL_S = 0.05
+ANSWERED_S = 0.5  # in which an answer passes the router that is asked to be started again
 
 
 class RouterHere:
@@ -55,10 +58,11 @@ class Swaps:
 
     def __init__(self, bus: Bus, supervisor: Supervisor, folder: Path, router: RouterHere | None) -> None:
         self._bus, self._supervisor, self._folder, self._router = bus, supervisor, folder, router
-        self._asked: queue.SimpleQueue[tuple[str, Request]] = queue.SimpleQueue()
+        self._asked: queue.Queue[tuple[str, Request]] = queue.Queue(MOST_ASKED)
         self._served: dict[str, Callable[[], None]] = {}
+        self._router_at_s = math.inf  # when it is to be started again
         if router is not None:
-            bus.serve(swap_key(ROUTER, ROUTER), lambda request: self._asked.put((ROUTER, request)))
+            bus.serve(swap_key(ROUTER, ROUTER), partial(self._ask, ROUTER))
 
     def check(self) -> list[str]:
         """Do what was asked; returns what happened, for the user."""
@@ -72,13 +76,17 @@ class Swaps:
                 request.refuse("the request is not a valid SwapRequest")
             except (PriorSgError, OSError) as error:
                 request.reply(encode(Swapped(error=str(error))))
+        if self._router is not None and time.monotonic() >= self._router_at_s:
+            self._router_at_s = math.inf
+            self._router.restart()
+            events.append("the router was started again in its place")
         return events
 
     def _swap(self, name: str, asked: SwapRequest, request: Request) -> str:
-        if name == ROUTER and self._router is not None:
-            request.reply(encode(Swapped(successor=ROUTER)))  # before, for it goes through this router
-            self._router.restart()
-            return "the router was started again in its place"
+        if name == ROUTER:
+            request.reply(encode(Swapped(successor=ROUTER)))
+            self._router_at_s = time.monotonic() + ANSWERED_S
+            return "the router is to be started again in its place"
         config = ""
         if asked.config:
             path = self._folder / f"{name}.toml"
@@ -97,7 +105,10 @@ class Swaps:
             self._served.pop(name)()
 
     def _ask(self, name: str, request: Request) -> None:
-        self._asked.put((name, request))
+        try:
+            self._asked.put_nowait((name, request))
+        except queue.Full:
+            request.refuse("too many exchanges are asked for at once")
 
 
 def _tell(request: Request, successor: str, error: str) -> None:
