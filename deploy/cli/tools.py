@@ -74,7 +74,9 @@ def _add_system(commands: Commands) -> None:
     health = commands.add("health", cmd_health, "show every running process and its topics", "prior-sg health --json")
     health.add_argument("--json", action="store_true", help="print JSON")
     only = health.add_mutually_exclusive_group()
-    only.add_argument("--here", action="store_true", help="only this user's processes on this host or in this container")
+    only.add_argument(
+        "--here", action="store_true", help="only this user's processes on this host or in this container"
+    )
     only.add_argument("--router", action="store_true", help="only whether the router answers")
     add_bus(health, robot=False)
 

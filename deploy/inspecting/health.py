@@ -42,7 +42,11 @@ class Found:
     @property
     def well(self) -> bool:
         """Whether something runs and nothing is wrong."""
-        return bool(self.processes or self.resting) and not self.silent and not any(remark.fault for remark in self.remarks)
+        return (
+            bool(self.processes or self.resting)
+            and not self.silent
+            and not any(remark.fault for remark in self.remarks)
+        )
 
     def plain(self) -> dict[str, Any]:
         """For JSON."""

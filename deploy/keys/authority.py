@@ -120,7 +120,6 @@ class Authority:
         for one in everybody:
             _write(self.bundle(one.name) / ABOUT_FILE, _json(About(name=one.name, participants=everybody)))
 
-
     def _with_key(self, one: Participant) -> Participant:
         """With the public key of its certificate, which older lists lack; without where its bundle is not here."""
         path = self.bundle(one.name) / CERTIFICATE_FILE

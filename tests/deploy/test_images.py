@@ -9,6 +9,7 @@ import os
 import re
 import shutil
 import subprocess
+import tomllib
 
 import pytest
 
@@ -73,6 +74,13 @@ def test_what_the_image_writes_lies_in_volumes():
     for name in ("XDG_CACHE_HOME", "NUMBA_CACHE_DIR"):
         assert paths[name].startswith(CACHE)
     assert paths["PYTHONPATH"] == WEIGHTS
+
+
+def test_image_and_chart_are_of_this_release():
+    release = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+    chart = (ROOT / "deploy/helm/prior-sg/Chart.yaml").read_text()
+    assert f"ARG VERSION={release}\n" in DOCKERFILE.read_text()
+    assert f"\nversion: {release}\nappVersion: {release}\n" in chart
 
 
 @pytest.fixture(scope="module")

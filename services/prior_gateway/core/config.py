@@ -54,7 +54,9 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
     archive: str = "~/.cache/prior-sg/priors"  # kept priors and evidence; empty = none
     signing_key: str = ""  # PEM file (Ed25519) for priors in files; what is published is signed where keys are in force
     trusted_keys: str = ""  # folder of NAME.pub
-    require_signature: bool = False  # adopt no prior from elsewhere without a good signature; so wherever keys are in force
+    require_signature: bool = (
+        False  # adopt no prior from elsewhere without a good signature; so wherever keys are in force
+    )
     lease_s: float = 5.0  # a gateway that has been silent for so long does not hold up the others
     learning: LearningConfig = msgspec.field(default_factory=LearningConfig)
 
