@@ -1,7 +1,7 @@
 """The image: what deploy/Dockerfile says and, asked for by `make images`, what comes of its steps.
 
-Buildah builds it without an engine. `PSG_TEST_BASE` names the root filesystem of a Debian with Python in /usr/local, which
-is taken for the base image where none can be fetched.
+Buildah builds it without an engine. `PSG_TEST_BASE` names the root filesystem of a Debian with Python in /usr/local,
+which is taken for the base image where none can be fetched.
 """
 
 import json
@@ -10,6 +10,7 @@ import re
 import shutil
 import subprocess
 import tomllib
+from pathlib import Path
 
 import pytest
 
@@ -116,7 +117,7 @@ def image(tmp_path_factory):
 def test_a_service_of_the_image_runs_without_rights_on_a_root_that_cannot_be_written(image):
     root, config = image
     assert config["User"] == f"{USER}:{USER}"
-    assert not [path for path in os.listdir(f"{root}{WEIGHTS}")]
+    assert list(Path(f"{root}{WEIGHTS}").iterdir()) == []
     connect = free_endpoint("tcp/127.0.0.1:0")
     variables = [*config["Env"], f"PSG_CONNECT={connect}"]
     owned = f"-o uid={USER},gid={USER}"
