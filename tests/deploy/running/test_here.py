@@ -1,10 +1,13 @@
 """What checks containers and units: `health --here`, what systemd is told, and the status `up` ends with."""
 
+import asyncio
+import contextlib
 import os
 import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 
 import pytest
@@ -16,9 +19,12 @@ from prior_sg.deploy.running.here import FOLDER, noted, processes_here
 from prior_sg.deploy.running.notify import Watchdog
 from prior_sg.deploy.running.serve import EXIT_HOPELESS
 from prior_sg.services.folders import temporary_cache
+from prior_sg.services.registry import BY_NAME
 from prior_sg.services.runtime.endpoints import free_endpoint
+from prior_sg.services.runtime.host.host import Host
 from prior_sg.services.runtime.keys import VARIABLE, Beyond, read_bundle
-from prior_sg.services.runtime.zenoh_bus import open_router
+from prior_sg.services.runtime.service import Identity
+from prior_sg.services.runtime.zenoh_bus import ZenohBus, open_router
 
 PROGRAM = [sys.executable, "-m", "prior_sg.deploy.cli.main"]
 
@@ -36,6 +42,29 @@ def until(condition, timeout_s=90.0):
     while not condition():
         assert time.monotonic() < end_s, "did not happen"
         time.sleep(0.1)
+
+
+@contextlib.contextmanager
+def serving(connect, instance):
+    """A gateway on a thread of its own, at a router."""
+    service, loop = BY_NAME["prior_gateway"], asyncio.new_event_loop()
+    thread = threading.Thread(target=loop.run_forever, daemon=True)
+    thread.start()
+
+    async def begin():
+        bus = await asyncio.to_thread(ZenohBus, connect)
+        host = Host(service, bus, service.config(archive=""), Identity("*", instance, time.time_ns()))
+        return host, asyncio.ensure_future(host.run())
+
+    host, task = asyncio.run_coroutine_threadsafe(begin(), loop).result(60)
+    try:
+        yield
+    finally:
+        loop.call_soon_threadsafe(host.stop)
+        asyncio.run_coroutine_threadsafe(asyncio.wait([task]), loop).result(60)
+        loop.call_soon_threadsafe(loop.stop)
+        thread.join()
+        loop.close()
 
 
 def test_a_process_is_found_for_as_long_as_it_runs(own_folder):
@@ -57,7 +86,7 @@ def test_notes_of_processes_that_were_killed_are_removed(own_folder):
 
 
 def test_health_here_is_of_this_host_alone_by_the_router_of_an_edge(own_folder, tmp_path, monkeypatch, capsys):
-    """As pods do: the service and what checks it come by TLS with the edge's own keys."""
+    """As pods do: the service and what checks it come by TLS with the edge's own keys, which access control lets in."""
     authority = Authority.create(tmp_path / "keys")
     authority.add("edge", "edge1")
     monkeypatch.setenv(VARIABLE, str(authority.bundle("edge1")))
@@ -69,24 +98,18 @@ def test_health_here_is_of_this_host_alone_by_the_router_of_an_edge(own_folder, 
         status = main(["health", *words, "--connect", tls])
         return status, " ".join("".join(capsys.readouterr()).split())
 
-    process = None
     try:
         assert health("--router")[0] == 0
         status, said = health("--here")
         assert status == 1 and "no service is running" in said
-        process = subprocess.Popen([*PROGRAM, "serve", "prior_gateway", "--connect", tls, "--instance", "it"])
-        until(lambda: health("--here")[0] == 0)
-        assert "it pid" in health("--here")[1]
-        with noted("elsewhere"):
-            status, said = health("--here")
-        assert status == 1 and "elsewhere" in said and "is not heard" in said
-        process.send_signal(signal.SIGTERM)
-        assert process.wait(60) == 0
-        assert processes_here() == {}
+        with noted("it"), serving(tls, "it"), serving(tls, "of another host"):
+            until(lambda: health("--here")[0] == 0)
+            said = health("--here")[1]
+            assert "it pid" in said and "of another host" not in said
+            with noted("elsewhere"):
+                status, said = health("--here")
+            assert status == 1 and "elsewhere" in said and "is not heard" in said
     finally:
-        if process is not None and process.poll() is None:
-            process.kill()
-            process.wait()
         stop()
 
 
