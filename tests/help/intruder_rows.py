@@ -215,18 +215,6 @@ def _(stage):
     return (f"{BY_ROUTER}, which keeps {grown_mb:.0f} MB" if not came else f"HEARD: {came}"), "nobody", ""
 
 
-@row("robot B", "a flood of its own tasks")
-def _(stage):
-    def act(end):
-        for number in range(3 * TASK.most_at_once):
-            put("psg/B/task", task("B", number + 1), writer="flood/b/1", number=number)(end)
-
-    bundle = stage.own.bundle("B")
-    return at_the_service(
-        stage, act, ("scene_store", TASK), "limited", "too many messages: .*psg/B/task", bundle=bundle
-    )
-
-
 @row("robot A", "an old message of its own again, as it was")
 def _(stage):
     def act(end):
@@ -280,6 +268,18 @@ def _(stage):
 def _(stage):
     act = put(f"psg/fleet/prior/{'0' * 32}", A_PRIOR)
     return at_the_service(stage, act, ("prior_gateway", PRIOR), "malformed", "it came on psg/fleet/prior/000")
+
+
+@row("robot B", "a flood of its own tasks")
+def _(stage):
+    def act(end):
+        for number in range(3 * TASK.most_at_once):
+            put("psg/B/task", task("B", number + 1), writer="flood/b/1", number=number)(end)
+
+    bundle = stage.own.bundle("B")
+    return at_the_service(
+        stage, act, ("scene_store", TASK), "limited", "too many messages: .*psg/B/task", bundle=bundle
+    )
 
 
 @row("a program on a host", "a keyframe that says it has 30 000 x 30 000 pixels")

@@ -16,7 +16,7 @@ import zenoh
 
 from prior_sg.deploy.keys.authority import Authority
 from prior_sg.deploy.running.serve import _in_charge
-from prior_sg.schemas.topics import ENCODE, TOPICS, job_key
+from prior_sg.schemas.topics import ENCODE, JOURNAL, TOPICS, job_key
 from prior_sg.services.registry import BY_NAME
 from prior_sg.services.runtime.endpoints import free_endpoint, listened_to
 from prior_sg.services.runtime.keys import VARIABLE, read_bundle
@@ -84,7 +84,7 @@ class Stage:
         spy = ZenohBus(self.local)
         self._ending.append(spy.close)
         for topic in TOPICS:
-            if topic.delivery != "job":
+            if topic.delivery != "job" and topic is not JOURNAL:
                 spy.subscribe(topic, topic.pattern("*"), lambda one: self.heard.append(one.key), lambda *_: None)
         self.inside.declare_queryable(job_key(ENCODE, "w", "*"), lambda query: self.heard.append("a job"))
 
@@ -162,6 +162,7 @@ def at_the_router(stage, bundle, act, pattern):
 def at_the_service(stage, act, where, counted, pattern, *, bundle=None):
     """Row of a message that gets as far as a service (name, topic), which must count and log it."""
     name, topic = where
+    until(lambda: not len(stage.hosts[name].inbox))
     counts, begin = stage.hosts[name].inbox.of(topic.name), len(stage.records.told)
     before, consumed = getattr(counts, counted), counts.consumed
     with stage.end_of(bundle) if bundle else contextlib.nullcontext(stage.inside) as end:

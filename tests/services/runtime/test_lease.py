@@ -295,7 +295,7 @@ def test_what_a_stranger_numbers_above_the_one_in_charge_is_not_let_in(new_bus, 
             host = Host(READER, bus, Nothing(), Identity("r", "reader", 1), fence=fence)
             running = asyncio.create_task(host.run())
             await asyncio.sleep(0.3)
-            for number, told in enumerate((epoch + 1, epoch, epoch - 1)):
+            for number, told in enumerate((epoch + 1, epoch - 1, epoch)):
                 delta = msgspec.structs.replace(DELTA, epoch=told)
                 those.buses[0].put(PLACE_DELTA, PLACE_DELTA.key_of(delta), encode(delta), pack_header("x", number, 0))
             end_s = time.monotonic() + 5
@@ -303,7 +303,7 @@ def test_what_a_stranger_numbers_above_the_one_in_charge_is_not_let_in(new_bus, 
                 await asyncio.sleep(0.02)
             host.stop()
             await running
-            assert host._state == [epoch, epoch - 1]
+            assert host._state == [epoch - 1, epoch]
             assert host.inbox.of(PLACE_DELTA.name).malformed == 1
 
     asyncio.run(main())
