@@ -134,6 +134,7 @@ class System:
         told = {
             MARK: self.mark,
             serve.FOLDER: str(self.folder),
+            "PYTHONDONTWRITEBYTECODE": "",  # they are started by the hundred
             painted.LABELS: json.dumps(self.stream.labels),
             "PYTHONPATH": os.pathsep.join(
                 filter(None, (str(ROOT), str(ROOT / "src"), os.environ.get("PYTHONPATH", "")))

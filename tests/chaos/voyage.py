@@ -20,7 +20,7 @@ from tests.chaos.watch import Watch, waited
 
 GRID = 8  # frames between two points of comparison
 FRAME_S = 0.25  # between two frames of the stream
-AHEAD = 4  # frames let through beyond the newest that is mapped
+AHEAD = 4  # frames let through beyond the newest that is mapped and segmented
 PATIENCE_S = 90.0  # until the stream is followed again, and until the system rests
 FIRST_PATIENCE_S = 400.0  # of an undisturbed one, which may have to compile its loops
 LATE_S = 20.0  # in which what seemed at rest may still become equal: what is missing is asked for again
@@ -210,7 +210,9 @@ class Voyage:
     def _flow(self) -> None:
         """Let one more frame through when its time has come."""
         now_s = time.monotonic()
-        if now_s - self._flowed_s >= FRAME_S and self._gate < min(self.stream.frames, self.watch.mapped + 1 + AHEAD):
+        if now_s - self._flowed_s >= FRAME_S and self._gate < min(
+            self.stream.frames, min(self.watch.mapped, self.watch.seen) + 1 + AHEAD
+        ):
             self._flowed_s = now_s
             self._to(self._gate + 1)
 
