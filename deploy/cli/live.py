@@ -157,7 +157,12 @@ def _stay_up(arguments: argparse.Namespace, names: list[str]) -> int:
             listening = " and ".join((arguments.connect, *arguments.listen))
             console.print(f"router {listening}; logs in {supervisor.log_folder}; Ctrl-C stops")
             watchdog = Watchdog()
-            wait(lambda: (_tell(supervisor, roll, arguments.restart_hung, swaps), watchdog.alive()))
+
+            def tell() -> None:
+                _tell(supervisor, roll, arguments.restart_hung, swaps)
+                watchdog.alive()
+
+            wait(tell)
         return 0
     finally:
         supervisor.stop()

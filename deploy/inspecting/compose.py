@@ -51,7 +51,8 @@ def profiles_of(service: Service) -> list[str]:
 
 def _container(service: Service) -> dict[str, Any]:
     robot = ["--robot", "${PSG_ROBOT:-robot1}"] if service.scope == "robot" else []
-    environment, volumes = {}, [f"state:{STATE}", f"cache:{CACHE}"]
+    environment: dict[str, str] = {}
+    volumes = [f"state:{STATE}", f"cache:{CACHE}"]
     if service.drive is not None:
         environment["PSG_INGEST__SOURCE"] = "${PSG_SOURCE:-/data}"
         volumes.append("${PSG_DATA:-./data}:/data:ro")

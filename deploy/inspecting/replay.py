@@ -180,8 +180,8 @@ def compare(log: Log, life: Life) -> Comparison:
         if len(new) != len(old) and (life.ended_cleanly or len(new) > len(old)):
             differences.append(f"{name}: {len(old)} recorded, {len(new)} replayed")
         for index, (before, after) in enumerate(zip(old, new, strict=False)):
-            pair = map(_unsigned, (before, after))
-            differences += [f"{name}[{index}].{text}" for text in message_differences(*pair, tolerance)]
+            found = message_differences(_unsigned(before), _unsigned(after), tolerance)
+            differences += [f"{name}[{index}].{text}" for text in found]
     return Comparison(
         life.instance,
         len(life.inputs),

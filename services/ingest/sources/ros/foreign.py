@@ -76,7 +76,7 @@ class ForeignBag:
         """All topics by name; of images and cameras with what their first message says. Raises SourceError."""
         return [self._topic(name) for name in sorted(self._channels)]
 
-    def messages(self, names: Sequence[str], **span: int) -> Iterator[tuple[str, int, bytes]]:
+    def messages(self, names: Sequence[str], **span: Any) -> Iterator[tuple[str, int, bytes]]:
         """Topic, time of arrival (ns) and data of all messages of some topics, by arrival. Raises SourceError."""
         if not names:
             return
