@@ -27,7 +27,7 @@ def compose() -> str:
     services: dict[str, Any] = {_router_name(profile): _router(profile) for profile in ROUTERS}
     services |= {service.name: _container(service) for service in SERVICES}
     services["weights"] = _weights()
-    volumes = {name: {} for name in ("state", "cache", "weights", "no-keys")}
+    volumes: dict[str, dict] = {name: {} for name in ("state", "cache", "weights", "no-keys")}
     return HEAD + _yaml({"name": "prior-sg", "services": services, "volumes": volumes})
 
 

@@ -102,7 +102,7 @@ def faults() -> list[str]:
         text = (ROOT / document).read_text()
         if generated(document) not in text:
             found.append(f"{document} is out of date; run `prior-sg topics --write`")
-    for file, text in FILES.items():
-        if not (ROOT / file).exists() or (ROOT / file).read_text() != text():
+    for file, written_anew in FILES.items():
+        if not (ROOT / file).exists() or (ROOT / file).read_text() != written_anew():
             found.append(f"{file} is out of date; run `prior-sg topics --write`")
     return found
