@@ -2,6 +2,7 @@
 
 import pytest
 
+from prior_sg.deploy.cli.main import build_parser
 from prior_sg.deploy.inspecting.compose import ON_ROBOT
 from prior_sg.deploy.running.serve import add_arguments
 from prior_sg.services.registry import SERVICES
@@ -130,3 +131,12 @@ def test_workers_grow_with_how_long_keyframes_wait_and_drain():
 def test_values_that_make_no_sense_are_refused(values):
     with helm.Chart.load(CHART) as chart, pytest.raises(helm.HelmError):
         chart.validate_schema(values)
+
+
+def test_the_figures_are_served_with_a_token_by_a_command_that_exists():
+    (container,) = pods(rendered({"metrics": {"options": ["--trace", "http://collector:4318"]}}))["metrics"]["spec"][
+        "containers"
+    ]
+    arguments = build_parser().parse_args(container["args"])
+    assert (arguments.port, arguments.host, arguments.trace) == (9464, "0.0.0.0", "http://collector:4318")
+    assert any(str(arguments.token_file).startswith(one["mountPath"]) for one in container["volumeMounts"])
