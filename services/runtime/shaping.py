@@ -16,8 +16,9 @@ BLOCKED_MS = 30_000  # for which what is bulky may be held up by what overtakes 
 
 def size_filters() -> list[dict[str, Any]]:
     """Zenoh's `low_pass_filter`: what the table allows of each message and answer, on its way into the router."""
-    limits: list[tuple[tuple[str, ...], str, int]]
-    limits = [(("query",), f"{worker_keys(t, '*')[0]}/*", t.most_bytes) for t in TOPICS if t.delivery == "job"]
+    limits: list[tuple[tuple[str, ...], str, int]] = [
+        (("query",), f"{worker_keys(t, '*')[0]}/*", t.most_bytes) for t in TOPICS if t.delivery == "job"
+    ]
     limits += [(("put", "reply"), t.pattern("*"), t.most_bytes) for t in TOPICS if t.delivery != "job"]
     for query in QUERIES:
         key = query.key.format(**{name: "**" if name == "space" else "*" for name in query.request.__struct_fields__})
