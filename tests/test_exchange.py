@@ -1,6 +1,7 @@
 """Every service and the router exchanged while a stream goes on: real processes, a real router, nothing lost."""
 
 import numpy as np
+import pytest
 
 from prior_sg.deploy.benches.exchange import ROBOT, ROUTER, ROWS, Running
 from prior_sg.deploy.benches.same_scene import same
@@ -8,12 +9,13 @@ from prior_sg.schemas.scene import Scene, SceneRequest
 from prior_sg.schemas.topics import SCENE
 from tests.test_pipeline import shortened
 
-FRAMES = 40
+FRAMES = 30
 BEGIN_AT = 0.3  # share of the stream
 SPEED = 0.5
 IN_TURN = [row for row in ROWS if row != "ingest"]  # whose successor needs what it has kept on disk
 
 
+@pytest.mark.timeout(1200)  # of many processes on a busy machine; 50 s on a quiet one
 def test_every_service_is_exchanged_in_mid_run_and_nothing_is_lost(tmp_path):
     source = tmp_path / "source.mcap"
     shortened(source, FRAMES)

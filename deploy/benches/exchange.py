@@ -44,6 +44,7 @@ ROBOT = "bench"
 SPEED = 0.5  # of the source: the successor wants a share of two cores, too
 AT = 0.5  # share of the frames after which the exchange begins
 TIMEOUT_S = 300.0
+ANSWER_S = 30.0  # of who holds the router
 QUIET_S = 3.0
 POLL_S = 0.02
 SLACK = 0.02  # by which a share may lie below that of two undisturbed runs
@@ -226,7 +227,8 @@ class Running:
 
     def _ask(self, row: str, name: str, settings: Sequence[str], done: Callable[[str], None]) -> None:
         try:
-            done(self.client.swap(row, name, SwapRequest(settings=list(settings)), TIMEOUT_S).error)
+            timeout_s = ANSWER_S if row == ROUTER else TIMEOUT_S
+            done(self.client.swap(row, name, SwapRequest(settings=list(settings)), timeout_s).error)
         except BusError as error:
             done(str(error))
 
