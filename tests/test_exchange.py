@@ -1,4 +1,4 @@
-"""Every service and the router exchanged while a stream goes on: real processes, a real router, nothing lost."""
+"""Services and the router exchanged while a stream goes on: real processes, a real router, nothing lost."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ SPEED = 0.5
 IN_TURN = [row for row in ROWS if row != "ingest"]  # whose successor needs what it has kept on disk
 
 
-@pytest.mark.timeout(1200)  # of many processes on a busy machine; 50 s on a quiet one
+@pytest.mark.timeout(1200)  # of many processes, on a machine as busy as may be
 def test_every_service_is_exchanged_in_mid_run_and_nothing_is_lost(tmp_path):
     source = tmp_path / "source.mcap"
     shortened(source, FRAMES)
