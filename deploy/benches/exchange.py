@@ -44,6 +44,7 @@ ROBOT = "bench"
 SPEED = 0.5  # of the source: the successor wants a share of two cores, too
 AT = 0.5  # share of the frames after which the exchange begins
 TIMEOUT_S = 300.0
+ANSWER_S = 30.0  # of who holds the router
 QUIET_S = 3.0
 POLL_S = 0.02
 SLACK = 0.02  # by which a share may lie below that of two undisturbed runs
@@ -65,9 +66,14 @@ class Heard:
     times_s: dict[str, list[float]] = field(default_factory=dict)  # by topic; `answers` are the gateway's
     frames: dict[str, list[int]] = field(default_factory=dict)  # numbers of keyframes and pyramids, by topic
     ingest: IngestState | None = None
+    samples: set[tuple[str, str, int]] = field(default_factory=set)  # heard: caches may tell one again
 
     def __call__(self, sample: Sample) -> None:
         """See one message."""
+        name = (sample.writer, sample.key, sample.sequence)
+        if name in self.samples:
+            return
+        self.samples.add(name)
         message = message_in(sample)
         if isinstance(message, IngestState):
             self.ingest = message
@@ -102,6 +108,9 @@ class Exchanged(NamedTuple):
     stall_s: float  # longest time without what its readers wait for, from the request on
     usual_s: float  # the same before it
     took_s: float  # from the request until the successor was in charge
+    kept_place_ids: float  # shares of the places, and objects, there before and after that have the same names
+    kept_region_ids: float
+    kept_object_ids: float
 
 
 class Streamed(NamedTuple):
@@ -141,7 +150,7 @@ def streamed(source: Path, rows: Sequence[str], speed: float, settings: Sequence
         running.until(lambda: running.heard.share >= AT, "the middle of the stream")
         exchanged = {row: running.exchange(row) for row in rows}
         running.until(lambda: running.heard.finished and running.heard.quiet_s() > QUIET_S, "the end of the stream")
-        scene: Scene = running.client.ask(SCENE, SceneRequest(robot=ROBOT), 30.0)
+        scene = running.scene()
         keyframes = set(running.heard.frames["KEYFRAME"])
         encoded = running.heard.frames["PYRAMID"]
         lost = len(keyframes - set(encoded)) + max(len(keyframes) - len(scene.trajectory), 0)
@@ -203,6 +212,7 @@ class Running:
     def exchange(self, row: str, settings: Sequence[str] = ()) -> Exchanged:
         """Exchange one service, or the router. Raises RuntimeError where the former stays."""
         name = next((child.unique for child in self.supervisor.children if child.service == row), row)
+        scene = self.scene()
         asked_s, began_s = time.monotonic(), self.heard.times_s["PLACE_DELTA"][0]
         done: list[str] = []
         asking = threading.Thread(target=self._ask, args=(row, name, settings, done.append), daemon=True)
@@ -222,11 +232,19 @@ class Running:
         times_s = self.heard.times_s.get(shown, [told_s])
         end_s = max(told_s, times_s[-1])
         usual_s = self.heard.longest_s(shown, began_s, asked_s) if row != "prior_gateway" else 0.0
-        return Exchanged(self.heard.longest_s(shown, asked_s, end_s), usual_s, told_s - asked_s)
+        kept = same(scene, self.scene())
+        ids = kept.place_ids, kept.region_ids, kept.object_ids
+        return Exchanged(self.heard.longest_s(shown, asked_s, end_s), usual_s, told_s - asked_s, *ids)
+
+    def scene(self) -> Scene:
+        """As the store has it now."""
+        found: Scene = self.client.ask(SCENE, SceneRequest(robot=ROBOT), 30.0)
+        return found
 
     def _ask(self, row: str, name: str, settings: Sequence[str], done: Callable[[str], None]) -> None:
         try:
-            done(self.client.swap(row, name, SwapRequest(settings=list(settings)), TIMEOUT_S).error)
+            timeout_s = ANSWER_S if row == ROUTER else TIMEOUT_S
+            done(self.client.swap(row, name, SwapRequest(settings=list(settings)), timeout_s).error)
         except BusError as error:
             done(str(error))
 

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 
 ROUTER = "router"
 TIMEOUT_S = 240.0  # a successor may load a network, catch up and wait for a conversation of its predecessor
+ANSWER_S = 10.0  # of who holds the router
 BACK_S = 20.0  # in which everybody is back at a router that was started again
 POLL_S = 0.05
 
@@ -116,7 +117,7 @@ def _swap_router(client: "BusClient") -> int:
 
     alive = set(client.alive())
     started_s = time.monotonic()
-    client.swap(ROUTER, ROUTER, SwapRequest(), TIMEOUT_S)
+    client.swap(ROUTER, ROUTER, SwapRequest(), ANSWER_S)
     gone = False
     while time.monotonic() - started_s < BACK_S:
         there = client.bus.connected() and alive <= set(client.alive())
