@@ -80,7 +80,7 @@ def test_the_oracle_sees_what_differs(undisturbed):
     objects = [msgspec.structs.replace(item, id=item.id + 100) for item in undisturbed.objects]
     for worse, aspects in [
         (changed(undisturbed, positions_m=moved), {"places"}),
-        (changed(undisturbed, edges=undisturbed.edges[1:]), {"edges"}),
+        (changed(undisturbed, edges=undisturbed.edges[1:], clearances_m=undisturbed.clearances_m[1:]), {"edges"}),
         (changed(undisturbed, trajectory=undisturbed.trajectory[1:]), {"cameras"}),
         (changed(undisturbed, place_regions=regions), {"labels", "regions", "region_ids"}),
         (changed(undisturbed, place_regions=ids, regions=renamed), {"region_ids"}),
