@@ -36,6 +36,9 @@ DTYPES = (
     "uint64",
     "bool",
 )
+LITTLE = tuple(np.dtype(name).newbyteorder("<") for name in DTYPES)  # as they travel
+CODES = {dtype: code for code, dtype in enumerate(LITTLE)}
+REAL = float | int
 MAX_DIMENSIONS = 8
 LAST_NUMBER = 2**62  # so that the next one, and sums of two, fit 64 bits
 Number = Annotated[int, msgspec.Meta(ge=0, le=LAST_NUMBER)]  # of a frame, an epoch or a revision; how many
@@ -78,7 +81,7 @@ class Shape:
             expected = dim if isinstance(dim, int) else lengths.setdefault(dim, length)
             if length != expected:
                 raise ValueError(f"{field}: shape {array.shape}, expected {dim} = {expected}")
-        if self.finite and not np.isfinite(array).all():
+        if self.finite and not np.logical_and.reduce(np.isfinite(array), axis=None):  # `all()` takes a way by Python
             raise ValueError(f"{field}: not finite")
 
 
@@ -119,20 +122,17 @@ def _check_plain(value: msgspec.Struct) -> None:
         if isinstance(number, int) and not -(2**63) <= number < 2**63:
             raise ValueError(f"{field}: does not fit 64 bits")
     for field in real:
-        if not all(map(math.isfinite, _reals(getattr(value, field)))):
+        if not _is_finite(getattr(value, field)):
             raise ValueError(f"{field}: not finite")
 
 
-def _reals(value: Any) -> Iterator[float]:
-    """The real numbers in a number, or in lists, tuples and dictionaries of them."""
-    if isinstance(value, float | int):
-        yield value
-    elif isinstance(value, list | tuple):
-        for item in value:
-            yield from _reals(item)
-    elif isinstance(value, dict):
-        for item in value.values():
-            yield from _reals(item)
+def _is_finite(value: Any) -> bool:
+    """Whether a number, or every one in lists, tuples and dictionaries of them, is finite."""
+    if isinstance(value, REAL):
+        return math.isfinite(value)
+    if isinstance(value, list | tuple):
+        return all(map(_is_finite, value))
+    return not isinstance(value, dict) or all(map(_is_finite, value.values()))
 
 
 def _holds_reals(hint: Any) -> bool:
@@ -184,10 +184,13 @@ def versions() -> dict[str, int]:
 
 
 def _pack_array(array: np.ndarray) -> msgspec.msgpack.Ext:
-    if array.dtype.name not in DTYPES:
-        raise TypeError(f"arrays of dtype {array.dtype} do not travel; use one of {', '.join(DTYPES)}")
-    little = np.ascontiguousarray(array.astype(array.dtype.newbyteorder("<"), copy=False))
-    head = struct.pack(f"<BB{array.ndim}I", DTYPES.index(array.dtype.name), array.ndim, *array.shape)
+    code = CODES.get(array.dtype)
+    if code is None:
+        if array.dtype.name not in DTYPES:
+            raise TypeError(f"arrays of dtype {array.dtype} do not travel; use one of {', '.join(DTYPES)}")
+        return _pack_array(array.astype(array.dtype.newbyteorder("<")))
+    little = np.ascontiguousarray(array)
+    head = struct.pack(f"<BB{array.ndim}I", code, array.ndim, *array.shape)
     return msgspec.msgpack.Ext(ARRAY_EXT_CODE, b"".join((head, little.data.cast("B") if little.size else b"")))
 
 
@@ -198,10 +201,7 @@ def _unpack_array(data: memoryview) -> np.ndarray:
     if code >= len(DTYPES) or ndim > MAX_DIMENSIONS or len(data) < 2 + 4 * ndim:
         raise ValueError("array header damaged")
     shape = struct.unpack_from(f"<{ndim}I", data, 2)
-    dtype = np.dtype(DTYPES[code]).newbyteorder("<")
-    count = 1
-    for length in shape:
-        count *= length
+    dtype, count = LITTLE[code], math.prod(shape)
     body = data[2 + 4 * ndim :]
     if len(body) != count * dtype.itemsize:
         raise ValueError("array length does not fit its shape")

@@ -45,18 +45,17 @@ def check_pose(world_from_camera: np.ndarray) -> None:
 
 def _check_rows(one: list[float], two: list[float], three: list[float], last: list[float]) -> None:
     """Plain numbers: for a single matrix, which every keyframe carries, NumPy would take five times as long."""
-    for first, second, dot in (
-        (one, one, 1), (two, two, 1), (three, three, 1), (one, two, 0), (one, three, 0), (two, three, 0),
-    ):  # fmt: skip
-        deviation = first[0] * second[0] + first[1] * second[1] + first[2] * second[2] - dot
-        if not abs(deviation) <= ROTATION_TOLERANCE:  # also when huge entries made it infinite or not a number
-            raise ValueError("world_from_camera: rotation is not orthonormal")
-    crossed = (
-        two[1] * three[2] - two[2] * three[1],
-        two[2] * three[0] - two[0] * three[2],
-        two[0] * three[1] - two[1] * three[0],
-    )
-    if one[0] * crossed[0] + one[1] * crossed[1] + one[2] * crossed[2] <= 0:
+    (a, b, c, _), (d, e, f, _), (g, h, i, _) = one, two, three
+    if not (  # also where huge entries made one of these infinite or not a number
+        abs(a * a + b * b + c * c - 1) <= ROTATION_TOLERANCE
+        and abs(d * d + e * e + f * f - 1) <= ROTATION_TOLERANCE
+        and abs(g * g + h * h + i * i - 1) <= ROTATION_TOLERANCE
+        and abs(a * d + b * e + c * f) <= ROTATION_TOLERANCE
+        and abs(a * g + b * h + c * i) <= ROTATION_TOLERANCE
+        and abs(d * g + e * h + f * i) <= ROTATION_TOLERANCE
+    ):
+        raise ValueError("world_from_camera: rotation is not orthonormal")
+    if a * (e * i - f * h) + b * (f * g - d * i) + c * (d * h - e * g) <= 0:
         raise ValueError("world_from_camera: rotation mirrors")
     if last != [0.0, 0.0, 0.0, 1.0]:
         raise ValueError("world_from_camera: last row is not 0 0 0 1")

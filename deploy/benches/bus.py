@@ -2,7 +2,10 @@
 
 Both ways carry the same bytes: typed messages are encoded, published, validated and handed to a handler; bare ones are
 put and handed to a callback. They take turns, and the median of their ratios counts. So does a third, typed and by TLS
-with keys from both processes to the router: twice what a robot and an edge have between them.
+with keys from both processes to the router: twice what a robot and an edge have between them. The processor time of
+writer, router and reader for each message says what it costs beside other work, when rates say little.
+
+Bare puts send one object again and again; a program that made new bytes for each would pay for that as the typed do.
 """
 
 import multiprocessing
@@ -45,11 +48,13 @@ def bus_bench(keyframe: Keyframe) -> tuple[dict, dict]:
             message = msgspec.structs.replace(keyframe, color=half, depth=half)
             ways = ((endpoint, True), (endpoint, False), (tls, True))
             rates = [[_rate(where, message, number, typed) for where, typed in ways] for _ in range(TURNS)]
-            metrics[f"throughput_ratio_{name}"] = statistics.median(typed / bare for typed, bare, _ in rates)
-            metrics[f"messages_per_s_{name}"] = statistics.median(typed for typed, _, _ in rates)
-            metrics[f"bare_messages_per_s_{name}"] = statistics.median(bare for _, bare, _ in rates)
-            metrics[f"tls_messages_per_s_{name}"] = statistics.median(secured for _, _, secured in rates)
-            metrics[f"tls_ratio_{name}"] = statistics.median(secured / typed for typed, _, secured in rates)
+            for number_of_way, way in enumerate(("", "bare_", "tls_")):
+                rate, cpu_us = zip(*(turn[number_of_way] for turn in rates), strict=True)
+                metrics[f"{way}messages_per_s_{name}"] = statistics.median(rate)
+                metrics[f"{way}cpu_us_{name}"] = statistics.median(cpu_us)
+            metrics[f"throughput_ratio_{name}"] = statistics.median(typed[0] / bare[0] for typed, bare, _ in rates)
+            metrics[f"cpu_ratio_{name}"] = statistics.median(bare[1] / typed[1] for typed, bare, _ in rates)
+            metrics[f"tls_ratio_{name}"] = statistics.median(secured[0] / typed[0] for typed, _, secured in rates)
     metrics["throughput_ratio"] = min(value for name, value in metrics.items() if name.startswith("throughput"))
     return metrics, {"path": "process, router, process on loopback", "turns": TURNS}
 
@@ -73,16 +78,17 @@ def _routers() -> Iterator[tuple[str, str]]:
                 stop()
 
 
-def _rate(endpoint: str, message: Keyframe, number: int, typed: bool) -> float:
-    """Messages per second that arrive in another process."""
+def _rate(endpoint: str, message: Keyframe, number: int, typed: bool) -> tuple[float, float]:
+    """Messages per second that arrive in another process, and microseconds of processor time for each."""
     context = multiprocessing.get_context("spawn")
     here, there = context.Pipe()
     reader = context.Process(target=_read, args=(endpoint, number, typed, there), daemon=True)
     reader.start()
     try:
         _received(here)  # it is subscribed
-        (_write_typed if typed else _write_bare)(endpoint, message, number, here)
-        return _received(here)
+        written_s = (_write_typed if typed else _write_bare)(endpoint, message, number, here)
+        rate, read_s = _received(here)
+        return rate, (written_s + read_s) / number * 1e6
     finally:
         reader.terminate()
         reader.join()
@@ -94,29 +100,32 @@ def _received(pipe: Connection) -> Any:
     return pipe.recv()
 
 
-def _write_typed(endpoint: str, message: Keyframe, number: int, pipe: Connection) -> None:
+def _write_typed(endpoint: str, message: Keyframe, number: int, pipe: Connection) -> float:
     bus, key = ZenohBus(endpoint), KEYFRAME.key_of(message)
     try:
-        _write(lambda sequence: bus.put(KEYFRAME, key, encode(message), _header(sequence)), number, pipe)
+        return _write(lambda sequence: bus.put(KEYFRAME, key, encode(message), _header(sequence)), number, pipe)
     finally:
         bus.close()
 
 
-def _write_bare(endpoint: str, message: Keyframe, number: int, pipe: Connection) -> None:
+def _write_bare(endpoint: str, message: Keyframe, number: int, pipe: Connection) -> float:
     payload = encode(message)
     with zenoh.open(client_config(endpoint)) as session:
         publisher = session.declare_publisher(BARE_KEY, congestion_control=zenoh.CongestionControl.BLOCK)
-        _write(lambda sequence: publisher.put(payload), number, pipe)
+        return _write(lambda sequence: publisher.put(payload), number, pipe)
 
 
-def _write(put: Callable[[int], None], number: int, pipe: Connection) -> None:
-    """One message ahead, so that reader and writer have found each other; the reader then waits for the others."""
+def _write(put: Callable[[int], None], number: int, pipe: Connection) -> float:
+    """One message ahead, so that reader and writer have found each other; the reader then waits for the others. Returns
+    the seconds of processor time of this process, in which the router is, from then on."""
     put(0)
     _received(pipe)
+    began_s = time.process_time()
     for sequence in range(1, number + 1):
         put(sequence)
     _received(pipe)
     pipe.send(None)
+    return time.process_time() - began_s
 
 
 def _read(endpoint: str, number: int, typed: bool, pipe: Connection) -> None:
@@ -139,11 +148,13 @@ def _read(endpoint: str, number: int, typed: bool, pipe: Connection) -> None:
     time.sleep(0.5)  # until the router has told the writers
     pipe.send(None)
     first.wait(TIMEOUT_S)
+    began_s = time.process_time()
     pipe.send(None)
     last.wait(TIMEOUT_S)
+    read_s = time.process_time() - began_s
     pipe.send(None)
     pipe.recv()
-    pipe.send((len(arrivals_s) - 1) / (arrivals_s[-1] - arrivals_s[0]))
+    pipe.send(((len(arrivals_s) - 1) / (arrivals_s[-1] - arrivals_s[0]), read_s))
 
 
 def _decoded(sample: Sample) -> Keyframe:

@@ -10,6 +10,7 @@ import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
+from functools import lru_cache
 from typing import Any, Protocol
 
 from prior_sg.schemas.codec import DecodeError, decode
@@ -120,10 +121,15 @@ def unpack_header(header: bytes | None) -> tuple[str, int, int, str]:
     if header is None or not HEADER.size < len(header) <= HEADER.size + LONGEST_WRITER:
         return "", -1, 0, ""
     sequence, sent_ns = HEADER.unpack_from(header)
-    writer, _, context = header[HEADER.size :].decode(errors="replace").partition(";")
-    if not WRITER.fullmatch(writer):
-        return "", -1, 0, ""
-    return writer, sequence, sent_ns, context if context and TRACEPARENT.fullmatch(context) else ""
+    writer, context = _who(header[HEADER.size :])
+    return (writer, sequence, sent_ns, context) if writer else ("", -1, 0, "")
+
+
+@lru_cache(maxsize=256)  # few write, and each says who it is with every sample
+def _who(said: bytes) -> tuple[str, str]:
+    """Writer and context, each empty where it is not one."""
+    writer, _, context = said.decode(errors="replace").partition(";")
+    return writer if WRITER.fullmatch(writer) else "", context if TRACEPARENT.fullmatch(context) else ""
 
 
 def key_matches(pattern: str, key: str) -> bool:
