@@ -47,7 +47,7 @@ check: $(VENV)/installed-dev
 bench: $(VENV)/installed-dev
 	$(BIN)/prior-sg bench all --json
 
-# Hundreds of faults on whole systems, about 40 minutes; CHAOS='--faults 20 --seed 7' for others. It goes on where it was.
+# Hundreds of faults on whole systems; CHAOS='--faults 20 --seed 7' for others. It goes on where it was.
 chaos: $(VENV)/installed-dev
 	$(BIN)/python -m tests.chaos $(CHAOS)
 
