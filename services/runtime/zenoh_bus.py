@@ -71,7 +71,7 @@ TRANSPORT: dict[str, Any] = {
         "tx": {"lease": LEASE_MS, "keep_alive": 4},
         "rx": {"buffer_size": 4194304, "max_message_size": LARGEST + HEAD_BYTES},
     },
-    "shared_memory": {"enabled": False},  # asks for a /dev/shm that can be written, which containers may lack
+    "shared_memory": {"enabled": False},  # a reader that was stopped would take other bytes: docs/decisions.md
 }
 
 
