@@ -15,7 +15,7 @@ from prior_sg.services.feature_pyramid.encoders.base import FAMILIES
 from tests.chaos import painted
 from tests.chaos.dialects import spoken
 from tests.chaos.faults import FAULTS
-from tests.chaos.oracle import ASPECTS, LASTING, differences, likeness
+from tests.chaos.oracle import ASPECTS, LASTING, differences, kept_ids, likeness
 from tests.chaos.results import Results, table
 from tests.chaos.schedule import BY_NAME, KINDS, Planned, planned
 from tests.chaos.streams import ROBOT, made
@@ -79,10 +79,10 @@ def test_the_oracle_sees_what_differs(undisturbed):
     renamed = [msgspec.structs.replace(region, id=region.id + 100) for region in undisturbed.regions]
     objects = [msgspec.structs.replace(item, id=item.id + 100) for item in undisturbed.objects]
     for worse, aspects in [
-        (changed(undisturbed, positions_m=moved), {"places", "positions"}),
+        (changed(undisturbed, positions_m=moved), {"places", "edges"}),
         (
             changed(undisturbed, place_ids=undisturbed.place_ids + 1, edges=undisturbed.edges + 1),
-            {"places", "edges", "labels", "region_ids"},
+            {"place_ids"},
         ),
         (changed(undisturbed, edges=undisturbed.edges[1:], clearances_m=undisturbed.clearances_m[1:]), {"edges"}),
         (changed(undisturbed, trajectory=undisturbed.trajectory[1:]), {"cameras"}),
@@ -94,6 +94,13 @@ def test_the_oracle_sees_what_differs(undisturbed):
         lower = {aspect for aspect, share in likeness(undisturbed, worse).items() if share < 1.0}
         assert aspects <= lower, aspects
         assert lower <= aspects | {"regions"}, lower
+
+
+def test_ids_that_are_given_anew_are_seen(undisturbed):
+    assert kept_ids(undisturbed, undisturbed) == 1.0
+    assert kept_ids(undisturbed, changed(undisturbed, place_ids=undisturbed.place_ids + 1)) == 0.0
+    grown = changed(undisturbed, place_ids=undisturbed.place_ids[1:], positions_m=undisturbed.positions_m[1:])
+    assert kept_ids(grown, undisturbed) == 1.0
 
 
 def test_a_schedule_is_that_of_its_seed_and_spares_whoever_was_hit_before():

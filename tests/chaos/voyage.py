@@ -12,7 +12,7 @@ from prior_sg.schemas.scene import Scene
 from prior_sg.services.runtime.bus import BusError
 from prior_sg.services.runtime.record import LogError, summary
 from tests.chaos.faults import done
-from tests.chaos.oracle import ASPECTS, differences, likeness, worst
+from tests.chaos.oracle import ASPECTS, differences, kept_ids, likeness, worst
 from tests.chaos.schedule import Phase, Planned
 from tests.chaos.streams import Stream
 from tests.chaos.system import System
@@ -25,6 +25,7 @@ PATIENCE_S = 90.0  # until the stream is followed again, and until the system re
 FIRST_PATIENCE_S = 400.0  # of an undisturbed one, which may have to compile its loops
 LATE_S = 20.0  # in which what seemed at rest may still become equal: what is missing is asked for again
 LEFT_MB = 150.0  # more than undisturbed that a process may hold
+ID_TOLERANCE = 0.02  # of the share of ids kept
 
 
 class Hit(msgspec.Struct, frozen=True, kw_only=True):
@@ -111,6 +112,7 @@ class Voyage:
         self.number, self.stream, self.known, self.lasting = number, system.stream, known, lasting
         self.system, self.watch = system, watch
         self._gate = 0
+        self._before: tuple[int, Scene] | None = None  # the scene at the last quiet point
 
     def outcomes(self, phases: Sequence[Phase]) -> Iterator[Outcome]:
         """What came of each phase, while there is stream left."""
@@ -133,13 +135,15 @@ class Voyage:
             _rest(self.watch, point)
             rested_s = time.monotonic()
             while True:
-                alike = likeness(self.known.scene(point), self.watch.scene())
-                differs = differences(alike, self.known.tolerance, self.lasting)
+                scene = self.watch.scene()
+                alike = likeness(self.known.scene(point), scene)
+                differs = [*differences(alike, self.known.tolerance, self.lasting), *self._ids_lost(point, scene)]
                 late_s = time.monotonic() - rested_s
                 if not differs or late_s > LATE_S:
                     break
                 time.sleep(0.5)
             problems += [*differs, *self.watch.lost()[:3]]
+            self._before = point, scene
         except (TimeoutError, BusError) as error:
             problems.append(str(error))
         resident_mb = self.system.resident_mb()
@@ -164,6 +168,15 @@ class Voyage:
             beside=[text for text in ended if text.split()[0].rsplit("-", 1)[0] not in expected],
             resident_mb=resident_mb,
         )
+
+    def _ids_lost(self, point: int, scene: Scene) -> list[str]:
+        """Whether places that stand where they stood at the last quiet point have other ids, but for what changes in an
+        undisturbed run as well."""
+        if self._before is None:
+            return []
+        frames, before = self._before
+        usual, kept = kept_ids(self.known.scene(frames), self.known.scene(point)), kept_ids(before, scene)
+        return [f"{kept:.3f} of the place ids kept (undisturbed {usual:.3f})"] if kept < usual - ID_TOLERANCE else []
 
     def _disturbed(self, phase: Phase, problems: list[str]) -> list[Hit]:
         """Let the stream run until every fault is over and the system follows the stream again."""
