@@ -17,7 +17,7 @@ from random import Random
 import cv2
 
 from tests.fuzz.mutators import LONGEST, mutated
-from tests.fuzz.trial import Crash, Decoder, Tally, inputs_of, written
+from tests.fuzz.trial import Decoder, Tally, inputs_of, written
 
 HANG_S = 2.0  # of processor, for one input
 GROWTH_KB = 500 * 1024
@@ -34,16 +34,16 @@ class Ledger:
 
     def read(self) -> tuple[Tally, bool, bytes]:
         """Counts, whether the child came to its end, and the last input."""
-        inputs, accepted, refused, slowest_ns, _, length, ended = HEAD.unpack_from(self._shared)
+        *counts, length, ended = HEAD.unpack_from(self._shared)
         data = self._shared[HEAD.size : HEAD.size + length]
-        return Tally(inputs, accepted, refused, slowest_ns), bool(ended), data
+        return Tally(*counts), bool(ended), data
 
     def trying(self, data: bytes) -> None:
         struct.pack_into("<Q", self._shared, 40, len(data))
         self._shared[HEAD.size : HEAD.size + len(data)] = data
 
     def write(self, tally: Tally, ended: bool = False) -> None:
-        counts = (tally.inputs, tally.accepted, tally.refused, tally.slowest_ns, len(tally.crashes))
+        counts = (tally.inputs, tally.accepted, tally.refused, tally.slowest_ns, tally.crashed)
         HEAD.pack_into(self._shared, 0, *counts, HEAD.unpack_from(self._shared)[5], int(ended))
 
 
@@ -62,10 +62,11 @@ class Watch:
         peak_kb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         self._base_kb = self._base_kb or peak_kb
         if peak_kb - self._base_kb > GROWTH_KB:
-            self.tally.crashes.append(Crash(f"memory grew to {peak_kb} kB", self.decoder.name, data))
+            self.tally.crash(f"memory grew to {peak_kb} kB", self.decoder.name, data)
             self._base_kb = peak_kb
         if self.tally.crashes:
-            written(self.out, self.decoder.name, self.tally.crashes[-1:])
+            written(self.out, self.decoder.name, self.tally.crashes)
+            self.tally.crashes.clear()
         if self.tally.inputs % EVERY == 0:
             self.ledger.write(self.tally)
 

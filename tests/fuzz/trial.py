@@ -52,6 +52,7 @@ class Tally:
     accepted: int = 0
     refused: int = 0
     slowest_ns: int = 0  # of processor
+    crashed: int = 0
     crashes: list[Crash] = field(default_factory=list)
 
     def run(self, decoder: Decoder, data: bytes) -> bool:
@@ -65,10 +66,15 @@ class Tally:
         except decoder.refuses:
             self.refused += 1
         except Exception as error:
-            self.crashes.append(Crash(repr(error)[:200], _place(error), data))
+            self.crash(repr(error)[:200], _place(error), data)
         finally:
             self.slowest_ns = max(self.slowest_ns, time.thread_time_ns() - began_ns)
         return False
+
+    def crash(self, what: str, where: str, data: bytes) -> None:
+        """One more, of which the input is kept."""
+        self.crashed += 1
+        self.crashes.append(Crash(what, where, data))
 
 
 def _place(error: BaseException) -> str:
