@@ -60,7 +60,7 @@ sbom: $(VENV)/installed-audit
 	mkdir -p build
 	$(BIN)/cyclonedx-py environment $(BIN)/python --pyproject pyproject.toml --output-file build/sbom.json
 
-# Hundreds of faults on whole systems, about 40 minutes; CHAOS='--faults 20 --seed 7' for others. It goes on where it was.
+# Hundreds of faults on whole systems; CHAOS='--faults 20 --seed 7' for others. It goes on where it was.
 chaos: $(VENV)/installed-dev
 	$(BIN)/python -m tests.chaos $(CHAOS)
 

@@ -17,7 +17,7 @@ from typing import NamedTuple
 from prior_sg.deploy.benches.same_scene import Same, same
 from prior_sg.deploy.running.roll import Roll
 from prior_sg.deploy.running.supervisor import Supervisor
-from prior_sg.deploy.running.swaps import ROUTER, RouterHere, Swaps
+from prior_sg.deploy.running.swaps import RESTARTED, ROUTER, RouterHere, Swaps
 from prior_sg.deploy.settings import DEMO_ENVIRONMENT, DEMO_TASK
 from prior_sg.schemas.frames import IngestState
 from prior_sg.schemas.priors import PriorRequest, Task
@@ -223,6 +223,8 @@ class Running:
         self.until(lambda: bool(done), f"the exchange of {row}")
         if done[0]:
             raise RuntimeError(f"{row}: {done[0]}")
+        if row == ROUTER:  # it answers first
+            self.until(lambda: RESTARTED in self.events, "the router's start")
         told_s = time.monotonic()
         shown = "answers" if row == "prior_gateway" else SHOWN_BY[row].name
         before = len(self.heard.times_s.get(shown, ()))

@@ -18,6 +18,7 @@ from prior_sg.services.runtime.keys import Beyond
 from prior_sg.services.runtime.zenoh_bus import EndpointTakenError, open_router
 
 ROUTER = "router"
+RESTARTED = "the router was started again in its place"
 MOST_ASKED = 16  # exchanges that wait to be begun
 REOPEN_S = 10.0  # in which the port of a router that has ended can be had again
 REOPEN_POLL_S = 0.05
@@ -79,7 +80,7 @@ class Swaps:
         if self._router is not None and time.monotonic() >= self._router_at_s:
             self._router_at_s = math.inf
             self._router.restart()
-            events.append("the router was started again in its place")
+            events.append(RESTARTED)
         return events
 
     def _swap(self, name: str, asked: SwapRequest, request: Request) -> str:

@@ -1,6 +1,6 @@
 """Whether two scenes are the same, aspect by aspect, as shares from 0 to 1 (pure)."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 
 import numpy as np
 
@@ -9,7 +9,7 @@ from prior_sg.schemas.scene import Scene
 
 NEAR_M = 0.01  # that a place may have moved
 OBJECT_NEAR_M = 0.2  # between the middles of an object in both
-ASPECTS = ("places", "edges", "cameras", "labels", "regions", "region_ids", "objects", "object_ids")
+ASPECTS = ("positions", "places", "edges", "cameras", "labels", "regions", "region_ids", "objects", "object_ids")
 LASTING = ("region_ids", "object_ids")  # told, and not part of what must be equal while ids end with their service
 
 
@@ -25,6 +25,7 @@ def likeness(one: Scene, other: Scene) -> dict[str, float]:
     moved = np.abs(one.trajectory[:cameras] - other.trajectory[:cameras]).max(axis=1, initial=0.0) > NEAR_M
     pairs, ids = _objects(one.objects, other.objects)
     return {
+        "positions": _jaccard(*(_spots(scene) for scene in (one, other))),  # of places, whatever their ids
         "places": _share(int(near.sum()), len(one.place_ids) + len(other.place_ids) - len(rows)),
         "edges": _jaccard(map(tuple, one.edges.tolist()), map(tuple, other.edges.tolist())),
         "cameras": _share(int((~moved).sum()), max(len(one.trajectory), len(other.trajectory))),
@@ -58,6 +59,10 @@ def _common(one: Scene, other: Scene) -> list[tuple[int, int]]:
     """Rows of the places that both have, by id."""
     rows = {place: row for row, place in enumerate(other.place_ids.tolist())}
     return [(row, rows[place]) for row, place in enumerate(one.place_ids.tolist()) if place in rows]
+
+
+def _spots(scene: Scene) -> Iterator[tuple[int, ...]]:
+    return map(tuple, np.rint(scene.positions_m / NEAR_M).astype(np.int64).tolist())
 
 
 def _partition(one: Scene, other: Scene, regions: Mapping[int, tuple[int, int]]) -> float:

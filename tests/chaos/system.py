@@ -117,7 +117,8 @@ class System:
         self.failed = ""  # why the supervisor has given up
         self.expected: list[str] = []  # instances whose end is a fault of ours
         self._command = [sys.executable, "-P", "-m", "prior_sg.deploy.cli.main"]
-        self._settings = [*SETTINGS, *settings, f"ingest.source={stream.path}", f"scene_store.path={self.database}"]
+        kept = [f"ingest.archive_path={self.disk / 'keyframes.sqlite'}", f"scene_store.path={self.database}"]
+        self._settings = [*SETTINGS, *settings, f"ingest.source={stream.path}", *kept]
         self._stopping = threading.Event()
         self._keeper = threading.Thread(target=self._keep, name="keeper", daemon=True)
         self._lock = threading.Lock()

@@ -79,7 +79,11 @@ def test_the_oracle_sees_what_differs(undisturbed):
     renamed = [msgspec.structs.replace(region, id=region.id + 100) for region in undisturbed.regions]
     objects = [msgspec.structs.replace(item, id=item.id + 100) for item in undisturbed.objects]
     for worse, aspects in [
-        (changed(undisturbed, positions_m=moved), {"places"}),
+        (changed(undisturbed, positions_m=moved), {"places", "positions"}),
+        (
+            changed(undisturbed, place_ids=undisturbed.place_ids + 1, edges=undisturbed.edges + 1),
+            {"places", "edges", "labels", "region_ids"},
+        ),
         (changed(undisturbed, edges=undisturbed.edges[1:], clearances_m=undisturbed.clearances_m[1:]), {"edges"}),
         (changed(undisturbed, trajectory=undisturbed.trajectory[1:]), {"cameras"}),
         (changed(undisturbed, place_regions=regions), {"labels", "regions", "region_ids"}),

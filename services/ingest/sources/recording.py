@@ -17,7 +17,8 @@ from prior_sg.services.ingest.core.frames import BadFrame, Correction, RawFrame
 from prior_sg.services.ingest.core.options import ReadOptions
 from prior_sg.services.ingest.core.poses import Convention
 from prior_sg.services.ingest.sources.base import Camera, Found, Images, Source, SourceError, Wanted, shifted_truth
-from prior_sg.services.ingest.sources.normalise import LOOKED_AT, UNUSABLE, Normaliser, prepare
+from prior_sg.services.ingest.sources.normalise import LOOKED_AT, prepare
+from prior_sg.services.ingest.sources.normaliser import UNUSABLE, Normaliser
 from prior_sg.services.runtime.record import (
     Content,
     LogError,

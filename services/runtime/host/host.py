@@ -6,7 +6,6 @@ All of a service's state is touched by one worker thread only; the event loop ha
 import asyncio
 import logging
 import os
-import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -16,22 +15,21 @@ from typing import Any, cast
 import msgspec
 
 from prior_sg.schemas.codec import DecodeError, Message, decode, encode, versions
-from prior_sg.schemas.status import Consumed, JobDone, ServiceStatus, Started, StatusRequest, Tick, TopicCount
+from prior_sg.schemas.status import JobDone, ServiceStatus, Started, StatusRequest, Tick, TopicCount
 from prior_sg.schemas.succession import Bequest, Succession, TakesOver
 from prior_sg.schemas.topics import (
     DELTAS,
-    JOURNAL,
     Query,
     Topic,
     alive_key,
-    fault_of_job,
     status_key,
     worker_keys,
     yield_key,
 )
-from prior_sg.services.refusals import InputRefused, NotYet
+from prior_sg.services.refusals import InputRefused
 from prior_sg.services.runtime.bus import Bus, Request, Sample
 from prior_sg.services.runtime.extras import release
+from prior_sg.services.runtime.host.answering import Answering
 from prior_sg.services.runtime.host.asks import Asks, Reply
 from prior_sg.services.runtime.host.door import Door
 from prior_sg.services.runtime.host.faults import fault_of_clock, fault_of_reply, fault_of_writer
@@ -41,21 +39,20 @@ from prior_sg.services.runtime.host.items import LastWord, Question, Work
 from prior_sg.services.runtime.host.lease import Fence, Lease
 from prior_sg.services.runtime.host.outbox import Outbox
 from prior_sg.services.runtime.host.port import Fed, Port
+from prior_sg.services.runtime.host.readers import Readers
 from prior_sg.services.runtime.host.replays import Replays
 from prior_sg.services.runtime.host.succession import Predecessor, Standby
 from prior_sg.services.runtime.host.timing import Timing
 from prior_sg.services.runtime.host.trail import Trail
+from prior_sg.services.runtime.host.workplace import Workplace
 from prior_sg.services.runtime.host.yielding import Yielding
 from prior_sg.services.runtime.jobs.board import Ended
-from prior_sg.services.runtime.jobs.dispatcher import CREDITS
-from prior_sg.services.runtime.jobs.memory import Done
-from prior_sg.services.runtime.jobs.pool import JobPool, done
+from prior_sg.services.runtime.jobs.pool import JobPool
 from prior_sg.services.runtime.service import Ask, Identity, Service
 from prior_sg.services.runtime.signatures import signatures_in_force
 
 log = logging.getLogger(__name__)
 FEW_INPUTS = 4  # that may wait in a process that has caught up
-MOST_QUESTIONS = 256  # that wait in one service
 
 
 class Host:
@@ -93,14 +90,21 @@ class Host:
         self._thread = ThreadPoolExecutor(1, thread_name_prefix=service.name)
         self._asks = Asks(bus, self.inbox, self.stopping)
         self._pools: dict[Topic, JobPool] = {}
-        self._slots, self._asked = threading.Semaphore(CREDITS), threading.Semaphore(MOST_QUESTIONS)
-        self._done = Done()
         self._progress = Progress()
         self._outbox = Outbox(service.name, identity, bus, self._progress)
+        self._answering = Answering(self.inbox, self._door)
+        self._workplace = self._workplace_of(service)
         self._timing = Timing()
         self._replays = Replays()
         self.trail = Trail(identity.robot)
         self._state: Any = None
+
+    def _workplace_of(self, service: Service) -> Workplace | None:
+        if service.job is None:
+            return None
+        return Workplace(
+            service.job, self.inbox, self._door, self._outbox, step=self._step, writes=bool(service.writes)
+        )
 
     async def run(self) -> None:
         """Build the state, join the bus, and work until stopped."""
@@ -162,6 +166,9 @@ class Host:
         return self._yielding.bequest is not None
 
     async def _drain(self) -> None:
+        await self._yielding.begun.wait()
+        if self._workplace is not None:
+            self._workplace.closed.set()
         await self._yielding.drain(self._is_busy)
         await self.stopping.wait()
 
@@ -215,11 +222,11 @@ class Host:
         for topic in service.reads:
             self.bus.subscribe(topic, topic.pattern(robot), self.inbox.offer, self._missed)
         if service.drive is not None:
-            self.bus.subscribe(JOURNAL, JOURNAL.pattern(robot), self._saw_consumed, lambda topic, number: None)
-            self.bus.watch(alive_key("*", "*"), self._saw_alive)
-        if service.job is not None:
+            readers = Readers(self.inbox, self._door, self._progress, self._loop, writer=self._outbox.writer)
+            readers.follow(self.bus, robot)
+        if service.job is not None and self._workplace is not None:
             run_key, live_key = worker_keys(service.job, self.identity.instance, service.job_group(self.cfg))
-            self.bus.serve(f"{run_key}/*", self._offer_work)
+            self.bus.serve(f"{run_key}/*", self._workplace.offer)
             self.bus.announce(live_key)
         self.bus.announce(alive_key(service.name, self.identity.instance))
 
@@ -227,7 +234,7 @@ class Host:
         """Declare what this process answers: nothing while another is in charge."""
         for query in self.service.answers:
             key = self.service.answer_key(query, self.identity.robot, self.cfg)
-            self.bus.serve(key, partial(self._queue_question, query))
+            self.bus.serve(key, partial(self._answering.receive, query))
         self._answers = True
 
     def _wake(self) -> None:
@@ -257,9 +264,10 @@ class Host:
             case Reply():
                 self._handle_reply(item)
             case Question():
-                self._handle_question(item)
+                self._answering.reply(item, partial(self._answered, item.query))
             case Work():
-                self._handle_work(item)
+                assert self._workplace is not None
+                self._workplace.do(item, self._prepare)
             case JobDone():
                 self._step(item, "JobDone")
             case Fed():
@@ -311,6 +319,13 @@ class Host:
             key=sample.key,
         )
 
+    def _answered(self, query: Query, request: Message) -> Message:
+        return self._signatures.signed(self.service.answers[query](self._state, request, self.cfg))
+
+    def _prepare(self, jobs: list[Message]) -> None:
+        if self.service.prepare is not None:
+            self.service.prepare(self._state, jobs, self.cfg)
+
     def _handle_reply(self, reply: Reply) -> None:
         query = reply.ask.query
         message = self._door.admitted(
@@ -331,77 +346,6 @@ class Host:
         self._asks.answered(reply.ask)
         self._take(message, query.name, query.key)
         self._outbox.journal(query.name, inline=reply.payload)
-
-    def _handle_question(self, question: Question) -> None:
-        query, key = question.query, question.request.key
-        self._asked.release()
-        fault_of = partial(query.fault_of, key)
-        request = self._door.admitted(
-            query.request, question.request.payload, name=query.name, key=key, fault_of=fault_of
-        )
-        if request is None:
-            question.request.refuse(f"the request is not a valid {query.request.__name__} for {key}")
-            return
-        self.inbox.of(query.name).consumed += 1
-        try:
-            answer = encode(self._signatures.signed(self.service.answers[query](self._state, request, self.cfg)))
-        except NotYet as error:
-            question.request.refuse(f"{query.name}: {error}")
-            return
-        except Exception as error:  # an answer changes no state: a question it cannot take must not end the service
-            log.exception("question not answered", extra={"query": query.name})
-            question.request.refuse(f"{query.name}: {error}")
-            return
-        question.request.reply(answer)
-
-    def _handle_work(self, work: Work) -> None:
-        job = self.service.job
-        assert job is not None
-        message = work.message
-        self._slots.release()
-        if message is None:
-            work.request.refuse("malformed")
-            return
-        self.inbox.of(job.name).consumed += 1
-        wished_again = bool(getattr(message, "space", ""))  # of a back-fill: somebody lacks the results
-        if not wished_again and (results := self._done.results_of(work.request.payload)):
-            work.request.reply(done(results))
-            return
-        if self.service.prepare is not None:
-            self.service.prepare(self._state, [message, *self._waiting_jobs()], self.cfg)
-        before = self._outbox.written
-        try:
-            self._step(message, job.name)
-        except Exception as error:  # jobs are independent of each other: one that cannot be done ends no worker
-            log.exception("job failed", extra={"topic": job.name, "frame_id": getattr(message, "frame_id", -1)})
-            work.request.refuse(f"failed: {error}")
-            return
-        results = self._outbox.written - before
-        self._done.note(work.request.payload, results)
-        self._outbox.journal(job.name, frame_id=getattr(message, "frame_id", -1))
-        work.request.reply(done(results if self.service.writes else 1))
-
-    def _queue_question(self, query: Query, request: Request) -> None:
-        """Questions come first: they change nothing, and whoever asks waits."""
-        if self._asked.acquire(blocking=False):
-            self.inbox.put(Question(query, request), first=True)
-        else:
-            request.refuse(f"{MOST_QUESTIONS} questions wait here already; ask again later")
-
-    def _offer_work(self, request: Request) -> None:
-        job = self.service.job
-        assert job is not None
-        if not self._yielding.begun.is_set() and self._slots.acquire(blocking=False):
-            fault_of = partial(fault_of_job, job, request.key)
-            message = self._door.admitted(job.type, request.payload, name=job.name, key=request.key, fault_of=fault_of)
-            self.inbox.put(Work(request, message))
-        else:
-            request.refuse("busy")
-
-    def _waiting_jobs(self) -> list[Message]:
-        """Jobs taken in and not begun, oldest first."""
-        waiting = (item.message for item in self.inbox.waiting() if isinstance(item, Work))
-        return [message for message in waiting if message is not None]
 
     def _take(self, message: Message, name: str, key: str, sample: Sample | None = None) -> None:
         """Step with an input from outside: an absurd one is counted and logged, and the service goes on."""
@@ -467,24 +411,6 @@ class Host:
     def _missed(self, topic: Topic, number: int) -> None:
         self.inbox.missed(topic.name, number)
         log.warning("samples lost", extra={"topic": topic.name, "number": number})
-
-    def _saw_consumed(self, sample: Sample) -> None:
-        if not self.inbox.allows(sample):
-            return
-        admitted = partial(self._door.admitted, name=JOURNAL.name, key=sample.key, writer=sample.writer)
-        match admitted(Consumed, sample.payload, fault_of=partial(JOURNAL.fault_of, sample.key)):
-            case Consumed(topic="START") as entry:
-                started = admitted(Started, entry.inline, fault_of=lambda started: "")
-                if isinstance(started, Started):
-                    self._progress.reader(entry.instance, started.reads)
-            case Consumed() as entry:
-                own = entry.writer == self._outbox.writer
-                self._progress.consumed(entry.instance, entry.topic, entry.sequence if own else -1)
-        self._progress.changed(self._loop)
-
-    def _saw_alive(self, key: str, alive: bool) -> None:
-        self._progress.alive(key.rsplit("/", 1)[-1], alive)
-        self._progress.changed(self._loop)
 
     def _answer_status(self, request: Request) -> None:
         try:

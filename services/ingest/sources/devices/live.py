@@ -23,7 +23,8 @@ from prior_sg.services.ingest.core.poses import FROM_CAMERA, Convention
 from prior_sg.services.ingest.sources.base import Event, Found, Images, Source, SourceError
 from prior_sg.services.ingest.sources.devices.device import Capture
 from prior_sg.services.ingest.sources.devices.rig import Posed, Rig, first
-from prior_sg.services.ingest.sources.normalise import UNUSABLE, Normaliser, prepare
+from prior_sg.services.ingest.sources.normalise import prepare
+from prior_sg.services.ingest.sources.normaliser import UNUSABLE, Normaliser
 
 NAME = "camera"
 SAMPLES, LOOK_S = 3, 10.0

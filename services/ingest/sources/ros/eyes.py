@@ -31,7 +31,8 @@ from prior_sg.services.ingest.core.ros.transforms import Stamped, TransformTree
 from prior_sg.services.ingest.sources.base import MILLIMETRE, Camera, Found, FrameError, Images, SourceError
 from prior_sg.services.ingest.sources.clouds.live import Around, Drawn, Shower, period_ns, used_views
 from prior_sg.services.ingest.sources.clouds.ros import EDGE_NS
-from prior_sg.services.ingest.sources.normalise import UNUSABLE, Normaliser, Samples, beside, prepare
+from prior_sg.services.ingest.sources.normalise import Samples, beside, prepare
+from prior_sg.services.ingest.sources.normaliser import UNUSABLE, Normaliser
 from prior_sg.services.ingest.sources.ros.look import Look
 from prior_sg.services.ingest.sources.ros.pictures import Rig, color_camera, pictures
 from prior_sg.services.ingest.sources.ros.reader import Reader

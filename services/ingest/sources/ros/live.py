@@ -20,7 +20,7 @@ from prior_sg.services.ingest.core.frames import BadFrame, RawFrame, View
 from prior_sg.services.ingest.core.options import ROBOT, ReadOptions
 from prior_sg.services.ingest.core.ros.topics import NAMED, Topic
 from prior_sg.services.ingest.sources.base import Source, SourceError
-from prior_sg.services.ingest.sources.normalise import UNUSABLE, Normaliser
+from prior_sg.services.ingest.sources.normaliser import UNUSABLE, Normaliser
 from prior_sg.services.ingest.sources.ros.eyes import NAME, Robot, robot_of
 from prior_sg.services.ingest.sources.ros.look import MOMENT_S, Look
 from prior_sg.services.ingest.sources.ros.reader import robot_types

@@ -20,7 +20,7 @@ from prior_sg.services.ingest.core.ros.topics import CAMERA_INFO, COMPRESSED, IM
 from prior_sg.services.ingest.core.ros.transforms import transforms_of
 from prior_sg.services.ingest.sources.base import Event, Images, SourceError
 from prior_sg.services.ingest.sources.clouds.live import Shower, Shown
-from prior_sg.services.ingest.sources.normalise import UNUSABLE
+from prior_sg.services.ingest.sources.normaliser import UNUSABLE
 from prior_sg.services.ingest.sources.ros.eyes import Eye, Robot
 from prior_sg.services.ingest.sources.ros.feed import Feed, Tally
 from prior_sg.services.ingest.sources.ros.look import MOMENT_S
