@@ -8,8 +8,10 @@ from collections.abc import Callable
 from typing import Any
 
 from prior_sg.schemas.codec import DecodeError, M, Message, Refused, decode, decode_plain, encode_plain, schema_name
+from prior_sg.schemas.names import LONGEST_NAME
 
 NEWER, OLDER = "is newer than this program's", "is too old for this program's"
+LONGEST_NUMBER = 6  # digits of a version; Python reads none of more than 4300
 Migration = Callable[[dict[str, Any]], dict[str, Any]]
 
 # (name of the message, version before): fields by name, arrays as arrays, to the fields of the next version.
@@ -57,8 +59,10 @@ def tells_of_versions(sentence: str) -> bool:
 def _steps(message_type: type[Message], schema: str) -> list[Migration]:
     """The migrations from `schema` up to our version."""
     ours, (name, _, number) = schema_name(message_type), schema.rpartition("/")
-    if name != message_type.__name__ or not (number.isascii() and number.isdigit()):
-        raise SchemaError(f"{schema} stands where a {ours} belongs: its writer puts another message there")
+    is_number = number.isascii() and number.isdigit() and len(number) <= LONGEST_NUMBER
+    if name != message_type.__name__ or not is_number:
+        told = schema[:LONGEST_NAME]
+        raise SchemaError(f"{told} stands where a {ours} belongs: its writer puts another message there")
     version = int(number)
     if version > message_type.VERSION:
         raise SchemaError(f"{schema} {NEWER} {ours}; update it")

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 
 from prior_sg.schemas.frames import Intrinsics, Keyframe
-from prior_sg.services.headers import ImageError, told_size
+from prior_sg.services.headers import ImageError, image_size, trimmed
 
 MAX_PRINCIPAL_OFFSET = 0.45  # share of the image by which the principal point may be off its middle: crops
 
@@ -56,10 +56,12 @@ def _single_channel(data: bytes, camera: Intrinsics, name: str) -> np.ndarray:
 
 
 def _decoded(data: bytes, camera: Intrinsics, name: str, mode: int) -> np.ndarray:
-    """Decodes only what its header says to be of the camera's size: others may be far larger than they look."""
+    """Decodes only what its header says to be of the camera's size: others may be far larger than they look. OpenCV
+    believes each part of a PNG how long it is, up to 2 GB, so one whose parts do not fit in is not given to it."""
     try:
-        _check_size(*told_size(data), camera, name)
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), mode)
+        width_px, height_px, _ = image_size(data)
+        _check_size(width_px, height_px, camera, name)
+        image = cv2.imdecode(np.frombuffer(trimmed(data), np.uint8), mode)
     except (cv2.error, ImageError):
         image = None
     if image is None:

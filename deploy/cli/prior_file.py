@@ -77,7 +77,7 @@ def read(path: Path) -> Prior:
             provenance=file.provenance,
             spread=spread,
         )
-    except (OSError, msgspec.MsgspecError, ValueError, TypeError) as error:
+    except (OSError, msgspec.MsgspecError, ValueError, TypeError, OverflowError, RecursionError) as error:
         raise PriorError(f"{path} is no usable prior: {error}") from error
 
 

@@ -11,7 +11,6 @@ import msgspec
 import numpy as np
 
 from prior_sg.schemas.codec import DecodeError, Message, decode, encode
-from prior_sg.schemas.frames import Keyframe
 from prior_sg.schemas.migrations import journalled
 from prior_sg.schemas.priors import Prior
 from prior_sg.schemas.status import Consumed, Started, Tick
@@ -57,7 +56,7 @@ def lives(journal: list[Consumed], service: str) -> list[Life]:
     found: dict[str, Life] = {}
     for entry in sorted((e for e in journal if e.service == service), key=lambda e: (e.instance, e.order)):
         if entry.topic == "START":
-            found[entry.instance] = Life(service, entry.instance, decode(Started, entry.inline))
+            found[entry.instance] = Life(service, entry.instance, _start(entry))
         elif entry.instance not in found:  # its start was not recorded: it cannot be replayed
             continue
         elif entry.topic == "STOP":
@@ -65,6 +64,13 @@ def lives(journal: list[Consumed], service: str) -> list[Life]:
         else:
             found[entry.instance].inputs.append(entry)
     return sorted(found.values(), key=lambda life: life.started.epoch)
+
+
+def _start(entry: Consumed) -> Started:
+    try:
+        return decode(Started, entry.inline)
+    except DecodeError as error:
+        raise LogError(f"the journal of {entry.instance} does not tell how it was started: {error}") from error
 
 
 class Log:
@@ -79,12 +85,12 @@ class Log:
         journal: list[Consumed] = []
         for logged in read_log(path, wanted):
             if logged.topic is JOURNAL:
-                journal.append(decode(Consumed, logged.payload))
+                journal.append(logged.message())
                 continue
             self.messages[logged.key, logged.writer, logged.sequence] = logged
             self.order.append(logged)
             if logged.topic is KEYFRAME:
-                self.frames[decode(Keyframe, logged.payload).frame_id] = logged
+                self.frames[logged.message().frame_id] = logged
         self.lives = lives(journal, service.name)
         self._versions = {life.instance: life.started.versions for life in self.lives}
 
@@ -103,7 +109,9 @@ class Log:
         errands = {errand.name: errand for errand in self.service.errands}
         if question := QUERY_BY_NAME.get(entry.topic) or errands.get(entry.topic):
             return journalled(question.reply, entry.inline, versions)
-        topic = TOPIC_BY_NAME[entry.topic]
+        topic = TOPIC_BY_NAME.get(entry.topic)
+        if topic is None:
+            raise LogError(f"the journal of {entry.instance} names {entry.topic!r}, which this program does not know")
         if topic.delivery == "job":
             logged = self.frames.get(entry.frame_id)
         elif not entry.writer:
@@ -112,7 +120,7 @@ class Log:
             logged = self.messages.get((entry.key, entry.writer, entry.sequence))
         if logged is None:
             raise LogError(f"the log lacks {entry.topic} {entry.sequence} of {entry.writer}, which was consumed")
-        return decode(topic.type, logged.payload)
+        return logged.message()
 
     def recorded(self, life: Life) -> dict[str, list[Message]]:
         """What this life published, by topic, in order."""
@@ -120,7 +128,7 @@ class Log:
         outputs: dict[str, list[Message]] = {}
         for logged in self.order:
             if logged.writer == writer:
-                outputs.setdefault(logged.topic.name, []).append(decode(logged.topic.type, logged.payload))
+                outputs.setdefault(logged.topic.name, []).append(logged.message())
         return outputs
 
 
@@ -242,7 +250,7 @@ def undisturbed(log: Log) -> Runner:
     runner = Runner(service, service.replay_config(service.config()), Identity("*", "undisturbed", 0))
     for logged in log.order:
         if logged.topic in service.reads:
-            runner.feed(decode(logged.topic.type, logged.payload))
+            runner.feed(logged.message())
     return runner
 
 

@@ -11,12 +11,12 @@ from prior_sg.deploy.api.history import History
 from prior_sg.deploy.showing.material import Cloud, Moment
 from prior_sg.schemas.codec import DecodeError, decode
 from prior_sg.schemas.frames import Keyframe, PoseUpdate
-from prior_sg.schemas.status import Consumed, Started
+from prior_sg.schemas.status import Started
 from prior_sg.schemas.topics import JOURNAL, KEYFRAME, POSE_UPDATE
 from prior_sg.services.deltas import PoseCorrections
 from prior_sg.services.images import MAX_PRINCIPAL_OFFSET, ImageFault, color_of, depth_of
 from prior_sg.services.refusals import InputRefused
-from prior_sg.services.runtime.record import read_log
+from prior_sg.services.runtime.record import LogError, read_log
 
 CLOUD_FRAMES, CLOUD_POINTS, PIXEL_STEP, CLOUD_VOXEL_M = 60, 400_000, 4, 0.04
 
@@ -81,7 +81,10 @@ def settings_of(log: Path) -> dict[str, dict[str, Any]]:
     """The settings each service of a log last started with. Raises LogError."""
     found: dict[str, dict[str, Any]] = {}
     for logged in read_log(log, (JOURNAL,)):
-        entry = decode(Consumed, logged.payload)
+        entry = logged.message()
         if entry.topic == "START":
-            found[entry.service] = msgspec.json.decode(decode(Started, entry.inline).config)
+            try:
+                found[entry.service] = msgspec.json.decode(decode(Started, entry.inline).config)
+            except (msgspec.MsgspecError, DecodeError, RecursionError) as error:
+                raise LogError(f"the settings of {entry.service} in {log} cannot be read: {error}") from error
     return dict(sorted(found.items()))

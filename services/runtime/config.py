@@ -10,6 +10,7 @@ import msgspec
 
 from prior_sg.services.errors import PriorSgError
 
+LONGEST_LINE = 10_000  # characters; the time to read a name of many parts grows with their square
 ENVIRONMENT_PREFIX = "PSG_"
 C = TypeVar("C", bound=msgspec.Struct)
 
@@ -23,8 +24,11 @@ def read_file(path: str | Path | None) -> dict[str, dict[str, Any]]:
     if not path:
         return {}
     try:
-        return tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        text = Path(path).read_text(encoding="utf-8-sig")
+        if (longest := max(map(len, text.splitlines()), default=0)) > LONGEST_LINE:
+            raise ConfigError(f"cannot read the configuration {path}: break its line of {longest} characters")
+        return tomllib.loads(text)
+    except (OSError, ValueError, RecursionError) as error:
         raise ConfigError(f"cannot read the configuration {path}: {error}") from error
 
 
@@ -91,7 +95,7 @@ def recorded(config_type: type[C], section: str, data: bytes) -> tuple[C, list[s
         values = msgspec.json.decode(data, type=dict[str, Any])
         notes = list(_kept(config_type, section, values))
         return msgspec.json.decode(msgspec.json.encode(values), type=config_type), notes
-    except (msgspec.MsgspecError, ValueError) as error:
+    except (msgspec.MsgspecError, ValueError, RecursionError) as error:
         raise ConfigError(f"the recorded config of {section} does not fit this program: {error}") from error
 
 
@@ -147,5 +151,5 @@ def _decoded(name: str, value: Any, kind: Any) -> Any:
         return value
     try:
         return msgspec.json.decode(value)
-    except msgspec.DecodeError as error:
-        raise ConfigError(f"{name}: {value!r} is not valid JSON: {error}") from error
+    except (msgspec.DecodeError, RecursionError) as error:
+        raise ConfigError(f"{name}: {value[:40]!r} is not valid JSON: {error}") from error

@@ -11,37 +11,31 @@ A log whose process was killed has no index at its end. It is read up to its las
 
 import json
 import logging
-import struct
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 from types import TracebackType
 from typing import Any, BinaryIO
 
 import msgspec
 import numpy as np
-import zstandard
-from mcap.data_stream import ReadDataStream
-from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.reader import SeekingReader
-from mcap.records import Attachment, Channel, Chunk, ChunkIndex, Message, Metadata, Schema
+from mcap.records import Channel, Message, Schema
 from mcap.stream_reader import breakup_chunk
-from mcap.summary import Summary
 from mcap.writer import MCAP0_MAGIC, Writer
 
-from prior_sg.schemas.codec import DecodeError, schema_name
+from prior_sg.schemas.codec import DecodeError, decode, schema_name
 from prior_sg.schemas.migrations import current
 from prior_sg.schemas.topics import TOPICS, Topic
 from prior_sg.services.errors import PriorSgError
+from prior_sg.services.runtime.chunks import DAMAGE, bounded, index_of, indexed_chunks, records
 
 CHUNK_BYTES = 1 << 20
 FLUSH_NS = 1_000_000_000  # of received time: what a killed process can lose
 SEQUENCE_MASK = 0xFFFFFFFF  # MCAP sequences are 32 bit
-DAMAGE = (McapError, ValueError, struct.error, zstandard.ZstdError, RuntimeError, MemoryError, OverflowError)
 ROS_PROFILE = b"ros2"
 
 logger = logging.getLogger(__name__)
@@ -62,6 +56,13 @@ class Logged:
     sent_ns: int
     received_ns: int
     payload: bytes
+
+    def message(self) -> Any:
+        """What was encoded. Raises LogError."""
+        try:
+            return decode(self.topic.type, self.payload)
+        except DecodeError as error:
+            raise LogError(f"the log is damaged: a message on {self.key} is none ({error})") from error
 
 
 @dataclass(frozen=True, slots=True)
@@ -227,7 +228,7 @@ def holds_ros(path: str | Path) -> bool:
 def holds_messages(path: str | Path) -> bool:
     """Whether an MCAP file of another program has schemas of ROS 2 or Foxglove. Raises LogError."""
     with _opened(path) as file:
-        index = _index(file)
+        index = index_of(file)
     if index is None or any("topic" in channel.metadata for channel in index.channels.values()):
         return False
     return any(
@@ -239,13 +240,13 @@ def holds_messages(path: str | Path) -> bool:
 def is_whole(path: str | Path) -> bool:
     """Whether a log was closed, and not cut off. Raises LogError."""
     with _opened(path) as file:
-        return _index(file) is not None
+        return index_of(file) is not None
 
 
 def _channels(path: str | Path) -> list[tuple[Channel, int]]:
     """Channels of an MCAP file of any program and how many messages each has."""
     with _opened(path) as file:
-        index = _index(file)
+        index = index_of(file)
         if index is not None and index.statistics is not None:
             channels, counts = index.channels, Counter(index.statistics.channel_message_counts)
         else:
@@ -267,13 +268,13 @@ def summary(path: str | Path) -> dict[str, int]:
 def attachments(path: str | Path) -> dict[str, bytes]:
     """Attached files by name. Raises LogError."""
     with _opened(path) as file:
-        return {record.name: record.data for record in _records(file, Opcode.ATTACHMENT)}
+        return {record.name: record.data for record in _whole_records(file, path, Opcode.ATTACHMENT)}
 
 
 def metadata(path: str | Path) -> dict[str, dict[str, str]]:
     """Named text fields. Raises LogError."""
     with _opened(path) as file:
-        return {record.name: record.metadata for record in _records(file, Opcode.METADATA)}
+        return {record.name: record.metadata for record in _whole_records(file, path, Opcode.METADATA)}
 
 
 @contextmanager
@@ -292,29 +293,31 @@ def _messages(
 ) -> Iterator[tuple[Channel, str, Message]]:
     """Messages with their channels and schema names, in file order; `wanted` names topics, None = all messages of any
     program."""
-    index = _index(file)
+    index = index_of(file)
     channels: dict[int, Channel] = {} if index is None else dict(index.channels)
     schemas: dict[int, str] = {} if index is None else {i: schema.name for i, schema in index.schemas.items()}
     if index is None:
         _say_cut_off(str(path))
-    for read in _all_chunks(file) if index is None else _indexed_chunks(file, index, wanted):
+    for read in records(file, Opcode.CHUNK) if index is None else indexed_chunks(file, index, wanted):
         try:
-            records = breakup_chunk(read(), validate_crc=True)
+            found = breakup_chunk(bounded(read()), validate_crc=True)
         except DAMAGE as error:
             if index is None:
                 return
-            fault = LogError(f"the log {path} is damaged: a chunk cannot be read ({error})")
-            if damaged is None:
-                raise fault from error
-            damaged(fault)
+            _tell(LogError(f"the log {path} is damaged: a chunk cannot be read ({error})"), damaged)
             continue
-        for record in records:
+        for record in found:
             if isinstance(record, Channel):
                 channels[record.id] = record
             elif isinstance(record, Schema):
                 schemas[record.id] = record.name
             elif isinstance(record, Message):
-                channel = channels[record.channel_id]
+                channel = channels.get(record.channel_id)
+                if channel is None:
+                    _tell(
+                        LogError(f"the log {path} is damaged: it does not describe the channel of a message"), damaged
+                    )
+                    break
                 if wanted is None or channel.metadata.get("topic") in wanted:
                     yield channel, schemas.get(channel.schema_id, ""), record
 
@@ -325,60 +328,15 @@ def _say_cut_off(path: str) -> None:
     logger.warning("the log %s was cut off: reading the part that is complete", path)
 
 
-def _index(file: BinaryIO) -> Summary | None:
-    """The index at the end of the file; None when the file was cut off."""
-    size = file.seek(0, 2)
-    if size < 3 * len(MCAP0_MAGIC):
-        return None
-    file.seek(-len(MCAP0_MAGIC), 2)
-    if file.read() != MCAP0_MAGIC:
-        return None
-    file.seek(0)
+def _tell(fault: LogError, damaged: Callable[[LogError], None] | None) -> None:
+    if damaged is None:
+        raise fault
+    damaged(fault)
+
+
+def _whole_records(file: BinaryIO, path: str | Path, wanted: Opcode) -> list[Any]:
+    """All records of one kind. Raises LogError."""
     try:
-        return SeekingReader(file, record_size_limit=size).get_summary()
-    except DAMAGE:
-        return None
-
-
-def _all_chunks(file: BinaryIO) -> Iterator[Callable[[], Chunk]]:
-    for chunk in _records(file, Opcode.CHUNK):
-        yield partial(_same, chunk)
-
-
-def _same(chunk: Chunk) -> Chunk:
-    return chunk
-
-
-def _chunk_at(file: BinaryIO, offset: int) -> Chunk:
-    file.seek(offset)
-    chunk: Chunk = Chunk.read(ReadDataStream(file))
-    return chunk
-
-
-def _indexed_chunks(file: BinaryIO, index: Summary, wanted: set[str] | None) -> Iterator[Callable[[], Chunk]]:
-    """What reads each chunk, for one that is damaged must not hide those behind it."""
-    ids = {i for i, channel in index.channels.items() if wanted is None or channel.metadata.get("topic") in wanted}
-
-    def holds(chunk: ChunkIndex) -> bool:
-        return not ids.isdisjoint(chunk.message_index_offsets)
-
-    for chunk in sorted(filter(holds, index.chunk_indexes), key=lambda chunk: chunk.chunk_start_offset):
-        yield partial(_chunk_at, file, chunk.chunk_start_offset + struct.calcsize("<BQ"))
-
-
-def _records(file: BinaryIO, wanted: Opcode) -> Iterator[Any]:
-    """Complete records of one kind, in file order, without the help of an index."""
-    readers: dict[Opcode, Any] = {Opcode.CHUNK: Chunk, Opcode.ATTACHMENT: Attachment, Opcode.METADATA: Metadata}
-    size = file.seek(0, 2)
-    start = len(MCAP0_MAGIC)
-    while True:
-        file.seek(start)
-        head = file.read(struct.calcsize("<BQ"))
-        if len(head) < struct.calcsize("<BQ"):
-            return
-        opcode, length = struct.unpack("<BQ", head)
-        start += len(head) + length
-        if start > size or opcode in (0, Opcode.DATA_END):
-            return
-        if opcode == wanted:
-            yield readers[wanted].read(ReadDataStream(file))
+        return [read() for read in records(file, wanted)]
+    except DAMAGE as error:
+        raise LogError(f"the log {path} is damaged: its {wanted.name.lower()} cannot be read ({error})") from error
