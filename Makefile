@@ -8,7 +8,7 @@ WORKERS ?= 2
 # One process compiles for all others, whatever the caller's shell says.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo test coverage test-llm check loops bench manifests images sbom chaos clean
+.PHONY: demo test test-long coverage test-llm check loops bench manifests images sbom chaos clean
 .DEFAULT_GOAL := demo
 
 demo: $(VENV)/installed
@@ -17,6 +17,10 @@ demo: $(VENV)/installed
 test: $(VENV)/installed-dev
 	$(MAKE) --no-print-directory -j 2 check loops
 	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
+
+# Two hosts, and every service exchanged in mid-run: minutes, as root.
+test-long: $(VENV)/installed-dev
+	PSG_TEST_LONG=1 $(BIN)/python -m pytest tests/test_hosts.py tests/test_exchange.py
 
 # Shares of the cores that tests run; measuring makes them half as slow again.
 coverage: $(VENV)/installed-dev

@@ -6,6 +6,7 @@ import pytest
 from prior_sg.deploy.benches.exchange import ROUTER, ROWS, Running
 from prior_sg.deploy.benches.same_scene import same
 from prior_sg.services.runtime.jobs.dispatcher import CREDITS
+from tests.help.long import long_run
 from tests.test_pipeline import shortened
 
 FRAMES = 30
@@ -14,6 +15,7 @@ SPEED = 0.5
 IN_TURN = [row for row in ROWS if row != "ingest"]  # whose successor needs what it has kept on disk
 
 
+@long_run
 @pytest.mark.timeout(1200)  # of many processes, on a machine as busy as may be
 def test_every_service_is_exchanged_in_mid_run_and_nothing_is_lost(tmp_path):
     source = tmp_path / "source.mcap"

@@ -5,6 +5,7 @@ import time
 import pytest
 
 from tests.help.hosts import Network
+from tests.help.long import long_run
 from tests.help.two_hosts import TwoHosts, alone, differences
 
 FRAMES, CUT_S = 8, 10.0
@@ -16,6 +17,7 @@ def pair(tmp_path):
         yield TwoHosts(tmp_path, network, FRAMES, speed=0.5)
 
 
+@long_run
 @pytest.mark.timeout(1800)
 def test_two_hosts_by_the_documented_commands_lose_nothing_to_a_link_that_is_cut(pair, tmp_path):
     assert "regions for 'serve drinks' after" in pair.begin()

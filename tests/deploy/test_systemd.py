@@ -9,7 +9,7 @@ import pytest
 from prior_sg.deploy.cli.main import build_parser
 from prior_sg.deploy.inspecting.compose import ON_ROBOT
 from prior_sg.deploy.running.notify import EVERY_S
-from prior_sg.deploy.running.serve import EXIT_HOPELESS
+from prior_sg.deploy.running.serve import EXIT_HOPELESS, EXIT_YIELDED
 from prior_sg.services.registry import BY_NAME
 from tests.help.paths import ROOT
 
@@ -31,7 +31,7 @@ def settings_of(name):
 
 def test_the_unit_agrees_with_the_program():
     service = unit()
-    assert service["RestartPreventExitStatus"] == str(EXIT_HOPELESS)
+    assert service["RestartPreventExitStatus"] == f"{EXIT_HOPELESS} {EXIT_YIELDED}"
     assert float(service["WatchdogSec"]) > 2 * EVERY_S
 
 

@@ -10,7 +10,7 @@ from tests.fuzz import child
 from tests.fuzz.decoders import DECODERS
 from tests.fuzz.trial import CORPUS, Decoder, Tally, tried
 
-IN_ALL = 25_000
+IN_ALL = 8_000
 WHOLE = sum(decoder.share for decoder in DECODERS)
 
 

@@ -33,7 +33,7 @@ def test_who_lacks_what_can_come_back_is_started_again_and_again(tmp_path, monke
     codes = [EXIT_LATER] * 3 * GIVE_UP_AFTER + [EXIT_HOPELESS, EXIT_LATER]
     said = checked(tmp_path, monkeypatch, codes)
     assert sum("restarted" in text for text in said) == len(codes) - 1
-    assert said[0] == "scene_store-1 ended (exit status 4): the disk is full; restarting"
+    assert said[0] == f"scene_store-1 ended (exit status {EXIT_LATER}): the disk is full; restarting"
 
 
 @pytest.mark.parametrize("codes", [[EXIT_HOPELESS], [1] * GIVE_UP_AFTER, [EXIT_LATER, 1, EXIT_HOPELESS]])

@@ -25,7 +25,8 @@ from prior_sg.services.runtime.bus import BusError, Sample, pack_header
 from prior_sg.services.runtime.client import BusClient
 from prior_sg.services.runtime.endpoints import free_endpoint
 from prior_sg.services.runtime.host import limits
-from prior_sg.services.runtime.host.host import MOST_QUESTIONS, Host
+from prior_sg.services.runtime.host.answering import MOST_QUESTIONS
+from prior_sg.services.runtime.host.host import Host
 from prior_sg.services.runtime.host.limits import Limits
 from prior_sg.services.runtime.host.replays import Replays
 from prior_sg.services.runtime.service import Identity, Service

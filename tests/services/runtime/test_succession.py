@@ -96,11 +96,11 @@ def test_a_worker_that_yields_finishes_its_jobs_and_no_job_is_done_twice(endpoin
             with client:
                 for number in range(30):
                     client.publish(KEYFRAME, of("yield1", number))
-                await until(lambda: len(first._state) > 2)
+                await until(lambda: len(first._state or ()) > 2)
                 second = await here.start(WORKER, "w2", succeeds="w1")
                 await here.ended(first)
                 assert first.yielded and not second.yielded
-                await until(lambda: len(first._state) + len(second._state) >= 30)
+                await until(lambda: len(first._state) + len(second._state or ()) >= 30)
             assert sorted(first._state + second._state) == list(range(30))
             assert len(second._state) > 2
 
