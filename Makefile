@@ -18,9 +18,11 @@ test: $(VENV)/installed-dev
 	$(MAKE) --no-print-directory -j 2 check loops
 	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
 
-# Two hosts, and every service exchanged in mid-run: minutes, as root.
+# Two hosts (as root), every service exchanged in mid-run, a system disturbed, more robots: minutes.
 test-long: $(VENV)/installed-dev
-	PSG_TEST_LONG=1 $(BIN)/python -m pytest tests/test_hosts.py tests/test_exchange.py
+	PSG_TEST_LONG=1 $(BIN)/python -m pytest tests/test_hosts.py tests/test_exchange.py tests/test_encoder_swap.py \
+		tests/test_ros_robot.py tests/chaos tests/services/ingest/test_ros_live_robots.py tests/deploy/keys \
+		tests/deploy/evaluation
 
 # Shares of the cores that tests run; measuring makes them half as slow again.
 coverage: $(VENV)/installed-dev

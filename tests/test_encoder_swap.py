@@ -11,6 +11,7 @@ from prior_sg.schemas.priors import Task
 from prior_sg.schemas.topics import INGEST_STATE, PYRAMID, REGION_DELTA, TASK
 from prior_sg.services.runtime.client import BusClient
 from prior_sg.services.runtime.zenoh_bus import ZenohBus
+from tests.help.long import long_run
 from tests.help.world import Reader
 from tests.test_pipeline import shortened
 
@@ -73,6 +74,7 @@ def system(tmp_path, endpoint):
             supervisor.stop()
 
 
+@long_run
 def test_a_new_encoder_takes_over_and_the_old_one_may_go(system, endpoint):
     first, second = system
     with BusClient(ZenohBus(endpoint)) as client:

@@ -19,6 +19,7 @@ from prior_sg.services.ingest.sources import open_source
 from prior_sg.services.runtime.record import LogWriter, read_log
 from prior_sg.services.runtime.ros.session import RosSession
 from prior_sg.services.runtime.ros.wire import SUBSCRIPTION
+from tests.help.long import long_run
 from tests.help.paths import ROOT, SAMPLE
 
 FRAMES = 2
@@ -57,6 +58,7 @@ def scene_of(source):
         return scene
 
 
+@long_run
 def test_a_node_of_ros_gives_the_scene_of_the_file(log, endpoint):
     relay = started("tests.help.relay", endpoint, *(f"{topic}={name}" for topic, name in TYPES.items()))
     robot = started("tests.help.rclpy_robot", log, FRAMES)

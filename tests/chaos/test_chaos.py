@@ -22,6 +22,7 @@ from tests.chaos.streams import ROBOT, made
 from tests.chaos.system import SETTINGS, TASK
 from tests.chaos.voyage import GRID, Hit, Outcome, Reference, sailed
 from tests.help.examples import EXAMPLES
+from tests.help.long import long_run
 
 EXACT = dict.fromkeys(ASPECTS, 1.0) | dict.fromkeys(LASTING, 0.0)
 FRAMES = 4 * GRID
@@ -56,6 +57,7 @@ def undisturbed(stream, tmp_path_factory):
         return run(job, Console(quiet=True)).scene
 
 
+@long_run
 @pytest.mark.timeout(280)
 def test_a_disturbed_system_maps_what_an_undisturbed_one_does(stream, undisturbed, tmp_path):
     known = Reference(scenes={FRAMES: encode(undisturbed)}, tolerance=EXACT, resident_mb={})

@@ -18,6 +18,7 @@ from prior_sg.deploy.evaluation.simulated import simulated as encoder_of
 from prior_sg.deploy.truth import GroundTruth, TrueObject
 from prior_sg.schemas.features import Pyramid
 from prior_sg.schemas.frames import Intrinsics
+from tests.help.long import long_run
 from tests.help.paths import SAMPLE
 
 CAMERA = Intrinsics(width_px=640, height_px=480, fx_px=400.0, fy_px=400.0, cx_px=319.5, cy_px=239.5)
@@ -218,6 +219,7 @@ def test_worlds_out_of_doors_are_mapped_as_such(tmp_path):
     assert presets == ["outdoor", "indoor", "indoor"]
 
 
+@long_run
 def test_sequences_under_a_simulated_encoder(tmp_path):
     sample = of_sequence(SAMPLE, "residential home", "tidy up")
     seen = simulated_perception(sample, "sim:0.3", folder=tmp_path)
@@ -234,6 +236,7 @@ def test_sequences_under_a_simulated_encoder(tmp_path):
         simulated_perception(sample, "conse", folder=tmp_path)
 
 
+@long_run
 def test_eval_compares_methods_on_worlds_side_by_side(tmp_path, capsys):
     arguments = ["eval", "world:home:0-1", "--methods", "ours,argmax", "--encoder", "sim:0.3", "--out", str(tmp_path)]
     arguments += ["--set", "place_graph.voxel_m=0.2"]  # coarse, for time

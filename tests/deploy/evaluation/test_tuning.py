@@ -10,6 +10,7 @@ from prior_sg.deploy.evaluation import methods
 from prior_sg.deploy.evaluation.errors import EvaluationError
 from prior_sg.deploy.evaluation.tune_command import combinations, score_of, verdict
 from prior_sg.deploy.evaluation.tuning import grouped, mean_and_error, tuned
+from tests.help.long import long_run
 
 ONE = {"a": 0.9, "b": 0.2, "c": 0.3}
 TWO = {"a": 0.1, "b": 0.5, "c": 0.4}
@@ -81,6 +82,7 @@ def test_settings_of_baselines_are_checked(changes, message):
         methods.baseline("clio", 0, changes)
 
 
+@long_run
 def test_tune_judges_ours_and_a_baseline_on_worlds(tmp_path, capsys):
     arguments = ["tune", "world:home:0-1", "--encoder", "sim:0.3", "--methods", "ours,argmax", "--out", str(tmp_path)]
     arguments += ["--set", "place_graph.voxel_m=0.2"]  # coarse, for time

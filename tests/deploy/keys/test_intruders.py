@@ -3,8 +3,10 @@
 import pytest
 
 from tests.help.intruder_rows import ROWS, table
+from tests.help.long import long_run
 
 
+@long_run
 @pytest.mark.timeout(900)
 def test_intruders_are_refused_and_told(tmp_path):
     rows = list(table(tmp_path))

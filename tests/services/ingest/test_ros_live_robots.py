@@ -22,6 +22,7 @@ from prior_sg.services.place_graph.core.volume.grid import OCCUPIED
 from prior_sg.services.registry import BY_NAME
 from prior_sg.services.runtime.runner import Runner
 from tests.help.bags import Maker
+from tests.help.long import long_run
 from tests.help.robot import Robot
 from tests.help.room import CAMERA
 from tests.help.two_eyed import NAMES, REAR_CAMERA, add_camera, base_of, two_eyed
@@ -58,7 +59,14 @@ def assert_alike(frames, recorded):
         assert np.abs(one.world_from_camera - other.world_from_camera).max() < 1e-9
 
 
-@pytest.mark.parametrize(("pictures", "message", "domain"), [(True, cloud, 21), (False, cloud, 22), (True, livox, 23)])
+@pytest.mark.parametrize(
+    ("pictures", "message", "domain"),
+    [
+        (True, cloud, 21),
+        pytest.param(False, cloud, 22, marks=long_run),
+        pytest.param(True, livox, 23, marks=long_run),
+    ],
+)
 def test_clouds_of_a_robot_give_the_frames_of_their_recording(endpoint, tmp_path, pictures, message, domain):
     maker = driven(pictures=pictures, message=message)
     recorded = [frame for frame in open_source(maker.write(tmp_path)) if isinstance(frame, RawFrame)]

@@ -135,12 +135,11 @@ def test_a_flood_of_one_robot_costs_another_nothing(endpoint, caplog):
                         client.publish(TASK, task("good", number + 1))
 
             await asyncio.to_thread(flood)
-            end_s = time.monotonic() + 20
-            while sum(one.robot == "good" for one in seen) < 50:
+            end_s, counts = time.monotonic() + 60, host.inbox.of("TASK")
+            while sum(one.robot == "good" for one in seen) < 50 or counts.limited <= 30_000:
                 assert time.monotonic() < end_s
                 await asyncio.sleep(0.05)
-            counts = host.inbox.of("TASK")
-            assert counts.limited > 30_000 and sum(one.robot == "bad" for one in seen) < 5_000
+            assert sum(one.robot == "bad" for one in seen) < 5_000
             assert counts.missed == 0
         host.stop()
         await running
