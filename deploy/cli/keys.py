@@ -5,7 +5,17 @@ import json
 import time
 from pathlib import Path
 
-from prior_sg.deploy.cli.shared import Commands, Run, add_bus, add_router, console, until_interrupted, wait, writing
+from prior_sg.deploy.cli.shared import (
+    Commands,
+    Run,
+    add_bus,
+    add_router,
+    console,
+    reach_of,
+    until_interrupted,
+    wait,
+    writing,
+)
 from prior_sg.deploy.errors import UserError
 from prior_sg.services.folders import user_settings
 
@@ -131,10 +141,9 @@ def _list(arguments: argparse.Namespace) -> int:
 
 
 def _router(arguments: argparse.Namespace) -> int:
-    from prior_sg.deploy.keys.routing import beyond_this_host
     from prior_sg.services.runtime.zenoh_bus import check_router, open_router, router_settings
 
-    beyond = beyond_this_host(arguments.listen, arguments.join, arguments.thin_link)
+    beyond = reach_of(arguments)
     if arguments.write is not None:
         check_router(arguments.connect, beyond)
         with writing(arguments.write):

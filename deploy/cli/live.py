@@ -8,7 +8,16 @@ from prior_sg.deploy.cli.check import before_start
 from prior_sg.deploy.cli.doors import API_PORT, port_in
 from prior_sg.deploy.cli.jobs import add_run_options, settings_of
 from prior_sg.deploy.cli.ros_results import add_ros, bridge_arguments, check_ros
-from prior_sg.deploy.cli.shared import Commands, add_bus, add_router, console, open_client, until_interrupted, wait
+from prior_sg.deploy.cli.shared import (
+    Commands,
+    add_bus,
+    add_router,
+    console,
+    open_client,
+    reach_of,
+    until_interrupted,
+    wait,
+)
 from prior_sg.deploy.cli.source_options import add_source_options, read_options
 from prior_sg.deploy.cli.watching import add_metrics, check_metrics, open_metrics
 from prior_sg.deploy.edge import names_in
@@ -102,43 +111,18 @@ def cmd_up(arguments: argparse.Namespace) -> int:
 
 
 def _stay_up(arguments: argparse.Namespace, names: list[str]) -> int:
-    from prior_sg.deploy.keys.routing import beyond_this_host
-    from prior_sg.deploy.running.job import KEYFRAMES, require_files
+    from prior_sg.deploy.running.job import require_files
     from prior_sg.deploy.running.roll import Roll
     from prior_sg.deploy.running.supervisor import Supervisor
     from prior_sg.deploy.running.swaps import RouterHere, Swaps
-    from prior_sg.deploy.settings import check_settings
-    from prior_sg.schemas.topics import KEYFRAME
-    from prior_sg.services.ingest.core.options import is_live
     from prior_sg.services.registry import BY_NAME
 
     require_files()
-    beyond = beyond_this_host(arguments.listen, arguments.join, arguments.thin_link)
-    if beyond is not None and (own := beyond.bundle.own).role == "robot" and own.name != arguments.robot:
-        raise UserError(f"these keys are of {own.name}, which writes nothing of {arguments.robot}; use --robot")
-    mappers = [name for name in names if KEYFRAME in BY_NAME[name].reads]
-    if arguments.thin_link and mappers and "ingest" not in names:
-        raise UserError(f"{mappers[0]} needs every keyframe, and a thin link carries none: run it where ingest runs")
-    if beyond is not None and arguments.no_router:
-        raise UserError("--listen and --join are of the router that `up` starts; leave out --no-router")
-    settings = [
-        f"scene_store.path={arguments.out / 'scene.sqlite'}",
-        f"ingest.archive_path={arguments.out / KEYFRAMES}",
-        f"ingest.speed={arguments.speed}",
-    ]
-    if arguments.source:
-        if not is_live(arguments.source):  # a robot may come later, through the router that is started here
-            before_start(arguments.source, read_options(arguments), console)
-        settings.append(f"ingest.source={arguments.source}")
-    settings += settings_of(arguments)
-    check_settings(arguments.config, settings)
+    _check_place(arguments, names)
+    settings = _settings(arguments)
     if arguments.no_router:
         open_client(arguments.connect).bus.close()  # finds out at once whether a router is there
-    router = (
-        None
-        if arguments.no_router
-        else RouterHere(arguments.connect, lambda: beyond_this_host(arguments.listen, arguments.join))
-    )
+    router = None if arguments.no_router else RouterHere(arguments.connect, lambda: reach_of(arguments))
     supervisor = Supervisor(arguments.connect, arguments.robot, arguments.out / "logs", settings, arguments.config)
     client = open_client(arguments.connect)
     roll = Roll(client.bus)
@@ -169,6 +153,41 @@ def _stay_up(arguments: argparse.Namespace, names: list[str]) -> int:
         client.bus.close()
         if router is not None:
             router.stop()
+
+
+def _check_place(arguments: argparse.Namespace, names: list[str]) -> None:
+    """That these services can run here, with these keys and this link. Raises UserError."""
+    from prior_sg.schemas.topics import KEYFRAME
+    from prior_sg.services.registry import BY_NAME
+
+    beyond = reach_of(arguments)
+    if beyond is not None and (own := beyond.bundle.own).role == "robot" and own.name != arguments.robot:
+        raise UserError(f"these keys are of {own.name}, which writes nothing of {arguments.robot}; use --robot")
+    mappers = [name for name in names if KEYFRAME in BY_NAME[name].reads]
+    if arguments.thin_link and mappers and "ingest" not in names:
+        raise UserError(f"{mappers[0]} needs every keyframe, and a thin link carries none: run it where ingest runs")
+    if beyond is not None and arguments.no_router:
+        raise UserError("--listen and --join are of the router that `up` starts; leave out --no-router")
+
+
+def _settings(arguments: argparse.Namespace) -> list[str]:
+    """Of the services. Raises UserError, SourceError."""
+    from prior_sg.deploy.running.job import KEYFRAMES
+    from prior_sg.deploy.settings import check_settings
+    from prior_sg.services.ingest.core.options import is_live
+
+    settings = [
+        f"scene_store.path={arguments.out / 'scene.sqlite'}",
+        f"ingest.archive_path={arguments.out / KEYFRAMES}",
+        f"ingest.speed={arguments.speed}",
+    ]
+    if arguments.source:
+        if not is_live(arguments.source):  # a robot may come later, through the router that is started here
+            before_start(arguments.source, read_options(arguments), console)
+        settings.append(f"ingest.source={arguments.source}")
+    settings += settings_of(arguments)
+    check_settings(arguments.config, settings)
+    return settings
 
 
 def _tell(supervisor: "Supervisor", roll: "Roll", restart_hung: bool, swaps: "Swaps | None" = None) -> None:

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from _typeshed import SupportsWrite
 
     from prior_sg.services.runtime.client import BusClient
+    from prior_sg.services.runtime.keys import Beyond
 
 POLL_S = 0.2
 console = Terminal()
@@ -78,6 +79,13 @@ def add_router(parser: argparse.ArgumentParser) -> None:
         help="bits per second that links to other hosts carry, as 2M or 500k, at both ends: what is urgent overtakes, "
         "states come less often, keyframes stay on their host",
     )
+
+
+def reach_of(arguments: argparse.Namespace) -> "Beyond | None":
+    """How such a router reaches others. Raises UserError, BusError."""
+    from prior_sg.deploy.keys.routing import beyond_this_host
+
+    return beyond_this_host(arguments.listen, arguments.join, arguments.thin_link)
 
 
 def rate_in(text: str) -> float:

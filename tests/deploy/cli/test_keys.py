@@ -7,6 +7,7 @@ import pytest
 import zenoh
 
 from prior_sg.deploy.cli.main import main
+from prior_sg.services.runtime.bus import BusError
 from prior_sg.services.runtime.keys import VARIABLE
 
 
@@ -63,3 +64,19 @@ def test_a_router_for_others_needs_keys_and_can_be_written_for_zenohd(said, tmp_
         said("router", "--thin-link", "fast")
     words = ("up", "ingest", "--robot", "robot8", "--join", "tls/127.0.0.1:7448", "--out", str(tmp_path / "out"))
     assert "these keys are of robot7" in said(*words, "--keys", str(bundles / "robot7"))[1]
+
+
+def test_the_router_of_up_knows_of_a_thin_link(said, tmp_path, monkeypatch):
+    reached = []
+
+    def open_router(endpoint, beyond):
+        reached.append(beyond)
+        raise BusError("seen")
+
+    monkeypatch.setattr("prior_sg.deploy.running.swaps.open_router", open_router)
+    said("keys", "init")
+    said("keys", "add", "edge", "edge1")
+    keys = str(tmp_path / "prior-sg/keys/bundles/edge1")
+    words = ("up", "prior_gateway", "--listen", "tls/127.0.0.1:7448", "--keys", keys, "--out", str(tmp_path / "out"))
+    assert said(*words, "--thin-link", "2M")[1].endswith("seen")
+    assert [one.thin_bps for one in reached] == [2e6]
