@@ -24,6 +24,7 @@ def add_commands(commands: Commands) -> None:
     _add_results(commands)
     _add_logs(commands)
     _add_system(commands)
+    _add_measuring(commands)
 
 
 def _add_results(commands: Commands) -> None:
@@ -90,6 +91,8 @@ def _add_system(commands: Commands) -> None:
     only.add_argument("--router", action="store_true", help="only whether the router answers")
     add_bus(health, robot=False)
 
+
+def _add_measuring(commands: Commands) -> None:
     evaluation.add_arguments(
         commands.add(
             "eval",
@@ -120,7 +123,7 @@ def _add_system(commands: Commands) -> None:
     bench.add_argument(
         "name",
         help="bus, places, features, kernel, swap, segmenter, task, learning, encoder_swap, queries, e2e, store, all "
-        "of these, or pool, store_crashes, lidar, view, hydra",
+        "of these, or exchange, pool, store_crashes, lidar, view, hydra",
     )
     bench.add_argument("--seconds", type=float, default=300.0, help="how long pool lasts (default: %(default)s)")
     bench.add_argument("--json", action="store_true", help="print one JSON object per measurement")
