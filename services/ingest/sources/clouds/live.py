@@ -11,13 +11,13 @@ import numpy as np
 
 from prior_sg.services.geometry import inverse, transform
 from prior_sg.services.ingest.core.clouds.upsampling import upsampled
-from prior_sg.services.ingest.core.clouds.views import VIEW, lidar_from_views, looked_at, seen
+from prior_sg.services.ingest.core.clouds.views import VIEW, looked_at
 from prior_sg.services.ingest.core.poses import Convention
 from prior_sg.services.ingest.core.ros.assembly import Posed, Rules, Shot
 from prior_sg.services.ingest.core.ros.images import color_file
 from prior_sg.services.ingest.core.ros.motions import Motions
 from prior_sg.services.ingest.core.ros.topics import Chosen
-from prior_sg.services.ingest.sources.base import Camera, FrameError, Images, SourceError
+from prior_sg.services.ingest.sources.base import Camera, Images
 from prior_sg.services.ingest.sources.cameras import straight_maps
 from prior_sg.services.ingest.sources.clouds.swept import USUAL_PERIOD_NS, VIEW_STEP_NS, Drawing, Lidar
 from prior_sg.services.ingest.sources.ros.reader import Reader
@@ -108,21 +108,6 @@ def lidar_of(reader: Reader, choice: Chosen, rules: Rules, motions: Motions, clo
         return motions.at(way, stamp_ns, rules.pose_within_ns)
 
     return Lidar([cloud.stamp_ns], lambda _: reader.sweep(cloud, choice.depth), world_from_lidar)
-
-
-def used_views(reader: Reader, choice: Chosen, clouds: Sequence[Shot]) -> list[np.ndarray]:
-    """The views into which points fall, of the first cloud that has any. Raises SourceError."""
-    reason = "none came"
-    for cloud in clouds:
-        try:
-            points_lidar = reader.sweep(cloud, choice.depth).points_lidar
-        except FrameError as error:
-            reason = str(error)
-            continue
-        if used := [view for view in lidar_from_views() if seen(points_lidar, view)]:
-            return used
-        reason = f"the first have {len(points_lidar)} points"
-    raise SourceError(f"none of the clouds of {choice.depth.name} can be used: {reason}")
 
 
 def _seen_from(lidar_from_view: np.ndarray, world_from_lidar: np.ndarray) -> np.ndarray:

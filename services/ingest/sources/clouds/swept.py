@@ -1,6 +1,6 @@
 """Frames of a lidar: its sweeps drawn into a camera's images, or into views of its own where there is no camera."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 
@@ -84,7 +84,8 @@ def view_entries(lidar: Lidar, options: ReadOptions) -> tuple[Camera, list[Entry
     """Frames without colour for a lidar without a camera, and a note on them. Raises SourceError."""
     poses = [_posed(lidar, stamp_ns) for stamp_ns in lidar.stamps_ns]
     chosen = looked_at(lidar.stamps_ns, poses)
-    views = _used_views(lidar, chosen)
+    sweeps = (partial(lidar.read, position) for position in chosen[:TRIED])
+    views = used_views(sweeps, f"{len(lidar.stamps_ns)} sweeps", "none has a pose")
     entries: list[Entry] = []
     for position in chosen:
         for number, lidar_from_view in enumerate(views):
@@ -98,19 +99,21 @@ def view_entries(lidar: Lidar, options: ReadOptions) -> tuple[Camera, list[Entry
     return Camera(VIEW), entries, note
 
 
-def _used_views(lidar: Lidar, chosen: Sequence[int]) -> list[np.ndarray]:
-    """The views into which points fall. Raises SourceError."""
-    reason = "none has a pose"
-    for position in chosen[:TRIED]:
+def used_views(sweeps: Iterable[Callable[[], Sweep]], of: str, otherwise: str) -> list[np.ndarray]:
+    """The views into which points fall, of the first sweep that has any; each raises FrameError or CloudError where it
+    cannot be read. Raises SourceError, which says `of` what and, of none at all, `otherwise`.
+    """
+    reason = otherwise
+    for read in sweeps:
         try:
-            points_lidar = lidar.read(position).points_lidar
+            points_lidar = read().points_lidar
         except (FrameError, CloudError) as error:
             reason = str(error)
             continue
         if used := [view for view in lidar_from_views() if seen(points_lidar, view)]:
             return used
         reason = f"the first have {len(points_lidar)} points"
-    raise SourceError(f"none of the {len(lidar.stamps_ns)} sweeps can be used: {reason}")
+    raise SourceError(f"none of the {of} can be used: {reason}")
 
 
 def _posed(lidar: Lidar, stamp_ns: int) -> np.ndarray | None:

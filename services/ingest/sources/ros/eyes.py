@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -29,8 +30,9 @@ from prior_sg.services.ingest.core.ros.topics import (
 )
 from prior_sg.services.ingest.core.ros.transforms import Stamped, TransformTree
 from prior_sg.services.ingest.sources.base import MILLIMETRE, Camera, Found, FrameError, Images, SourceError
-from prior_sg.services.ingest.sources.clouds.live import Around, Drawn, Shower, period_ns, used_views
+from prior_sg.services.ingest.sources.clouds.live import Around, Drawn, Shower, period_ns
 from prior_sg.services.ingest.sources.clouds.ros import EDGE_NS
+from prior_sg.services.ingest.sources.clouds.swept import used_views
 from prior_sg.services.ingest.sources.normalise import Samples, beside, prepare
 from prior_sg.services.ingest.sources.normaliser import UNUSABLE, Normaliser
 from prior_sg.services.ingest.sources.ros.look import Look
@@ -210,7 +212,8 @@ def _of_cloud(heard: Heard, choice: Chosen, rig: Rig, way: Way) -> tuple[Camera,
     cloud_way = way if choice.alone else heard.way(choice.depth.frame, rig.tree)
     rules = Rules(way, sweep_ns, max(rig.within_ns, EDGE_NS), cloud_way, sweep_ns)
     if choice.alone:
-        views = used_views(heard.reader, choice, clouds)
+        sweeps = (partial(heard.reader.sweep, cloud, choice.depth) for cloud in clouds)
+        views = used_views(sweeps, f"clouds of {choice.depth.name}", "none came")
         how = f"there is no camera: sweeps are looked at in {len(views)} views of 90 degrees"
         how += ", and places have no appearance"
         return Camera(VIEW), rules, Around(heard.reader, choice, rules, views).begin, how
