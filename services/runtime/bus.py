@@ -18,6 +18,7 @@ from prior_sg.schemas.topics import Topic
 from prior_sg.services.errors import PriorSgError
 
 HEADER = struct.Struct("<Qq")
+NOBODY = "nobody"  # the reason of a call that found no server
 WRITER = re.compile(r"[\w.:-]+(/[\w.:-]+)*")
 LONGEST_WRITER = 256  # bytes of a writer's name and its context
 TRACEPARENT = re.compile(r"00-(?!0{32})[0-9a-f]{32}-(?!0{16})[0-9a-f]{16}-[0-9a-f]{2}")
@@ -221,7 +222,7 @@ class LocalBus:
         with self._hub.lock:
             server = next((s for pattern, (_, s) in self._hub.servers.items() if key_matches(pattern, key)), None)
         if server is None:
-            on_answer(Answer(None, "nobody"))
+            on_answer(Answer(None, NOBODY))
         else:
             server(LocalRequest(payload, key, on_answer))
 

@@ -27,13 +27,12 @@ from prior_sg.schemas.topics import (
     swap_key,
 )
 from prior_sg.services.errors import PriorSgError
-from prior_sg.services.runtime.bus import Answer, Bus, BusError, Sample, message_in, pack_header
+from prior_sg.services.runtime.bus import NOBODY, Answer, Bus, BusError, Sample, message_in, pack_header
 from prior_sg.services.runtime.host.lease import Standing, standing
 from prior_sg.services.runtime.signatures import Unsigned, signatures_in_force
 
 R = TypeVar("R", bound=Message)
 POLL_S = 0.5
-NOBODY = "nobody"  # the reason of a call that found no server
 STAMP_TIMEOUT_S = 2.0
 STAMP_TRIES = 5  # of a store that is there and busy
 PATIENT_POLLS = 4

@@ -22,6 +22,7 @@ from prior_sg.schemas.codec import Message, Refused, schema_name
 from prior_sg.schemas.migrations import received
 from prior_sg.schemas.topics import LARGEST, MB, Query, Topic, called_on, called_with
 from prior_sg.services.runtime.bus import (
+    NOBODY,
     Answer,
     BusError,
     OnAlive,
@@ -380,12 +381,12 @@ def _answer_once(kind: type[Message] | None, on_answer: OnAnswer) -> Any:
         if reply.ok is not None:
             on_answer(Answer(_payload(kind, reply.ok.payload, reply.ok.encoding)))
         else:
-            reason = reply.err.payload.to_string() if reply.err is not None else "nobody"
+            reason = reply.err.payload.to_string() if reply.err is not None else NOBODY
             on_answer(Answer(None, "timeout" if reason == "Timeout" else reason))
 
     def finish() -> None:
         if not answered.is_set():
             answered.set()
-            on_answer(Answer(None, "nobody"))
+            on_answer(Answer(None, NOBODY))
 
     return zenoh.handlers.Callback(receive, finish)

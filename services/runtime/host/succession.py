@@ -13,13 +13,14 @@ from dataclasses import dataclass
 from prior_sg.schemas.codec import DecodeError, decode, encode
 from prior_sg.schemas.succession import Bequest, YieldRequest
 from prior_sg.schemas.topics import alive_key, yield_key
-from prior_sg.services.runtime.bus import Answer, Bus
+from prior_sg.services.runtime.bus import NOBODY, Answer, Bus
 from prior_sg.services.runtime.host.lease import Lease
 from prior_sg.services.runtime.service import ServiceError
 
 log = logging.getLogger(__name__)
 YIELD_S = 90.0  # in which who yields finishes what it has begun, a conversation with a model among it
 ALIVE_S = 2.0
+FOUND_S = 5.0  # in which a session that has just begun is told who answers
 PATIENCE_S = 60.0  # without anything new, after which who stands by gives up
 LOOK_S = 0.05
 
@@ -36,6 +37,23 @@ class Predecessor:
 
     async def yields(self) -> Bequest | None:
         """Ask it to yield; its last word, None where it has died. Raises ServiceError where it does not."""
+        deadline_s = time.monotonic() + FOUND_S
+        answer = await self._asked()
+        while answer.reason == NOBODY and await self._is_alive() and time.monotonic() < deadline_s:
+            await asyncio.sleep(LOOK_S)  # this session may not have been told yet who answers
+            answer = await self._asked()
+        if answer.payload is not None:
+            try:
+                return decode(Bequest, answer.payload)
+            except DecodeError as error:
+                log.warning("the last word of the predecessor is not understood", extra={"why": str(error)[:200]})
+                return None
+        if not await self._is_alive():
+            log.warning(f"{self.instance} has ended without a word")
+            return None
+        raise ServiceError(f"{self.instance} does not yield ({answer.reason}): it serves on, and this process ends")
+
+    async def _asked(self) -> Answer:
         loop = asyncio.get_running_loop()
         answered: asyncio.Future[Answer] = loop.create_future()
 
@@ -45,17 +63,10 @@ class Predecessor:
         key = yield_key(self.whose, self.service, self.instance)
         request = encode(YieldRequest(successor=self.successor))
         await asyncio.to_thread(self.bus.call, key, request, YIELD_S, receive)
-        answer = await answered
-        if answer.payload is not None:
-            try:
-                return decode(Bequest, answer.payload)
-            except DecodeError as error:
-                log.warning("the last word of the predecessor is not understood", extra={"why": str(error)[:200]})
-                return None
-        if not await asyncio.to_thread(self.bus.announced, alive_key(self.service, self.instance), ALIVE_S):
-            log.warning(f"{self.instance} has ended without a word")
-            return None
-        raise ServiceError(f"{self.instance} does not yield ({answer.reason}): it serves on, and this process ends")
+        return await answered
+
+    async def _is_alive(self) -> bool:
+        return bool(await asyncio.to_thread(self.bus.announced, alive_key(self.service, self.instance), ALIVE_S))
 
 
 @dataclass(frozen=True)

@@ -8,12 +8,13 @@ import msgspec
 import pytest
 
 from prior_sg.deploy.running.serve import _in_charge
-from prior_sg.schemas.codec import decode
+from prior_sg.schemas.codec import decode, encode
 from prior_sg.schemas.frames import Keyframe
 from prior_sg.schemas.places import PlaceDelta
 from prior_sg.schemas.status import Tick
 from prior_sg.schemas.succession import Bequest, Succession, TakesOver
 from prior_sg.schemas.topics import ENCODE, KEYFRAME, PLACE_DELTA, PYRAMID
+from prior_sg.services.runtime.bus import NOBODY, Answer
 from prior_sg.services.runtime.client import BusClient
 from prior_sg.services.runtime.host import succession
 from prior_sg.services.runtime.host.host import Host
@@ -246,3 +247,24 @@ def test_nobody_yields_twice(endpoint):
             await asyncio.to_thread(bus.close)
 
     asyncio.run(main())
+
+
+class SlowToTell:
+    """A bus whose session is told only after a while who answers."""
+
+    def __init__(self, empty):
+        self.empty, self.asked = empty, 0
+
+    def call(self, key, payload, timeout_s, on_answer):
+        self.asked += 1
+        word = encode(Bequest(robot="fleet", service="keeper", instance="k1"))
+        on_answer(Answer(None, NOBODY) if self.asked <= self.empty else Answer(word))
+
+    def announced(self, pattern, timeout_s):
+        return {pattern}
+
+
+def test_who_is_alive_and_not_yet_known_is_asked_again():
+    bus = SlowToTell(empty=3)
+    bequest = asyncio.run(succession.Predecessor(bus, "fleet", "keeper", "k1", "me").yields())
+    assert bequest is not None and bequest.instance == "k1" and bus.asked == 4
