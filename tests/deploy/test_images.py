@@ -70,7 +70,7 @@ def test_what_is_copied_is_let_through_and_nothing_else():
 def test_what_the_image_writes_lies_in_volumes():
     (text,) = [rest for word, rest in instructions() if word == "ENV" and "PSG_SCENE_STORE__PATH" in rest]
     paths = dict(re.findall(r"(\w+)=(\S+)", text))
-    for name in ("HOME", "PSG_PRIOR_GATEWAY__ARCHIVE", "PSG_SCENE_STORE__PATH"):
+    for name in ("HOME", "PSG_INGEST__ARCHIVE_PATH", "PSG_PRIOR_GATEWAY__ARCHIVE", "PSG_SCENE_STORE__PATH"):
         assert paths[name].startswith(STATE)
     for name in ("XDG_CACHE_HOME", "NUMBA_CACHE_DIR"):
         assert paths[name].startswith(CACHE)
