@@ -8,7 +8,7 @@ WORKERS ?= 2
 # One process compiles for all others, whatever the caller's shell says.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo test test-long coverage test-llm check loops bench manifests images sbom chaos clean
+.PHONY: demo test test-long coverage test-llm check loops bench manifests images sbom chaos soak load clean
 .DEFAULT_GOAL := demo
 
 demo: $(VENV)/installed
@@ -69,6 +69,10 @@ sbom: $(VENV)/installed-audit
 # Hundreds of faults on whole systems; CHAOS='--faults 20 --seed 7' for others. It goes on where it was.
 chaos: $(VENV)/installed-dev
 	$(BIN)/python -m tests.chaos $(CHAOS)
+
+# One robot for an hour; robots times rate until something is dropped. ENDURANCE='--seconds 600' for less.
+soak load: $(VENV)/installed-dev
+	$(BIN)/python -m tests.endurance $@ --out out/$@ $(ENDURANCE)
 
 INSTALL := $(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt
 # Loops compiled for another version may name what it lacks now.

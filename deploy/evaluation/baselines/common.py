@@ -4,6 +4,7 @@ All baselines see the places, the encoder's crops and the region concepts that o
 attach features to places and how they cut regions.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -89,7 +90,7 @@ class Inputs:
         """Our method's d_vis (place, dim) and whether each place (place,) was observed at all."""
         archive, evidence, cfg = FrameArchive(), kernel.Evidence(), kernel.KernelConfig()
         for pyramid in self.pyramids:
-            archive.add(pyramid.frame_id, kernel.compact(pyramid))
+            archive.add(pyramid.frame_id, kernel.compact(pyramid), math.inf)
         rows = list(range(len(self.place_ids)))
         evidence.add(rows)
         targets = kernel.Targets(evidence.of(rows), self.positions_m)

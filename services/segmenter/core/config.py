@@ -43,6 +43,8 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
     spaces: SpacesConfig = msgspec.field(default_factory=SpacesConfig)
     kernel: KernelConfig = msgspec.field(default_factory=KernelConfig)
     default_query_radius_m: float = 0.75  # r_Q until a prior is in force (paper)
+    evidence_mb: float = 512.0  # pyramids kept of each space, for places that are new or move; of the view that most
+    # frames have, the oldest goes first
     experts: dict[str, float] = msgspec.field(  # names, with their reliabilities lambda (paper)
         default_factory=lambda: {"visual": 4.0, "geometric": 1.0, "object": 1.0, "environment": 0.1}
     )
@@ -85,6 +87,8 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
         unknown = sorted(set(self.experts) - set(REGISTRY))
         if unknown:
             raise ValueError(f"no such expert: {', '.join(unknown)}; there are {', '.join(sorted(REGISTRY))}")
+        if not self.evidence_mb > 0:
+            raise ValueError("evidence_mb must be positive")
         if not (self.beta >= 0 and self.edge_decay_m > 0 and self.edge_sum >= 0 and self.region_cost >= 0):
             raise ValueError("beta, edge_decay_m, edge_sum or region_cost is out of range")
         if not (0 < self.probability_floor < 1 and self.trust_half > 0 and self.temperature > 0):

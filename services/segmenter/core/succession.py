@@ -111,7 +111,7 @@ def page(
     """The next of what was seen, in the order of frame numbers; frames are whole."""
     frames: dict[int, list[tuple[str, Frame] | Detections]] = {}
     for name, archive in spaces.items():
-        for frame_id in archive.frame_ids:
+        for frame_id in archive.kept_ids:
             frames.setdefault(frame_id, []).append((name, archive.get(frame_id)))
     for one in detections:
         frames.setdefault(one.frame_id, []).append(one)

@@ -1,5 +1,7 @@
 """Integration kernel against loops over the equations, visibility by hand, and retroactive integration."""
 
+import math
+
 import numpy as np
 import pytest
 
@@ -31,7 +33,7 @@ def gather(frames, positions, order=None):
     """Evidence of places from frames."""
     evidence, archive = Evidence(), FrameArchive()
     for index in range(len(frames)) if order is None else order:
-        archive.add(frames[index].frame_id, kernel.compact(frames[index]))
+        archive.add(frames[index].frame_id, kernel.compact(frames[index]), math.inf)
     ids = list(range(len(positions)))
     evidence.add(ids)
     targets = Targets(evidence.of(ids), positions.astype(float))
@@ -137,7 +139,7 @@ def test_frustum_candidates_miss_no_frame_that_sees_a_place():
     positions, _ = place_grid(3)
     archive = FrameArchive()
     for message in frames:
-        archive.add(message.frame_id, kernel.compact(message))
+        archive.add(message.frame_id, kernel.compact(message), math.inf)
     for row in range(0, len(positions), 5):
         place = positions[row : row + 1].astype(float)
         seeing = [i for i, f in enumerate(archive.frames) if len(kernel.visible(f, place, CFG))]

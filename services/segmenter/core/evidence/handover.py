@@ -55,8 +55,8 @@ class Spaces:
     asked: int = 0  # wishes for keyframes
 
 
-def hear(spaces: Spaces, pyramid: Pyramid, in_force: FrameArchive, cfg: SpacesConfig) -> bool:
-    """Keep a pyramid of a space that is not in force; False when it is not needed."""
+def hear(spaces: Spaces, pyramid: Pyramid, in_force: FrameArchive, cfg: SpacesConfig, limit_bytes: float) -> bool:
+    """Keep a pyramid of a space that is not in force, at most so many bytes of each; False when it is not needed."""
     if not cfg.follow:
         return False
     rival = spaces.rivals.get(pyramid.space)
@@ -64,7 +64,7 @@ def hear(spaces: Spaces, pyramid: Pyramid, in_force: FrameArchive, cfg: SpacesCo
         waits = pyramid.space in spaces.left or not len(in_force)
         rival = spaces.rivals[pyramid.space] = Rival(waits=waits)
     rival.heard += 1
-    if not _comes(rival, cfg) or not rival.archive.add(pyramid.frame_id, compact(pyramid)):
+    if not _comes(rival, cfg) or not rival.archive.add(pyramid.frame_id, compact(pyramid), limit_bytes):
         return False
     rival.still_ticks = 0
     return True

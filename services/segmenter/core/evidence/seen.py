@@ -43,8 +43,9 @@ class Seen:
     def observe(self, pyramid: Pyramid, targets: kernel.Targets, cfg: Config) -> np.ndarray | None:
         """Integrate a frame into the targets that it sees; their rows. None for a repeat; a pyramid of another space is
         kept apart."""
+        limit_bytes = cfg.evidence_mb * 1e6
         if pyramid.space != self.spaces.force:
-            if not handover.hear(self.spaces, pyramid, self.archive, cfg.spaces):
+            if not handover.hear(self.spaces, pyramid, self.archive, cfg.spaces, limit_bytes):
                 self._ignore(pyramid, "its space is not in force")
             return None
         handover.heard_in_force(self.spaces)
@@ -52,7 +53,7 @@ class Seen:
         if not self.evidence.fits(frame):
             self._ignore(pyramid, "its embeddings have another size than those before")
             return None
-        if not self.archive.add(pyramid.frame_id, frame):
+        if not self.archive.add(pyramid.frame_id, frame, limit_bytes):
             self._ignore(pyramid, "it repeats one")
             return None
         return kernel.integrate(self.evidence, frame, targets, self.query_radius_m, cfg.kernel)
@@ -61,7 +62,7 @@ class Seen:
         self.losses.add("pyramids ignored", reason, of=f"keyframe {pyramid.frame_id}, {pyramid.space}")
 
     def integrate_afresh(self, place_ids: np.ndarray, positions_m: np.ndarray, cfg: Config) -> np.ndarray:
-        """Compute the evidence of some places afresh from all stored frames; the slots (place,) that hold it."""
+        """Compute the evidence of some places afresh from all frames that are kept; the slots (place,) that hold it."""
         self.evidence.add(place_ids.tolist())
         slots = self.evidence.of(place_ids.tolist())
         targets = kernel.Targets(slots, positions_m)
