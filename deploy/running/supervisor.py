@@ -14,6 +14,7 @@ from pathlib import Path
 
 from prior_sg.deploy.errors import UserError
 from prior_sg.deploy.running.crashes import crashes
+from prior_sg.deploy.running.logfiles import bound
 from prior_sg.deploy.running.serve import EXIT_HOPELESS, EXIT_LATER, EXIT_SUPERSEDED
 from prior_sg.services.registry import BY_NAME
 
@@ -23,6 +24,7 @@ LATER_DELAY_S = 3.0  # of one that lacks what can come back
 STABLE_AFTER_S = 20.0
 GIVE_UP_AFTER = 5
 STOP_TIMEOUT_S = 10.0
+BOUND_LOGS_EVERY_S = 10.0
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
@@ -135,6 +137,7 @@ class Supervisor:
     children: list[Child] = field(default_factory=list)
     hears: Callable[[str], bool] = lambda unique: True  # whether a process is seen on the bus
     exchanges: list[Exchange] = field(default_factory=list)
+    logs_bound_s: float = 0.0  # when logs were last looked at
 
     @property
     def crash_folder(self) -> Path:
@@ -203,6 +206,7 @@ class Supervisor:
         """Restart what has died; returns what happened, for the user. Raises ChildFailed when it keeps dying."""
         events = self._exchanged()
         now_s = time.monotonic()
+        self._bound_logs(now_s)
         exchanged = [child for one in self.exchanges for child in (one.former, one.heir)]
         for child in self.children:
             if child in exchanged:
@@ -226,6 +230,13 @@ class Supervisor:
                 why = f": {child.last_words()}" if code > 0 else ""
                 events.append(f"{child.instance} ended ({_reason(code)}){why}{self._report_of(child)}; restarting")
         return events
+
+    def _bound_logs(self, now_s: float) -> None:
+        """No log fills the disk, whoever writes to it."""
+        if now_s - self.logs_bound_s >= BOUND_LOGS_EVERY_S:
+            self.logs_bound_s = now_s
+            for child in self.children:
+                bound(child.log_path)
 
     def _exchanged(self) -> list[str]:
         """What became of the exchanges. A successor that fails is given up; then the former serves on, or again."""

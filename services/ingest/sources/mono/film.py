@@ -8,6 +8,7 @@ from collections import OrderedDict
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
+from typing import Protocol
 
 import cv2
 import msgspec
@@ -34,6 +35,15 @@ TRIED = 16  # pictures that are looked at for their size
 LACKS_MODEL = (
     "{path} has no depth: give --depth-model FILE.onnx, a network that sees depth in one picture (docs/sources.md)"
 )
+
+
+class Sees(Protocol):
+    """What sees depth in one picture: a `Seer`, whose `kind` says what it gives."""
+
+    kind: str
+
+    def __call__(self, picture: np.ndarray) -> np.ndarray:
+        """(h, w) of a picture (h, w) or (h, w, 3). Raises FrameError."""
 
 
 def with_depth(found: Found, options: ReadOptions) -> tuple[Found, ReadOptions]:
@@ -71,7 +81,7 @@ def _size(found: Found) -> tuple[int, int]:
 class Film:
     """The pictures of a source, in order, each looked at with those around it."""
 
-    def __init__(self, entries: Sequence[Entry], camera: Camera, seer: Seer) -> None:
+    def __init__(self, entries: Sequence[Entry], camera: Camera, seer: Sees) -> None:
         self._entries, self._camera, self._seer = entries, camera.intrinsics, seer
         self._maps = straight_maps(camera)
         self._scaling = Scaling(seer.kind)
