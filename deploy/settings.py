@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from prior_sg.services.folders import expanded
+from prior_sg.services.roles import NAMES
 from prior_sg.services.runtime.config import check_sections, from_arguments, from_environment, merge, read_file, resolve
 from prior_sg.services.runtime.keys import VARIABLE
 from prior_sg.services.runtime.service import Service
@@ -42,11 +43,9 @@ def use_keys(folder: str) -> None:
 
 def settings_layers(config: str, settings: Sequence[str]) -> Layers:
     """Settings of all services: the TOML file, then the environment, then `SERVICE.FIELD=VALUE`. Raises ConfigError."""
-    from prior_sg.services.registry import BY_NAME
-
     file, given = read_file(config), from_arguments(settings)
-    check_sections(file, list(BY_NAME))
-    check_sections(given, list(BY_NAME))
+    check_sections(file, list(NAMES))
+    check_sections(given, list(NAMES))
     return merge(file, from_environment(os.environ), given)
 
 

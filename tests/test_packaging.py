@@ -1,6 +1,7 @@
 """What is installed: the wheel's content, its extras, and how a program without some of them behaves."""
 
 import importlib.metadata
+import os
 import re
 import shutil
 import subprocess
@@ -11,14 +12,23 @@ import zipfile
 import pytest
 
 from prior_sg.deploy.cli.main import main
-from prior_sg.deploy.running.serve import service_names
 from prior_sg.deploy.running.supervisor import Child
-from prior_sg.services.registry import BY_NAME
+from prior_sg.schemas.topics import DELTAS, EPOCH
+from prior_sg.services import roles
+from prior_sg.services.registry import SERVICES
 from prior_sg.services.runtime import extras
 from tests.help.paths import ROOT
 
 MB = 1e6
 FOLDERS = ("schemas", "services", "deploy")
+LOADED = """
+import sys
+from prior_sg.deploy.running import serve
+from prior_sg.deploy.settings import resolved_config
+from prior_sg.services.roles import declared
+resolved_config(declared(sys.argv[1]), "", [])
+print(*sys.modules)
+"""
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 
 
@@ -119,8 +129,39 @@ def test_a_package_of_no_extra_gets_no_advice():
     assert extras.advice(ModuleNotFoundError("no", name="scipy.sparse")) is not None
 
 
-def test_services_are_named_without_importing_them():
-    assert service_names() == sorted(BY_NAME)
+def test_what_is_known_of_services_without_loading_them_is_what_they_declare():
+    assert [service.name for service in SERVICES] == list(roles.NAMES)
+    leased = {
+        topic.name: service.name
+        for service in SERVICES
+        if service.scope == "robot"
+        for topic in service.writes
+        if topic in DELTAS
+    }
+    assert leased == roles.LEASED
+    assert [service.name for service in SERVICES if EPOCH in service.answers] == list(roles.KEEPERS)
+
+
+@pytest.mark.parametrize(
+    ("service", "without"),
+    [
+        ("prior_gateway", {"numba", "scipy", "cv2", "torch"}),
+        ("scene_store", {"numba", "cv2", "torch"}),
+        ("ingest", {"numba", "scipy", "torch"}),
+        ("place_graph", {"torch"}),
+        ("segmenter", {"torch", "cv2"}),
+        ("feature_pyramid", {"torch"}),
+    ],
+)
+def test_a_service_loads_nothing_that_only_others_need(service, without):
+    done = subprocess.run(
+        [sys.executable, "-c", LOADED, service],
+        capture_output=True,
+        text=True,
+        check=True,
+        env=os.environ | {"PYTHONPATH": str(ROOT / "src")},
+    )
+    assert not without & set(done.stdout.split())
 
 
 def test_a_child_process_imports_nothing_from_the_working_directory(tmp_path, monkeypatch):

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from prior_sg.deploy.cli.shared import Commands, add_bus, add_settings, console, open_client
 from prior_sg.deploy.errors import UserError
 from prior_sg.deploy.running import serve
+from prior_sg.services.roles import NAMES
 
 if TYPE_CHECKING:
     from prior_sg.services.runtime.client import BusClient
@@ -28,7 +29,7 @@ def add_commands(commands: Commands) -> None:
         "prior-sg swap segmenter --set segmenter.beta=3",
         needs="map",
     )
-    swap.add_argument("service", choices=[*serve.service_names(), ROUTER], help="what to exchange")
+    swap.add_argument("service", choices=[*sorted(NAMES), ROUTER], help="what to exchange")
     swap.add_argument("--instance", default="", help="which process of several; default: each in turn")
     swap.add_argument("--encoder", default="", help="the encoder of a new feature worker (docs/encoders.md)")
     swap.add_argument(

@@ -10,17 +10,15 @@ import sys
 import time
 import uuid
 from collections.abc import Coroutine
-from pathlib import Path
 from typing import Any
 
-from prior_sg import services
 from prior_sg.deploy.edge import check_arguments
 from prior_sg.deploy.errors import UserError
 from prior_sg.deploy.running import crashes
 from prior_sg.deploy.running.here import noted
 from prior_sg.deploy.settings import DEFAULT_ROBOT, add_keys, connect_in_force, resolved_config, use_keys
 from prior_sg.deploy.terminal import complain
-from prior_sg.schemas.topics import EPOCH
+from prior_sg.services.roles import KEEPERS, LEASED, NAMES, WRITERS, declared
 from prior_sg.services.runtime import extras
 from prior_sg.services.runtime.bus import BusError
 from prior_sg.services.runtime.config import ConfigError
@@ -41,15 +39,9 @@ EXIT_YIELDED = 4  # another has taken over: not to be started again
 EXIT_LATER = 5  # it lacks what can come back: started again, it goes on as soon as that has
 
 
-def service_names() -> list[str]:
-    """All services, by their folders: importing them takes packages that a mere client does without."""
-    files = Path(services.__file__).parent.glob("*/service.py")
-    return sorted(file.parent.name for file in files if file.parent.name != "runtime")
-
-
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """What a service process can be told."""
-    parser.add_argument("service", choices=service_names(), help="which service to run")
+    parser.add_argument("service", choices=sorted(NAMES), help="which service to run")
     parser.add_argument("--robot", default=DEFAULT_ROBOT, help="name of the robot whose streams it serves")
     parser.add_argument("--connect", default=connect_in_force(), help="Zenoh router")
     add_keys(parser)
@@ -66,9 +58,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 async def serve(arguments: argparse.Namespace, instance: str) -> bool:
     """Run until a signal, until the parent is gone, or until another takes over: then True."""
-    from prior_sg.services.registry import BY_NAME
-
-    service = BY_NAME[arguments.service]
+    service = declared(arguments.service)
     cfg = resolved_config(service, arguments.config, arguments.set)
     robot = arguments.robot if service.scope == "robot" else "*"
     identity = Identity(robot, instance, time.time_ns())
@@ -126,8 +116,6 @@ async def stay(
 async def _in_charge(service: Service, bus: ZenohBus, cfg: Any, identity: Identity, succeeds: str = "") -> Host:
     """The host of a service, once it may write, or stand by: what writes the same deltas has one lease, whatever it is
     called."""
-    from prior_sg.services.registry import WRITERS
-
     robot, instance = identity.robot, identity.instance
     fence = await asyncio.to_thread(Fence, bus, robot, WRITERS)
     former = Predecessor(bus, identity.whose, service.name, succeeds, instance) if succeeds else None
@@ -144,10 +132,8 @@ async def _in_charge(service: Service, bus: ZenohBus, cfg: Any, identity: Identi
 
 
 def _lease(service: Service, bus: ZenohBus, identity: Identity) -> Lease:
-    from prior_sg.services.registry import LEASED, SERVICES, WRITERS
-
     topics = [topic for topic in service.writes if topic.name in LEASED]
-    keepers = [other.name for other in SERVICES if EPOCH in other.answers and other is not service]
+    keepers = [name for name in KEEPERS if name != service.name]
     role = LEASED[topics[0].name] if topics else service.name
     shared = [name for name, services in WRITERS.items() if len(services) > 1]
     return Lease(bus, identity.robot, role, identity.instance, topics=topics, keepers=keepers, shared=shared)

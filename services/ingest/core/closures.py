@@ -6,8 +6,8 @@ best that can be said is that it grew evenly with the way travelled since the la
 
 from collections.abc import Sequence
 
+import cv2
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from prior_sg.services.ingest.core.frames import View
 
@@ -33,9 +33,9 @@ def spread(trail: Sequence[View], now: View, after_from_before: np.ndarray) -> l
 
 def _part(share: float, around_m: np.ndarray, motion: np.ndarray) -> np.ndarray:
     """A share of a motion (4, 4): turned about a point, and moved, by that share."""
-    turn = Rotation.from_matrix(motion[:3, :3]).as_rotvec()
+    turn = cv2.Rodrigues(motion[:3, :3])[0]
     shift_m = motion[:3, :3] @ around_m + motion[:3, 3] - around_m
     part = np.eye(4)
-    part[:3, :3] = Rotation.from_rotvec(share * turn).as_matrix()
+    part[:3, :3] = cv2.Rodrigues(share * turn)[0]
     part[:3, 3] = around_m - part[:3, :3] @ around_m + share * shift_m
     return part

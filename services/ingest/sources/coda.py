@@ -32,7 +32,6 @@ import numpy as np
 
 from prior_sg.schemas.frames import Intrinsics
 from prior_sg.services.geometry import inverse, transform
-from prior_sg.services.ingest.core.lidar import depth_image
 from prior_sg.services.ingest.core.options import ReadOptions
 from prior_sg.services.ingest.core.pixels import encoded
 from prior_sg.services.ingest.core.poses import quaternion_of
@@ -180,6 +179,8 @@ def _images(files: Files, camera: Camera, frame: int) -> Images:
     points_lidar = _points(file_of(files.scans, frame, "lidar"))
     points_camera = transform(camera.camera_from_lidar, points_lidar.reshape(-1, 3)).reshape(points_lidar.shape)
     empty = ~points_lidar.any(axis=-1, keepdims=True)  # the lidar writes 0 0 0 where nothing came back
+    from prior_sg.services.ingest.core.lidar import depth_image  # takes numba, which other layouts do without
+
     depth_m = depth_image(np.where(empty, np.nan, points_camera), camera.intrinsics)
     if camera.distorted is not None:
         color = encoded(cv2.undistort(color_pixels(color), *camera.distorted), ".jpg")

@@ -10,7 +10,8 @@ from prior_sg.deploy.running.serve import _in_charge
 from prior_sg.schemas.codec import encode
 from prior_sg.schemas.status import EpochKnown
 from prior_sg.schemas.topics import OBJECT_DELTA, PLACE_DELTA, REGION_DELTA
-from prior_sg.services.registry import BY_NAME, WRITERS
+from prior_sg.services.registry import BY_NAME
+from prior_sg.services.roles import WRITERS
 from prior_sg.services.runtime.bus import Hub, LocalBus
 from prior_sg.services.runtime.host import lease as leases
 from prior_sg.services.runtime.host.lease import Fence, SupersededError

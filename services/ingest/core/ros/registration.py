@@ -5,7 +5,6 @@ import numpy as np
 
 from prior_sg.schemas.frames import Intrinsics
 from prior_sg.services.geometry import transform
-from prior_sg.services.ingest.core import lidar
 
 
 def rays(camera: Intrinsics, model: str, distortion: tuple[float, ...]) -> np.ndarray:
@@ -30,4 +29,6 @@ def registered(depth_m: np.ndarray, rays: np.ndarray, color_from_depth: np.ndarr
     points_depth = np.where(depth_m[..., None] > 0, rays * depth_m[..., None], np.nan)
     points_color = transform(color_from_depth, points_depth.reshape(-1, 3)).reshape(points_depth.shape)
     seam = np.full((len(points_color), 1, 3), np.nan)  # an image, unlike a scan, does not close
-    return lidar.depth_image(np.concatenate((points_color, seam), axis=1), color)
+    from prior_sg.services.ingest.core.lidar import depth_image  # takes numba: few cameras need registration
+
+    return depth_image(np.concatenate((points_color, seam), axis=1), color)

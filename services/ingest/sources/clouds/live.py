@@ -10,7 +10,6 @@ from functools import partial
 import numpy as np
 
 from prior_sg.services.geometry import inverse, transform
-from prior_sg.services.ingest.core.clouds.upsampling import upsampled
 from prior_sg.services.ingest.core.clouds.views import VIEW, looked_at
 from prior_sg.services.ingest.core.poses import Convention
 from prior_sg.services.ingest.core.ros.assembly import Posed, Rules, Shot
@@ -19,7 +18,7 @@ from prior_sg.services.ingest.core.ros.motions import Motions
 from prior_sg.services.ingest.core.ros.topics import Chosen
 from prior_sg.services.ingest.sources.base import Camera, Images
 from prior_sg.services.ingest.sources.cameras import straight_maps
-from prior_sg.services.ingest.sources.clouds.swept import USUAL_PERIOD_NS, VIEW_STEP_NS, Drawing, Lidar
+from prior_sg.services.ingest.sources.clouds.swept import USUAL_PERIOD_NS, VIEW_STEP_NS, Drawing, Lidar, dense
 from prior_sg.services.ingest.sources.ros.reader import Reader
 
 
@@ -115,4 +114,4 @@ def _seen_from(lidar_from_view: np.ndarray, world_from_lidar: np.ndarray) -> np.
 
 
 def _view(lidar: Lidar, world_from_view: np.ndarray) -> Images:
-    return Images(None, upsampled(transform(inverse(world_from_view), lidar.points_world(0)), VIEW, None))
+    return Images(None, dense(transform(inverse(world_from_view), lidar.points_world(0)), VIEW, None))

@@ -7,9 +7,9 @@ from functools import partial
 import cv2
 import numpy as np
 
+from prior_sg.schemas.frames import Intrinsics
 from prior_sg.services.geometry import inverse, transform
 from prior_sg.services.ingest.core.clouds.sweep import CloudError, Sweep, in_world
-from prior_sg.services.ingest.core.clouds.upsampling import upsampled
 from prior_sg.services.ingest.core.clouds.views import VIEW, lidar_from_views, looked_at, seen
 from prior_sg.services.ingest.core.options import ReadOptions
 from prior_sg.services.ingest.core.pairing import associate
@@ -77,7 +77,7 @@ class Drawing:
             file = encoded(picture, ".png")
         points_world = self.lidar.points_world(position)
         points_camera = transform(inverse(self.world_from_camera(stamp_ns)), points_world)
-        return Images(file, upsampled(points_camera, of, picture))
+        return Images(file, dense(points_camera, of, picture))
 
 
 def view_entries(lidar: Lidar, options: ReadOptions) -> tuple[Camera, list[Entry], str]:
@@ -130,4 +130,11 @@ def _pose(lidar: Lidar, position: int, lidar_from_view: np.ndarray) -> np.ndarra
 def _images(lidar: Lidar, position: int, lidar_from_view: np.ndarray) -> Images:
     world_from_view = _pose(lidar, position, lidar_from_view)
     points_view = transform(inverse(world_from_view), lidar.points_world(position))
-    return Images(None, upsampled(points_view, VIEW, None))
+    return Images(None, dense(points_view, VIEW, None))
+
+
+def dense(points_camera: np.ndarray, camera: Intrinsics, picture: np.ndarray | None) -> np.ndarray:
+    """Depth (h, w), metres, of points (n, 3); see `upsampled`."""
+    from prior_sg.services.ingest.core.clouds.upsampling import upsampled  # takes numba and SciPy: lidars alone need it
+
+    return upsampled(points_camera, camera, picture)

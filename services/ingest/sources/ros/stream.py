@@ -14,7 +14,6 @@ from prior_sg.services.ingest.core.frames import BadFrame, Closure, Correction, 
 from prior_sg.services.ingest.core.pairing import risen
 from prior_sg.services.ingest.core.poses import PoseError
 from prior_sg.services.ingest.core.ros.assembly import Posed, Together
-from prior_sg.services.ingest.core.ros.graph import corrected
 from prior_sg.services.ingest.core.ros.motions import Fault, Jump, Motions
 from prior_sg.services.ingest.core.ros.topics import CAMERA_INFO, COMPRESSED, IMAGE
 from prior_sg.services.ingest.core.ros.transforms import transforms_of
@@ -180,6 +179,8 @@ class Stream:
 
     def _optimised(self, message: Received) -> Iterator[Correction]:
         """What a graph of optimised poses says of the frames so far, unless that is what was said before."""
+        from prior_sg.services.ingest.core.ros.graph import corrected  # takes SciPy: few robots publish such a graph
+
         graph, trail = self._robot.graph, list(self._trail)
         assert graph is not None
         try:
