@@ -136,9 +136,11 @@ class Perceiver:
         mapped.seconds["features"] = mapped.seconds.pop("layout")
         return replace(mapped, pyramids=tuple(decode(Pyramid, pyramid) for pyramid in made))
 
-    def deltas(self, dataset: Dataset) -> list[PlaceDelta]:
-        """The changes of the place graph, one for each keyframe."""
-        kept = self._kept("deltas", dataset, None, lambda: self._deltas(dataset), {})
+    def deltas(self, dataset: Dataset, preset: bool = False) -> list[PlaceDelta]:
+        """The changes of the place graph, one for each keyframe; with the preset that suits a world, or without."""
+        cfg = self.mapping(dataset) if preset else self._config("place_graph")
+        kind = "preset deltas" if preset else "deltas"
+        kept = self._kept(kind, dataset, None, lambda: self._deltas(dataset, cfg), {})
         return [decode(PlaceDelta, delta) for delta in kept]
 
     def _mapped(self, dataset: Dataset, cfg: Any) -> Perception:
@@ -189,8 +191,8 @@ class Perceiver:
         requests = ((PLACE_SNAPSHOT, SnapshotRequest(robot=ROBOT)), (VOXEL_MAP, MapRequest(robot=ROBOT)))
         return [encode(runner.answer(query, request)) for query, request in requests]
 
-    def _deltas(self, dataset: Dataset) -> list[bytes]:
-        runner = self._runner("place_graph", self._config("place_graph"))
+    def _deltas(self, dataset: Dataset, cfg: Any) -> list[bytes]:
+        runner = self._runner("place_graph", cfg)
         published = (output for keyframe in self._keyframes(dataset, "deltas") for output in runner.feed(keyframe))
         return [encode(message) for topic, message in published if topic is PLACE_DELTA]
 
