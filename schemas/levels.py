@@ -32,7 +32,7 @@ class Entry(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class LevelPrior(Message, frozen=True, kw_only=True, omit_defaults=True):
-    """One level above the regions. Its children are the entries of the level before it in the prior, else the regions."""
+    """One level above the regions; its children are the entries of the level before it in the prior, or the regions."""
 
     name: NamedLevel
     task: str = ""  # whose words its entries are, such as "which ward?"
@@ -50,7 +50,7 @@ class LevelPrior(Message, frozen=True, kw_only=True, omit_defaults=True):
         where, names = f"level {self.name}", self.names
         if not 0 < len(names) <= MOST_ENTRIES or len(set(names)) != len(names):
             raise ValueError(f"{where}: needs between 1 and {MOST_ENTRIES} entries of different names")
-        if not all(0 < len(name.strip()) and len(name) <= LONGEST_NAME for name in names):
+        if not all(len(name.strip()) > 0 and len(name) <= LONGEST_NAME for name in names):
             raise ValueError(f"{where}: a name is empty or too long")
         if len(self.task) > LONGEST_TEXT:
             raise ValueError(f"{where}: its task is too long")

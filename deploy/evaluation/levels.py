@@ -127,8 +127,8 @@ def _layers_ms(state: State, config: Config) -> float:
     storeys = state.regions.storeys
     assert storeys is not None
     arguments = (state.regions.known, state.map.places, storeys, state.aim.aligned.levels, config.layers)
-    LayerMap().renew(*arguments, config.edge_clearance_m)
+    LayerMap().renew(*arguments)
     started_s = time.perf_counter()
     for _ in range(TIMED):
-        LayerMap().renew(*arguments, config.edge_clearance_m)
+        LayerMap().renew(*arguments)
     return 1e3 * (time.perf_counter() - started_s) / TIMED

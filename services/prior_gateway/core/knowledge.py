@@ -44,7 +44,7 @@ class TaskEntry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
 
 
 class LevelEntry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """One level above the regions, and what its parts are called; of several of one name, the task chooses by keywords."""
+    """What the parts of one level above regions are called. Of several of one name the task chooses, by keywords."""
 
     name: NamedLevel
     entries: list[str]

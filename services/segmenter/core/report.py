@@ -37,8 +37,8 @@ def publish(state: State, events: list[RegionEvent], everything: bool, cfg: Conf
         places.slots[fresh],
         _beliefs(state, fresh, cfg),
         regions.known,
-        state.layers.known,
         events,
+        nodes=state.layers.known,
         everything=everything,
         tolerance=cfg.posterior_change,
     )
@@ -46,10 +46,10 @@ def publish(state: State, events: list[RegionEvent], everything: bool, cfg: Conf
 
 def _renew_layers(state: State, cfg: Config) -> None:
     """Find the levels above the regions again, and name each region's zone."""
-    regions, clearance_m = state.regions, cfg.edge_clearance_m or cfg.door_clearance_m
+    regions = state.regions
     assert regions.storeys is not None
     levels = state.aim.aligned.levels
-    state.layers.renew(regions.known, state.map.places, regions.storeys, levels, cfg.layers, clearance_m)
+    state.layers.renew(regions.known, state.map.places, regions.storeys, levels, cfg.layers)
     for number, region in regions.known.items():
         zone = state.layers.zone_of(number)
         if zone != region.parent:

@@ -29,14 +29,15 @@ class AlignmentConfig(msgspec.Struct, frozen=True, kw_only=True):
     saturation_m2: float = 8.0  # area at which a member counts once
     existence: float = 0.1  # reliability of P(e)
     border: float = 0.6  # times the cost of a border between regions
-    ways: float = 2.0  # of one border that count at most; a door counts half
+    way_m: float = 0.8  # clearance from which on a way counts once; half of it in a usual door
+    ways: float = 2.0  # of one border that count at most
     node_cost: float = 0.5  # of each node, in the energy's unit
     temperature: float = 1.0  # of the probabilities
 
     def __post_init__(self) -> None:
         numbers = (self.existence, self.border, self.ways, self.node_cost)
-        if min(numbers) < 0 or self.saturation_m2 <= 0 or self.temperature <= 0:
-            raise ValueError("a cost is negative, or saturation_m2 or temperature not positive")
+        if min(numbers) < 0 or min(self.saturation_m2, self.way_m, self.temperature) <= 0:
+            raise ValueError("a cost is negative, or saturation_m2, way_m or temperature not positive")
 
 
 class Members(NamedTuple):

@@ -43,12 +43,11 @@ class LayerMap:
         storeys: Storeys,
         levels: Mapping[str, LevelInForce],
         cfg: LayersConfig,
-        clearance_m: float,
     ) -> None:
-        """Find all levels of these regions; a way as wide as `clearance_m` to both sides counts once."""
+        """Find all levels of these regions."""
         listed = [region for _, region in sorted(regions.items()) if region.place_count]
         layers = layers_of(
-            _members(listed, places, clearance_m), _storeys(listed, places, storeys), levels, cfg.alignment
+            _members(listed, places, cfg.alignment.way_m), _storeys(listed, places, storeys), levels, cfg.alignment
         )
         counts = np.minimum([region.place_count for region in listed], MOST_COUNTED).astype(np.int64)
         former, self.node_of, ids = self.node_of, {}, {}
@@ -70,7 +69,7 @@ class LayerMap:
         return "" if node is None else self.known["zone", node].label
 
 
-def _members(regions: list[Region], places: Places, clearance_m: float) -> Members:
+def _members(regions: list[Region], places: Places, way_m: float) -> Members:
     """Regions as members of the level above: mean beliefs of their places, and the ways between them."""
     row = {region.id: number for number, region in enumerate(regions)}
     ways: dict[tuple[int, int], float] = {}
@@ -78,7 +77,7 @@ def _members(regions: list[Region], places: Places, clearance_m: float) -> Membe
         for way in region.transitions:
             if region.id < way.region and way.region in row:
                 pair = row[region.id], row[way.region]
-                ways[pair] = ways.get(pair, 0.0) + min(way.clearance_m / clearance_m, 1.0)
+                ways[pair] = ways.get(pair, 0.0) + min(way.clearance_m / way_m, 1.0)
     edges = sorted(ways)
     return Members(
         areas_m2=np.array([region.area_m2 for region in regions]),

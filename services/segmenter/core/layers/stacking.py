@@ -1,8 +1,8 @@
 """From regions to all levels above them, one upon the other (pure).
 
-Zones follow the prior and never span storeys. A building is a connected part of the map that the prior's level takes for
-one thing, such as indoors or outdoors; without that level, a connected part. A floor is what a building has on one
-storey. Districts follow the prior.
+Zones follow the prior and never span storeys. A building is a connected part of the map that the prior takes for one
+thing, such as indoors or outdoors; where it names no such level, a connected part. A floor is what a building has on
+one storey. Districts follow the prior.
 """
 
 from collections.abc import Mapping

@@ -82,9 +82,9 @@ class Ledger:
         slots: np.ndarray,
         now: Beliefs,
         regions: dict[int, Region],
-        nodes: Nodes,
         events: list[RegionEvent],
         *,
+        nodes: Nodes,
         everything: bool,
         tolerance: float,
     ) -> RegionDelta | None:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from prior_sg.schemas.regions import Region, RegionEvent
-from prior_sg.services.segmenter.core.layers.storeys import Storeys, StoreyConfig, split, storeys_of
+from prior_sg.services.segmenter.core.layers.storeys import StoreyConfig, Storeys, split, storeys_of
 from prior_sg.services.segmenter.core.map.place_map import MapChange, PlaceMap
 from prior_sg.services.segmenter.core.map.received import with_neighbours
 from prior_sg.services.segmenter.core.regions import components
