@@ -95,6 +95,17 @@ def regions_in(nodes: Iterable[LevelNode], level: LevelName) -> dict[int, int]:
     return found
 
 
+def nodes_above(nodes: Iterable[LevelNode]) -> dict[int, list[LevelNode]]:
+    """The nodes that hold each region, from below, by the region's id."""
+    listed = sorted(nodes, key=rank)
+    found: dict[int, list[LevelNode]] = {}
+    for level in LEVELS:
+        by_id = {node.id: node for node in listed if node.level == level}
+        for region, number in regions_in(listed, level).items():
+            found.setdefault(region, []).append(by_id[number])
+    return found
+
+
 def rank(node: LevelNode) -> tuple[int, int]:
     """By which nodes are sorted: from below, by id."""
     return LEVELS.index(node.level), node.id

@@ -325,7 +325,6 @@ EXAMPLES: list[Message] = [
     priors.TaskInForce(robot="r", task=TASK),
     PRIOR.spread,
     LEVEL_PRIOR,
-    LEVEL_PRIOR,
     PRIOR,
     priors.PriorRequest(digest="d", environment="home", task="tidy up", regions=["kitchen"]),
     priors.PriorList(priors=[PRIOR], reason="r", pending=True),

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from prior_sg.schemas.features import Pyramid
-from prior_sg.schemas.levels import LevelNode
+from prior_sg.schemas.levels import LEVELS, LevelName, LevelNode
 from prior_sg.schemas.objects import Detections, ObjectDelta, SceneObject
 from prior_sg.schemas.regions import NO_REGION, Region, RegionDelta
 from prior_sg.schemas.scene import Scene
@@ -38,6 +38,7 @@ class Legacy:
     digest: str = ""  # of the prior that regions were labelled by
     next_region_id: int = 0
     next_object_id: int = 0
+    next_node_ids: dict[LevelName, int] = field(default_factory=dict)  # of the levels above regions
 
     def hear(self, told: RegionDelta | ObjectDelta | Scene) -> None:
         """Take a snapshot, or the stored scene."""
@@ -100,6 +101,7 @@ class CatchingUp:
                     self.legacy.hear(told)
             self.legacy.next_region_id = max(self.legacy.next_region_id, bequest.next_ids.get("regions", 0))
             self.legacy.next_object_id = max(self.legacy.next_object_id, bequest.next_ids.get("objects", 0))
+            self.legacy.next_node_ids = {level: bequest.next_ids.get(level, 0) for level in LEVELS}
 
     def tick(self, seen: int) -> None:
         """Half a second has passed; so many of the places that were looked at before have been again."""

@@ -265,7 +265,7 @@ def _tell_all(state: State, cfg: Config) -> Iterator[RegionDelta | ObjectDelta]:
     assert legacy is not None
     state.map.places.regions = legacy.regions_of(state.map.graph.ids)
     state.regions.inherit(legacy.regions, legacy.next_region_id)
-    state.layers.inherit(legacy.nodes)
+    state.layers.inherit(legacy.nodes, legacy.next_node_ids)
     state.objects.inherit(legacy.objects, legacy.next_object_id, cfg.tracking)
     yield from follow_objects(state, cfg)
     yield from _segment(state, switched=False, idle=False, cfg=cfg)

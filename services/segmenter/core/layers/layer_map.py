@@ -28,13 +28,13 @@ class LayerMap:
     known: dict[NodeKey, LevelNode] = field(default_factory=dict)
     node_of: dict[LevelName, dict[int, int]] = field(default_factory=dict)  # node id by region id
 
-    def inherit(self, nodes: list[LevelNode]) -> None:
-        """These nodes were known before this process."""
+    def inherit(self, nodes: list[LevelNode], next_ids: Mapping[LevelName, int]) -> None:
+        """These nodes were known before this process, and no id below these has yet to be given."""
         self.known = {(node.level, node.id): node for node in nodes}
         self.node_of = {level: regions_in(nodes, level) for level in LEVELS}
         for level in LEVELS:
             ids = [node.id + 1 for node in nodes if node.level == level]
-            self.next_ids[level] = max([self.next_ids.get(level, 0), *ids])
+            self.next_ids[level] = max([self.next_ids.get(level, 0), next_ids.get(level, 0), *ids])
 
     def renew(
         self,
