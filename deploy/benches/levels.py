@@ -35,8 +35,9 @@ def world_figures(kind: str, seed: int, encoder: str, config: Config, folder: Pa
     """The figures of one world; `folder` keeps what was perceived."""
     dataset = levels.dataset_of(kind, seed)
     perceiver = Perceiver({}, Cache(folder), lambda *_: None, encoder)
+    deltas = perceiver.walk(dataset)
     case = Case(perceiver.perceive(dataset), dataset.prior, dataset.truth, dataset.objects)
-    return levels.figures(levels.walk(case, perceiver.deltas(dataset, preset=True), config), case)
+    return levels.figures(levels.walk(case, deltas, config), case)
 
 
 def _mean(values: list[float]) -> float:

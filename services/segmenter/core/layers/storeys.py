@@ -26,13 +26,14 @@ class StoreyConfig(msgspec.Struct, frozen=True, kw_only=True):
 
     least_height_m: float = 2.2  # from floor to floor
     least_m2: float = 12.0  # of places' discs on a floor
+    part_m2: float = 3.0  # the same of a region's part on one storey, where it is torn
     valley: float = 0.5  # density between two floors at most, of that at the lesser one
     tolerance_m: float = 0.3  # a bottom so far below a floor is still on it
     clutter_m: float = 0.8  # bottoms up to so far above a floor are on it
     stairs: float = 0.4  # share of a region between floors from which on it is stairs, which span storeys
 
     def __post_init__(self) -> None:
-        if min(self.least_height_m, self.least_m2, self.tolerance_m) <= 0 or not 0 < self.stairs <= 1:
+        if min(self.least_height_m, self.least_m2, self.part_m2, self.tolerance_m) <= 0 or not 0 < self.stairs <= 1:
             raise ValueError("a height or an area is not positive, or stairs not in (0, 1]")
         if self.tolerance_m + self.clutter_m >= self.least_height_m or self.clutter_m < 0 or self.valley < 0:
             raise ValueError("tolerance_m and clutter_m leave nothing between two floors, or valley is negative")
@@ -112,7 +113,7 @@ def split(component: np.ndarray, edges: np.ndarray, storeys: Storeys, cfg: Store
     size = (int(component.max()) + 1) * count
     weights = storeys.weights_m2
     ground_m2 = np.bincount(number, weights * storeys.grounded, minlength=size).reshape(-1, count)
-    own = ground_m2 >= cfg.least_m2 / count  # a part need not be as large as a storey
+    own = ground_m2 >= cfg.part_m2
     whole_m2, between_m2 = (
         np.bincount(component, weights * mask, minlength=len(own)) for mask in (True, storeys.between)
     )
