@@ -92,13 +92,9 @@ def _profile(heights_m: np.ndarray, weights_m2: np.ndarray, cells: int) -> np.nd
 
 def _valleys(profile: np.ndarray, mode: int, floors: list[int], cfg: StoreyConfig) -> bool:
     """Whether the profile falls low enough between a mode and the floors below and above it."""
-    beside = [max((floor for floor in floors if floor < mode), default=None)]
-    beside.append(min((floor for floor in floors if floor > mode), default=None))
-    for floor in filter(lambda found: found is not None, beside):
-        first, last = sorted((mode, floor))
-        if profile[first : last + 1].min() > cfg.valley * profile[mode]:
-            return False
-    return True
+    beside = [*sorted(floor for floor in floors if floor < mode)[-1:], *sorted(f for f in floors if f > mode)[:1]]
+    spans = [slice(min(mode, floor), max(mode, floor) + 1) for floor in beside]
+    return all(profile[span].min() <= cfg.valley * profile[mode] for span in spans)
 
 
 def split(component: np.ndarray, edges: np.ndarray, storeys: Storeys, cfg: StoreyConfig) -> np.ndarray:
