@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from prior_sg.schemas.levels import LevelName
 from prior_sg.schemas.places import VoxelMap
 from prior_sg.schemas.regions import NO_REGION
 from prior_sg.services.geometry import inside_polygon
@@ -26,10 +27,20 @@ class TrueRegion:
 
 
 @dataclass(frozen=True)
+class TrueNode:
+    """One ground-truth node of a level above regions."""
+
+    level: LevelName
+    label: str
+    regions: tuple[int, ...]  # ids of the true regions in it
+
+
+@dataclass(frozen=True)
 class GroundTruth:
     """The regions of one sequence."""
 
     regions: tuple[TrueRegion, ...]
+    nodes: tuple[TrueNode, ...] = ()  # of the levels above, where they are known
 
     @classmethod
     def from_json(cls, data: dict[str, Any]) -> "GroundTruth":

@@ -8,6 +8,7 @@ import msgspec
 import numpy as np
 
 from prior_sg.schemas.codec import Message, Number, NumberOrNone, Shape, Stamp, encode
+from prior_sg.schemas.levels import LevelPrior, check_levels, zones_of
 from prior_sg.schemas.names import LONGEST_NAME, fault_of_names, fault_of_text, key_part
 
 SUM_TOLERANCE = 1e-3
@@ -62,7 +63,7 @@ class RegionPrior(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True)
     inclination_mean_rad: float = 0.0
     inclination_std_rad: float = 0.2
     query_radius_m: float = 0.75  # r_Q
-    parent: str = ""
+    parent: str = ""  # its zone for sure, where the prior has no `levels`
 
 
 class ObjectPrior(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
@@ -119,9 +120,11 @@ class Prior(Message, frozen=True, kw_only=True, omit_defaults=True):
     adjacency: Annotated[np.ndarray, Shape("float32", "region", "region")]  # P(ri <-> rj | E0), symmetric, in (0, 1]
     provenance: Provenance
     spread: Spread | None = None
+    levels: list[LevelPrior] = []  # above the regions, from below; where there are some, no region's `parent` counts
 
     def check(self) -> None:
         """Whoever sent it: a model, a file or another robot."""
+        check_levels(self.levels, len(self.regions))
         self._check_names()
         self._check_matrices()
         for region in self.regions:
@@ -160,6 +163,23 @@ class Prior(Message, frozen=True, kw_only=True, omit_defaults=True):
             raise ValueError("adjacency is not symmetric")
         if self.spread is not None and self.spread.containment.shape != self.containment.shape:
             raise ValueError("the spread does not fit the regions and objects")
+
+    @property
+    def levels_above(self) -> list[LevelPrior]:
+        """The levels above the regions, whichever way the prior says them."""
+        if self.levels:
+            return self.levels
+        parents, existence = ([getattr(r, name) for r in self.regions] for name in ("parent", "existence"))
+        zones = zones_of(parents, existence, self.adjacency)
+        return [] if zones is None else [zones]
+
+    @property
+    def zones(self) -> list[str]:
+        """The zone (region,) that each region is most likely in; empty where the prior names none for it."""
+        if not self.levels:
+            return [region.parent for region in self.regions]
+        level = self.levels[0]
+        return [level.names[column] for column in level.parents.argmax(axis=1).tolist()]
 
     def digest(self) -> str:
         """Content address, 128 bit in hexadecimal; of everything but the signature, which signs it."""

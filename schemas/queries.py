@@ -12,6 +12,7 @@ from typing import Annotated, Literal
 import msgspec
 
 from prior_sg.schemas.codec import Message, NumberOrNone, Part, Stamp
+from prior_sg.schemas.levels import LevelName, LevelNode
 from prior_sg.schemas.names import LONGEST_TEXT
 from prior_sg.schemas.objects import SceneObject
 from prior_sg.schemas.regions import NO_REGION, Region, Transition
@@ -142,6 +143,17 @@ class AnswersTo(Part, frozen=True, kw_only=True, tag="answers_to"):
     limit: Limit = MOST_RANKED
 
 
+class NodesOf(Part, frozen=True, kw_only=True, tag="nodes_of"):
+    """Zones, floors, buildings and districts with their regions → Nodes, from below by id. Of one level, a label
+    whatever its case, an id within its level, or those that hold a region; without any, all."""
+
+    level: LevelName | None = None
+    label: Text = ""
+    id: int | None = None
+    region: int | None = None
+    limit: Limit = MOST_LISTED
+
+
 Question = (
     ById
     | ByLabel
@@ -155,6 +167,7 @@ Question = (
     | BeliefsOf
     | WordsInUse
     | AnswersTo
+    | NodesOf
 )
 
 
@@ -299,7 +312,22 @@ class Ranking(Part, frozen=True, kw_only=True, tag="ranking"):
     reason: str = ""
 
 
-Answer = Things | Details | Neighbourhood | Route | Difference | RegionBeliefs | Words | Ranking
+class NodeWithRegions(Part, frozen=True, kw_only=True):
+    """A node of a level above regions, and all regions in it, by id."""
+
+    node: LevelNode
+    regions: list[Thing] = []
+
+
+class Nodes(Part, frozen=True, kw_only=True, tag="nodes"):
+    """What was found; `total` may be more than what is listed."""
+
+    nodes: list[NodeWithRegions] = []
+    total: int = 0
+    reason: str = ""
+
+
+Answer = Things | Details | Neighbourhood | Route | Difference | RegionBeliefs | Words | Ranking | Nodes
 
 
 class SceneQuery(Message, frozen=True, kw_only=True):

@@ -6,6 +6,7 @@ import msgspec
 import numpy as np
 
 from prior_sg.schemas.codec import Message, Number, NumberOrNone, Part, Shape, Stamp
+from prior_sg.schemas.levels import LevelName, LevelNode
 
 NO_REGION = -1  # in place of a region id: not labelled yet
 _NO_IDS = msgspec.field(default_factory=lambda: np.zeros(0, np.int64))
@@ -36,7 +37,7 @@ class Region(Part, frozen=True, kw_only=True):
     neighbour_ids: list[int] = []  # regions that an edge of the place graph leads to
     transitions: list[Transition] = []  # the ways there
     object_ids: list[int] = []  # objects that stand in it
-    parent: str = ""  # zone above the label, as the prior names it
+    parent: str = ""  # label of the zone that it is in, where there are zones
 
 
 EventKind = Literal["appeared", "split", "merged", "relabelled", "removed"]
@@ -79,6 +80,8 @@ class RegionDelta(Message, frozen=True, kw_only=True):
     predicted_ids: Annotated[np.ndarray, Shape("int64", "predicted")] = _NO_IDS  # those of `place_ids` whose label
     # rests on their surroundings: seen from afar, barely or never
     events: list[RegionEvent] = []  # since the previous revision
+    removed_nodes: list[tuple[LevelName, int]] = []  # of the levels above, to be removed before `nodes` are put
+    nodes: list[LevelNode] = []
 
     def check(self) -> None:
         if self.posteriors.shape[1] != len(self.labels):

@@ -11,6 +11,7 @@ import numpy as np
 from prior_sg.deploy.api.errors import NotInSceneError
 from prior_sg.deploy.api.spots import spot_in
 from prior_sg.deploy.api.vectors import RecentVectors
+from prior_sg.schemas.levels import LevelName
 from prior_sg.schemas.objects import SceneObject
 from prior_sg.schemas.priors import Prior
 from prior_sg.schemas.queries import (
@@ -27,6 +28,8 @@ from prior_sg.schemas.queries import (
     Nearest,
     Neighbour,
     NeighboursOf,
+    NodesOf,
+    NodeWithRegions,
     ObjectsInRegions,
     Point,
     Question,
@@ -123,6 +126,21 @@ class Asking(ABC):
         route: Route
         (route,) = self.ask(RouteBetween(start=_spot(start), goal=_spot(goal), clearance_m=clearance_m))  # type: ignore[assignment]
         return route
+
+    def levels(
+        self,
+        level: LevelName | None = None,
+        label: str = "",
+        *,
+        number: int | None = None,
+        region: int | None = None,
+        limit: int = MOST_LISTED,
+    ) -> list[NodeWithRegions]:
+        """Zones, floors, buildings and districts with their regions, from below: of one level, of a label, of a number
+        within its level, or those that hold a region."""
+        question = NodesOf(level=level, label=label, id=number, region=region, limit=limit)
+        found: list[NodeWithRegions] = self._understood(question).nodes
+        return found
 
     def candidates(self, region: int, limit: int = MOST_RANKED) -> RegionBeliefs:
         """What a region may be: labels with their probabilities, what is unknown, and how much is a prediction."""

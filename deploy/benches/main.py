@@ -87,6 +87,13 @@ def lidar() -> tuple[dict, dict]:
     return lidar_bench(SAMPLE)
 
 
+def levels() -> tuple[dict, dict]:
+    """Levels above regions; see `prior_sg.deploy.benches.levels`."""
+    from prior_sg.deploy.benches.levels import levels_bench  # needs what evaluation needs
+
+    return levels_bench()
+
+
 def exchanged() -> tuple[dict, dict]:
     """Every service and the router exchanged in mid-run; see `prior_sg.deploy.benches.exchange`."""
     from prior_sg.deploy.benches.exchange import ROWS, exchange_bench  # needs the encoder
@@ -143,6 +150,7 @@ LONG: dict[str, Callable[[float], tuple[dict, dict]]] = {  # no part of `all`; t
     "pool": attacked_pool,
     "store_crashes": lambda seconds: crashes(),
     "lidar": lambda seconds: lidar(),  # seven minutes and more
+    "levels": lambda seconds: levels(),  # ten minutes
     "exchange": lambda seconds: exchanged(),  # nine runs of the sample at half its pace
     "view": lambda seconds: view(),  # needs an extra and a browser
     "hydra": lambda seconds: hydra(),  # needs an extra

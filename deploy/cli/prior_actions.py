@@ -265,7 +265,7 @@ def describe(prior: Prior, cfg: Config, console: Terminal) -> None:
         near = [j for j in np.argsort(-prior.adjacency[i], kind="stable") if j != i][:4]
         share = _with_spread(region.existence, prior.spread.existence[i] if prior.spread else None)
         slope = f"{np.degrees(region.inclination_mean_rad):.0f}±{np.degrees(region.inclination_std_rad):.0f}° steep"
-        zone = f", {region.parent}" if region.parent else ""
+        zone = f", {prior.zones[i]}" if prior.zones[i] else ""
         console.print(
             line(
                 (region.name, "bold"),

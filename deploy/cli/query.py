@@ -11,10 +11,11 @@ from rich.table import Table
 
 from prior_sg.deploy.cli.shared import Commands, add_bus, console
 from prior_sg.deploy.errors import UserError
+from prior_sg.schemas.levels import LEVELS
 
 if TYPE_CHECKING:
     from prior_sg.deploy.api.asking import Asking
-    from prior_sg.schemas.queries import Details, Difference, Neighbour, RegionBeliefs, Route, Thing
+    from prior_sg.schemas.queries import Details, Difference, Neighbour, NodeWithRegions, RegionBeliefs, Route, Thing
 
 FORMS = """\
 what to ask:
@@ -24,6 +25,7 @@ what to ask:
   in-box X Y Z X Y Z               all between two corners
   label LABEL                      all that carries it
   objects [LABEL] [in REGION]      objects of a label in regions of a label
+  level LEVEL [LABEL]              zones, floors, buildings, districts, with their regions
   region ID, place ID, object ID   one of them in full: beliefs, neighbours, what it holds
   route FROM TO                    the shortest way; each a label, here (where the camera was last), place:ID,
                                    region:ID, object:ID or X,Y,Z
@@ -135,6 +137,13 @@ def _one(scene: "Asking", arguments: argparse.Namespace, words: Sequence[str]) -
     return found | ({"beliefs": scene.candidates(number, arguments.limit)} if what == "region" else {})
 
 
+def _levels(scene: "Asking", arguments: argparse.Namespace, words: Sequence[str]) -> "list[NodeWithRegions]":
+    level, *label = words
+    if level not in LEVELS:
+        raise UserError(f"name a level: {', '.join(LEVELS)}; such as `prior-sg query level zone ward`")
+    return scene.levels(level, " ".join(label) or arguments.label, limit=arguments.limit)
+
+
 def _route(scene: "Asking", arguments: argparse.Namespace, words: Sequence[str]) -> "Route":
     if len(words) != 2:
         raise UserError("a route needs two ends: prior-sg query route kitchen bedroom (quote names of several words)")
@@ -179,6 +188,14 @@ def _show_things(things: "Sequence[Thing]") -> None:
         region = "-" if one.region < 0 or one.what == "region" else str(one.region)
         values = [f"{getattr(one, name):.{DECIMALS}f}" for name in extra]
         table.add_row(*values, one.what, str(one.id), label, f"{one.probability:.2f}", region, _at(one.position_m))
+    console.print(table)
+
+
+def _show_levels(found: "Sequence[NodeWithRegions]") -> None:
+    table = Table("level", "id", "label", "probability", "area m²", "regions")
+    for one in found:
+        node, regions = one.node, ", ".join(f"{region.label} {region.id}" for region in one.regions)
+        table.add_row(node.level, str(node.id), node.label, f"{node.probability:.2f}", f"{node.area_m2:.1f}", regions)
     console.print(table)
 
 
@@ -252,6 +269,7 @@ ASKED: dict[str, Asked] = {  # by first word; whatever else is a sentence
     "in-box": (_in_box, _show_things),
     "label": (_label, _show_things),
     "objects": (_objects, _show_things),
+    "level": (_levels, _show_levels),
     "region": (_one, _show_one),
     "place": (_one, _show_one),
     "object": (_one, _show_one),

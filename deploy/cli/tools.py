@@ -123,7 +123,7 @@ def _add_measuring(commands: Commands) -> None:
     bench.add_argument(
         "name",
         help="bus, places, features, kernel, swap, segmenter, task, learning, encoder_swap, queries, e2e, store, all "
-        "of these, or exchange, pool, store_crashes, lidar, view, hydra",
+        "of these, or exchange, levels, pool, store_crashes, lidar, view, hydra",
     )
     bench.add_argument("--seconds", type=float, default=300.0, help="how long pool lasts (default: %(default)s)")
     bench.add_argument("--json", action="store_true", help="print one JSON object per measurement")

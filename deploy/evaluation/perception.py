@@ -138,8 +138,14 @@ class Perceiver:
 
     def deltas(self, dataset: Dataset) -> list[PlaceDelta]:
         """The changes of the place graph, one for each keyframe."""
-        kept = self._kept("deltas", dataset, None, lambda: self._deltas(dataset), {})
+        kept = self._kept("deltas", dataset, None, lambda: self._walk(dataset, self._config("place_graph"))[:-2], {})
         return [decode(PlaceDelta, delta) for delta in kept]
+
+    def walk(self, dataset: Dataset) -> list[PlaceDelta]:
+        """The same with the preset that suits a world; the whole place graph and the map are kept with them."""
+        kept = self._kept("walk", dataset, None, lambda: self._walk(dataset, self.mapping(dataset)), {})
+        self._kept("places", dataset, None, lambda: kept[-2:], {})
+        return [decode(PlaceDelta, delta) for delta in kept[:-2]]
 
     def _mapped(self, dataset: Dataset, cfg: Any) -> Perception:
         """Places and voxels, without any crops."""
@@ -183,16 +189,15 @@ class Perceiver:
         return resolve(BY_NAME[name].config, name, layers)
 
     def _places(self, dataset: Dataset) -> list[bytes]:
-        runner = self._runner("place_graph", self.mapping(dataset))
-        for keyframe in self._keyframes(dataset, "places"):
-            runner.feed(keyframe)
-        requests = ((PLACE_SNAPSHOT, SnapshotRequest(robot=ROBOT)), (VOXEL_MAP, MapRequest(robot=ROBOT)))
-        return [encode(runner.answer(query, request)) for query, request in requests]
+        return self._walk(dataset, self.mapping(dataset))[-2:]
 
-    def _deltas(self, dataset: Dataset) -> list[bytes]:
-        runner = self._runner("place_graph", self._config("place_graph"))
-        published = (output for keyframe in self._keyframes(dataset, "deltas") for output in runner.feed(keyframe))
-        return [encode(message) for topic, message in published if topic is PLACE_DELTA]
+    def _walk(self, dataset: Dataset, cfg: Any) -> list[bytes]:
+        """The deltas of all keyframes, then the whole place graph, then the map."""
+        runner = self._runner("place_graph", cfg)
+        published = (output for keyframe in self._keyframes(dataset, "places") for output in runner.feed(keyframe))
+        deltas = [encode(message) for topic, message in published if topic is PLACE_DELTA]
+        requests = ((PLACE_SNAPSHOT, SnapshotRequest(robot=ROBOT)), (VOXEL_MAP, MapRequest(robot=ROBOT)))
+        return deltas + [encode(runner.answer(query, request)) for query, request in requests]
 
     def _layouts(self, dataset: Dataset, cfg: Any) -> list[bytes]:
         """The pyramid of each keyframe, its crops chosen and not encoded."""

@@ -13,6 +13,7 @@ from prior_sg.deploy.api.spots import ENDS, spot_in
 from prior_sg.deploy.serving.planner_text import lean_json
 from prior_sg.deploy.serving.system import LONGEST_SEARCH, System
 from prior_sg.deploy.showing.text import LEAST_TOKENS, USUAL_TOKENS, scene_text
+from prior_sg.schemas.levels import LevelName
 from prior_sg.schemas.queries import (
     BeliefsOf,
     ById,
@@ -21,6 +22,7 @@ from prior_sg.schemas.queries import (
     InRadius,
     Nearest,
     NeighboursOf,
+    NodesOf,
     ObjectsInRegions,
     Question,
     Route,
@@ -148,6 +150,15 @@ async def describe(system: System, what: What, id: Number) -> str:
 
 
 @asking
+async def levels(
+    system: System, level: LevelName | None = None, label: Label = "", region: Number | None = None
+) -> str:
+    """Zones (such as wards), floors, buildings and districts, each with its regions: all, of one level, of a label, or
+    those that hold a region."""
+    return await _answer(system, lambda: NodesOf(level=level, label=label, region=region))
+
+
+@asking
 async def region_candidates(system: System, region: Number) -> str:
     """What a region may be: labels with probabilities, what is unknown, and how much of it is only predicted."""
     return await _answer(system, lambda: BeliefsOf(region=region))
@@ -177,6 +188,7 @@ ASKING = [
     near,
     within,
     describe,
+    levels,
     region_candidates,
     route,
     changes,

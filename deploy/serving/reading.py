@@ -13,6 +13,7 @@ from prior_sg.deploy.api.spots import ENDS, spot_in
 from prior_sg.deploy.serving.errors import FaultyRequestError
 from prior_sg.deploy.serving.parameters import FAULTS, Coordinate, Count, Distance, Label, Robot, system_of
 from prior_sg.deploy.serving.system import EVERYWHERE, LONGEST_SEARCH, MOST_QUESTIONS
+from prior_sg.schemas.levels import LevelName
 from prior_sg.schemas.queries import (
     MOST_LISTED,
     MOST_RANKED,
@@ -27,6 +28,7 @@ from prior_sg.schemas.queries import (
     Nearest,
     Neighbourhood,
     NeighboursOf,
+    NodesOf,
     Question,
     RegionBeliefs,
     RouteBetween,
@@ -139,6 +141,21 @@ async def place(state: State, robot: Robot, number: FromPath[int]) -> Answered:
     return _there_in(await _one(state, robot, _asked(ById, what="place", id=number)))
 
 
+@get("/v1/{robot:str}/levels", responses=FAULTS)
+async def levels(
+    state: State,
+    robot: Robot,
+    *,
+    level: FromQuery[LevelName | None] = None,
+    label: Label = "",
+    region: FromQuery[int | None] = None,
+    limit: Count = MOST_LISTED,
+) -> Answered:
+    """Zones, floors, buildings and districts with their regions: all, of one level, of a label, or those that hold a
+    region."""
+    return await _one(state, robot, _asked(NodesOf, level=level, label=label, region=region, limit=limit))
+
+
 @get("/v1/{robot:str}/near", responses=FAULTS)
 async def near(
     state: State,
@@ -227,6 +244,7 @@ READING = [
     region,
     object_,
     place,
+    levels,
     near,
     within,
     route,

@@ -13,6 +13,7 @@ from prior_sg.deploy.showing.export import (
     frontiers_of,
     members_of,
     objects_with_places,
+    regions_of,
     surfaces_of,
 )
 from prior_sg.schemas.objects import SceneObject
@@ -24,7 +25,7 @@ MESH_PLACES = "MESH_PLACES"  # its layer of 2D places
 
 
 def spark_dsg_graph(scene: Scene) -> spark_dsg.DynamicSceneGraph:
-    """The scene in Spark-DSG's layers: objects, places above them, rooms, one building above the rooms.
+    """The scene in Spark-DSG's layers: objects, places above them, rooms, buildings above the rooms.
 
     A place keeps its radius as `distance`, a room the mean posterior of its places as `semantic_class_probabilities`;
     what Spark-DSG has no field for stands in the nodes' and the graph's metadata. Edges between places weigh their
@@ -50,12 +51,11 @@ def spark_dsg_graph(scene: Scene) -> spark_dsg.DynamicSceneGraph:
     for a, b in sorted(adjacent_regions(scene)):
         graph.insert_edge(_symbol(ROOM, a), _symbol(ROOM, b))
     if scene.regions:
-        _add(graph, spark_dsg.DsgLayers.BUILDINGS, BUILDING, 0, _building_node(scene))
-        for region in scene.regions:
-            graph.insert_edge(_symbol(BUILDING, 0), _symbol(ROOM, region.id), enforce_single_parent=True)
+        _add_buildings(graph, scene)
     about: dict[str, Any] = {"robot": scene.robot, "environment": scene.environment, "task": scene.task}
     about |= {"prior_digest": scene.prior_digest, "embedding_space": scene.space}
     about |= {"stamp_ns": scene.stamp_ns, "trajectory_m": scene.trajectory.tolist()}
+    about |= {"levels": msgspec.to_builtins(scene.nodes)}  # zones, floors and districts have no layer there
     graph.metadata.set(about | {"origin_m": list(scene.origin_m)})
     labelspace = spark_dsg.Labelspace(dict(enumerate(scene.labels)))  # kept in the metadata, hence after them
     for named in (layer, spark_dsg.DsgLayers.ROOMS):
@@ -169,12 +169,19 @@ def _room_node(
     return node
 
 
-def _building_node(scene: Scene) -> spark_dsg.SemanticNodeAttributes:
-    node = spark_dsg.SemanticNodeAttributes()
-    node.position = np.mean([region.position_m for region in scene.regions], axis=0)
-    node.last_update_time_ns = scene.stamp_ns
-    node.name = scene.environment
-    return node
+def _add_buildings(graph: spark_dsg.DynamicSceneGraph, scene: Scene) -> None:
+    """A building for each of the scene's; one for all, called like the environment, where it has at most one."""
+    found = [node for node in scene.nodes if node.level == "building"]
+    several = len(found) > 1
+    held = regions_of(scene, "building") if several else {0: [region.id for region in scene.regions]}
+    for number, regions in held.items():
+        node = spark_dsg.SemanticNodeAttributes()
+        node.position = np.mean([one.position_m for one in scene.regions if one.id in set(regions)], axis=0)
+        node.last_update_time_ns = scene.stamp_ns
+        node.name = next(one.label for one in found if one.id == number) if several else scene.environment
+        _add(graph, spark_dsg.DsgLayers.BUILDINGS, BUILDING, number, node)
+        for region in regions:
+            graph.insert_edge(_symbol(BUILDING, number), _symbol(ROOM, region), enforce_single_parent=True)
 
 
 def _label_node(

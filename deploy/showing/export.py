@@ -8,7 +8,10 @@
     regions       [{id, label, parent, probability, unknown, predicted, area_m2, position_m [x, y, z], hull_m [[x, y]],
                     places [id], objects [id], adjacent [region id],
                     transitions [{region, edge [place id inside, outside], position_m, clearance_m, door}]}]
-    zones         [{label, regions [id]}]         layer above: adjacent regions whose labels share a parent in the prior
+    zones         [{label, regions [id]}]         the level above
+    levels        [{level, id, label, probability, members, member_ids, area_m2, position_m, parent_id, regions [id]}]
+                                                  zone, floor, building, district, from below; members says what
+                                                  member_ids are of, parent_id -1 = none
     places        [{id, position_m [x, y, z], radius_m, region, label, posterior {label: p}, unknown, predicted,
                     frontier {direction [x, y, z], area_m2}, ellipse {half_axes_m, angle_rad}, hull_m [[x, y]]}]
     objects       [{id, label, probability, known, position_m, min_m, max_m, frames, place}]   place = the nearest
@@ -28,6 +31,7 @@ from prior_sg.deploy.json_text import json_text
 from prior_sg.deploy.showing.map import draw_map
 from prior_sg.deploy.showing.places import draw_places
 from prior_sg.deploy.truth import GroundTruth
+from prior_sg.schemas.levels import LevelName, regions_in
 from prior_sg.schemas.objects import SceneObject
 from prior_sg.schemas.places import VoxelMap
 from prior_sg.schemas.regions import NO_REGION
@@ -71,6 +75,9 @@ def scene_json(scene: Scene) -> dict[str, Any]:
             for region in scene.regions
         ],
         "zones": [{"label": label, "regions": ids} for label, ids in zones(scene)],
+        "levels": [
+            msgspec.to_builtins(node) | {"regions": regions_of(scene, node.level)[node.id]} for node in scene.nodes
+        ],
         "places": [
             _place_json(scene, row, names, predicted)
             | _opening_json(frontiers.get(place_id))
@@ -110,9 +117,14 @@ def objects_with_places(scene: Scene) -> list[tuple[SceneObject, int | None]]:
 
 
 def zones(scene: Scene) -> list[tuple[str, list[int]]]:
-    """The layer above the regions: label and region ids of each connected set of regions with one parent, sorted by
-    the smallest id. Regions without a parent belong to none.
+    """The level above the regions: label and region ids of each zone, sorted by the smallest id.
+
+    Of a scene that was stored before there were levels, each connected set of regions with one parent.
     """
+    if scene.nodes:
+        held = regions_of(scene, "zone")
+        found = [(node.label, held[node.id]) for node in scene.nodes if node.level == "zone"]
+        return sorted(found, key=lambda zone: zone[1])
     parents = {region.id: region.parent for region in scene.regions if region.parent}
     zone_of = {region: region for region in parents}
     for a, b in sorted(adjacent_regions(scene)):
@@ -123,6 +135,14 @@ def zones(scene: Scene) -> list[tuple[str, list[int]]]:
     for region, zone in sorted(zone_of.items()):
         members.setdefault(zone, []).append(region)
     return [(parents[zone], ids) for zone, ids in sorted(members.items())]
+
+
+def regions_of(scene: Scene, level: LevelName) -> dict[int, list[int]]:
+    """Ids of the regions of each node of a level, by the node's id."""
+    held: dict[int, list[int]] = {node.id: [] for node in scene.nodes if node.level == level}
+    for region, node in sorted(regions_in(scene.nodes, level).items()):
+        held[node].append(region)
+    return held
 
 
 def _place_json(scene: Scene, row: int, names: dict[int, str], predicted: set[int]) -> dict[str, Any]:

@@ -224,15 +224,15 @@ def _graph(canvas: Canvas, prior: Prior, corner: Point, side_px: float) -> None:
     """Discs as large as P(r | E0), coloured by zone; lines as dark as P(ri <-> rj); each region's telling objects."""
     space = side_px - 190
     at = layout(prior.adjacency) * space + np.array(corner) + (95, 70)
-    zones = list(dict.fromkeys(region.parent for region in prior.regions if region.parent))
+    zones = list(dict.fromkeys(filter(None, prior.zones)))
     for i in range(len(prior.regions)):
         for j in range(i):
             if (touch := float(prior.adjacency[i, j])) >= SHOWN_EDGE:
                 shade = round(225 - 150 * touch)
                 canvas.line(tuple(at[i]), tuple(at[j]), (shade, shade, shade), 0.6 + 4 * touch)
-    for (x, y), region, merit in zip(at.tolist(), prior.regions, merits(prior), strict=True):
+    for (x, y), region, zone, merit in zip(at.tolist(), prior.regions, prior.zones, merits(prior), strict=True):
         radius = 8 + 60 * math.sqrt(region.existence / math.pi)
-        canvas.disc((x, y), radius, _zone_color(zones, region.parent))
+        canvas.disc((x, y), radius, _zone_color(zones, zone))
         best = [prior.objects[j].name for j in np.argsort(-merit, kind="stable")[:3]]
         canvas.text(
             (x, y + radius + 15), f"{region.name} {100 * region.existence:.0f} %", 14, INK, anchor="middle", halo=True

@@ -13,6 +13,7 @@ from prior_sg.deploy.showing.map import FURNITURE_M
 from prior_sg.deploy.showing.places import SHOWN_AREA_M2
 from prior_sg.deploy.viewing.footprint import Footprint, Grounds
 from prior_sg.deploy.viewing.shapes import Arrows, Lines, Mesh, Name, Picture, Points, dashed
+from prior_sg.schemas.levels import LEVELS, LevelName, LevelNode, regions_in
 from prior_sg.schemas.names import shown
 from prior_sg.schemas.objects import SceneObject
 from prior_sg.schemas.regions import NO_REGION, Region
@@ -27,6 +28,7 @@ FAINTER = 0.45  # edges than their places
 ABOVE_FLOOR_M = 0.14  # of regions, so that floor points do not shine through
 FLOOR_OPACITY, PREDICTED_OPACITY, DIMMED_OPACITY = 0.5, 0.16, 0.1
 DASH_M = 0.18
+ABOVE_REGIONS_M, LEVEL_NAME_ABOVE_M = 0.06, 0.9  # outlines of the levels above, each so much over the one below
 PATH_DASH_M, ROBOT_NAME_ABOVE_M = 0.12, 0.45
 SHORT_ARROW_M, LONG_ARROW_M = 0.25, 0.8
 CORNERS = np.array([(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)])
@@ -70,6 +72,7 @@ class Painter:
 
     theme: Theme = DARK
     colors: LabelColors = field(default_factory=LabelColors)
+    level_colors: LabelColors = field(default_factory=LabelColors)
     grounds: Grounds = field(default_factory=Grounds)
 
     def ground(self, scene: Scene) -> dict[int, Footprint]:
@@ -87,6 +90,7 @@ class Painter:
         ground = self.ground(scene)
         for region in scene.regions:
             picture |= _region(self.theme, region, ground.get(region.id), colors[region.label], lit)
+        picture |= _levels(scene, ground, self.level_colors.of(node.label for node in scene.nodes))
         tints = _place_tints(self.theme, scene, colors)
         picture |= _places(self.theme, scene, tints, lit)
         picture |= _edges(self.theme, scene, tints)
@@ -117,6 +121,30 @@ def _region(theme: Theme, region: Region, ground: Footprint | None, color: Color
         f"{root}/outline": Lines(outline, np.array(tint, np.uint8), 4.0 if found or chosen else 2.0),
         f"{root}/name": name,
     }
+
+
+def _levels(scene: Scene, ground: dict[int, Footprint], colors: dict[str, Color]) -> Picture:
+    """Of each node above regions the outlines of its regions, and its name; a layer for each level."""
+    picture: Picture = {}
+    held: dict[tuple[LevelName, int], list[np.ndarray]] = {}
+    for level in LEVELS:
+        for region, node in regions_in(scene.nodes, level).items():
+            if region in ground:
+                held.setdefault((level, node), []).append(ground[region].outline)
+    for node in scene.nodes:
+        lifted = np.array((0, 0, ABOVE_FLOOR_M + ABOVE_REGIONS_M * (2 + LEVELS.index(node.level))), np.float32)
+        root, (x, y, z) = f"/{node.level}s/{node.id}", node.position_m
+        if outlines := held.get((node.level, node.id)):
+            tint = np.array(colors[node.label], np.uint8)
+            picture[f"{root}/outline"] = Lines(np.concatenate(outlines) + lifted, tint, 3.5)
+        above_m = LEVEL_NAME_ABOVE_M * (1 + LEVELS.index(node.level))
+        picture[f"{root}/name"] = Name(level_title(node), (x, y, z + above_m), 1.1)
+    return picture
+
+
+def level_title(node: LevelNode) -> str:
+    """What a node of a level is called: several may have one label."""
+    return f"{shown(node.label)} ({node.level} {node.id})"
 
 
 def title_of(region: Region) -> str:

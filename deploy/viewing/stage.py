@@ -32,6 +32,10 @@ class Layer:
 LAYERS = (
     Layer("map", "Map points", True),
     Layer("regions", "Regions", True),
+    Layer("zones", "Zones", False),
+    Layer("floors", "Floors", False),
+    Layer("buildings", "Buildings", False),
+    Layer("districts", "Districts", False),
     Layer("places", "Places", True),
     Layer("edges", "Edges", True),
     Layer("objects", "Objects", True),

@@ -9,9 +9,10 @@ import numpy as np
 from prior_sg.deploy.api.client import Health
 from prior_sg.deploy.inspecting.explain import gains
 from prior_sg.deploy.showing.colors import Color
-from prior_sg.deploy.viewing.drawing import edges_left_out
+from prior_sg.deploy.viewing.drawing import edges_left_out, level_title
 from prior_sg.deploy.viewing.search import Hit
 from prior_sg.deploy.viewing.ways import Stop, Way
+from prior_sg.schemas.levels import nodes_above
 from prior_sg.schemas.names import shown
 from prior_sg.schemas.queries import Thing
 from prior_sg.schemas.regions import NO_REGION, PosteriorReply, Region
@@ -105,6 +106,8 @@ def region_story(scene: Scene, region: Region) -> str:
         if ways
         else "leads nowhere yet",
     ]
+    if above := nodes_above(scene.nodes).get(region.id):
+        lines.append("in " + ", ".join(text_of(level_title(node)) for node in above))
     if region.predicted:
         lines.insert(0, "a prediction from its surroundings: barely seen itself")
     bars = _bars(candidates(scene, region), AGREES)

@@ -3,7 +3,19 @@
 import msgspec
 import numpy as np
 
-from prior_sg.schemas import features, frames, objects, places, priors, queries, regions, scene, status, succession
+from prior_sg.schemas import (
+    features,
+    frames,
+    levels,
+    objects,
+    places,
+    priors,
+    queries,
+    regions,
+    scene,
+    status,
+    succession,
+)
 from prior_sg.schemas.codec import M, Message
 
 CAMERA = frames.Intrinsics(640, 480, 525.5, 526.5, 319.5, 239.5)
@@ -41,6 +53,24 @@ KEYFRAME = frames.Keyframe(
     camera="left",
 )
 TASK = priors.Task(robot="r", stamp_ns=2**60, environment="home", task="tidy up", regions=["kitchen", "Küche"])
+LEVEL_PRIOR = levels.LevelPrior(
+    name="zone",
+    task="which zone?",
+    entries=[levels.Entry(name="day zone", existence=0.75), levels.Entry(name="way", existence=0.25)],
+    parents=f4([0.875, 0.125], [0.25, 0.75]),
+    adjacency=f4([1.0, 0.5], [0.5, 1.0]),
+)
+LEVEL_NODE = levels.LevelNode(
+    level="floor",
+    id=3,
+    label="floor 0",
+    probability=0.75,
+    member_ids=[2, 6],
+    members="zone",
+    area_m2=12.5,
+    position_m=(1.0, 2.0, 0.5),
+    parent_id=1,
+)
 PRIOR = priors.Prior(
     environment="home",
     task="tidy up",
@@ -91,6 +121,7 @@ PRIOR = priors.Prior(
         adjacency=f4([0.3, 0.4], [0.4, 0.3]),
         support=f4(1.0, 0.5),
     ),
+    levels=[LEVEL_PRIOR],
 )
 EVIDENCE = priors.PriorEvidence(
     robot="r",
@@ -147,6 +178,7 @@ QUESTIONS = [
     queries.BeliefsOf(region=4, limit=2),
     queries.WordsInUse(),
     queries.AnswersTo(text="eat", regions={"kitchen": 0.75}, objects={"stove": 0.5}, what="region", limit=4),
+    queries.NodesOf(level="zone", label="ward", id=2, region=4, limit=3),
 ]
 THING = queries.Thing(
     what="object",
@@ -207,6 +239,7 @@ ANSWERS = [
         objects={"stove": 2},
     ),
     queries.Ranking(things=[THING], note="n", reason="r"),
+    queries.Nodes(nodes=[queries.NodeWithRegions(node=LEVEL_NODE, regions=[THING])], total=2, reason="r"),
 ]
 
 EXAMPLES: list[Message] = [
@@ -291,6 +324,7 @@ EXAMPLES: list[Message] = [
     priors.TaskRequest(robot="r"),
     priors.TaskInForce(robot="r", task=TASK),
     PRIOR.spread,
+    LEVEL_PRIOR,
     PRIOR,
     priors.PriorRequest(digest="d", environment="home", task="tidy up", regions=["kitchen"]),
     priors.PriorList(priors=[PRIOR], reason="r", pending=True),
@@ -333,6 +367,8 @@ EXAMPLES: list[Message] = [
         energy=-1.5,
         predicted_ids=i8(1),
         events=[regions.RegionEvent(kind="split", region=4, label="kitchen", other=5, former_label="hall")],
+        removed_nodes=[("zone", 5)],
+        nodes=[LEVEL_NODE],
     ),
     regions.PosteriorRequest(robot="r", place_id=1),
     regions.PosteriorReply(
@@ -426,6 +462,7 @@ EXAMPLES: list[Message] = [
         hulls_m=f4([0, 0], [1, 0], [0, 1]),
         origin_m=(512e3, 5.4e6, 312.0),
         revision=9,
+        nodes=[LEVEL_NODE],
     ),
     queries.SceneQuery(robot="r", questions=QUESTIONS),
     queries.SceneAnswer(robot="r", revision=2, stamp_ns=3, answers=ANSWERS),

@@ -13,7 +13,8 @@ import numpy as np
 from scipy import ndimage
 
 from prior_sg.deploy.evaluation.worlds.outline import Rect, Segment, outline, shared_edges
-from prior_sg.deploy.truth import TrueObject, TrueRegion
+from prior_sg.deploy.truth import TrueNode, TrueObject, TrueRegion
+from prior_sg.schemas.levels import LEVELS, LevelName
 
 STEP_M = 0.05
 WALL_M = 0.1
@@ -57,6 +58,7 @@ class Room:
     portals: list[tuple[float, float]] = field(default_factory=list)  # where one comes in; they stay joined
     kept_free: list[Rect] = field(default_factory=list)
     taken: list[Rect] = field(default_factory=list)  # footprints of what stands on the floor
+    within: dict[LevelName, tuple[str, int]] = field(default_factory=dict)  # label and number of the nodes above
 
     @property
     def area_m2(self) -> float:
@@ -190,6 +192,14 @@ class Plan:
             TrueRegion(number, room.label, outline(room.rects, margin), room.z_m - SLAB_M, room.top_m)
             for number, (room, margin) in enumerate(zip(self.rooms, inset, strict=True))
         )
+
+    def nodes(self) -> tuple[TrueNode, ...]:
+        """The ground truth of the levels above."""
+        held: dict[tuple[int, str, int], list[int]] = {}
+        for number, room in enumerate(self.rooms):
+            for level, (label, which) in room.within.items():
+                held.setdefault((LEVELS.index(level), label, which), []).append(number)
+        return tuple(TrueNode(LEVELS[rank], label, tuple(ids)) for (rank, label, _), ids in sorted(held.items()))
 
     def _behind(self, room: Room, edge: Segment) -> bool:
         """Whether another room lies on the other side."""

@@ -104,7 +104,7 @@ def _drawn(kind: str, seed: int, walk: Manner, draw: int) -> World:
         kind=kind,
         seed=seed,
         environment=plan.environment,
-        truth=GroundTruth(plan.regions()),
+        truth=GroundTruth(plan.regions(), plan.nodes()),
         objects=tuple(plan.objects),
         intrinsics=CAMERA,
         grid=grid,

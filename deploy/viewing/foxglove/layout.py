@@ -6,9 +6,9 @@ from foxglove import layouts as fl
 
 from prior_sg.deploy.viewing.drawing import DARK
 from prior_sg.deploy.viewing.foxglove.shapes import WORLD
-from prior_sg.deploy.viewing.foxglove.stream import CALIBRATION, DEPTH, IMAGE, LAYERS, MAP, NOTES, PLACES, SCENE
+from prior_sg.deploy.viewing.foxglove.stream import ABOVE, CALIBRATION, DEPTH, IMAGE, LAYERS, MAP, NOTES, PLACES, SCENE
 
-HIDDEN = ("unnamed", "frontiers")  # as on the live page
+HIDDEN = (*ABOVE, "unnamed", "frontiers")  # as on the live page
 PLACE_PX, SURFACE_PX = 7.0, 2.0
 
 

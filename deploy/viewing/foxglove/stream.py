@@ -37,10 +37,20 @@ from prior_sg.deploy.viewing.drawing import Painter
 from prior_sg.deploy.viewing.foxglove.shapes import CAMERA, WORLD, cloud, entity, quaternion_of, stamp_of
 from prior_sg.deploy.viewing.shapes import Picture, Points, same
 from prior_sg.schemas.frames import Intrinsics
+from prior_sg.schemas.levels import LEVELS
 from prior_sg.schemas.regions import Region
 from prior_sg.schemas.scene import Scene
 
-LAYERS = ("regions", "edges", "objects", "unnamed", "frontiers", "trajectory")  # of entities; the rest are points
+ABOVE = tuple(f"{level}s" for level in LEVELS)  # the levels above regions
+LAYERS = (
+    "regions",
+    *ABOVE,
+    "edges",
+    "objects",
+    "unnamed",
+    "frontiers",
+    "trajectory",
+)  # of entities; the rest are points
 PLACES, MAP, IMAGE, CALIBRATION = "/map/places", "/map/surface", "/camera/image", "/camera/calibration"
 DEPTH = "/camera/depth"
 TRANSFORMS, SCENE, NOTES = "/tf", "/scene", "/notes"

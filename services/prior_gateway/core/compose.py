@@ -24,6 +24,7 @@ import numpy as np
 from prior_sg.schemas.priors import ObjectPrior, Prior, Provenance, RegionPrior, Task
 from prior_sg.services.prior_gateway.core.config import Config
 from prior_sg.services.prior_gateway.core.knowledge import Chosen, Environment, RegionEntry, TaskEntry
+from prior_sg.services.prior_gateway.core.levels import levels_of
 from prior_sg.services.prior_gateway.core.matching import choose_regions, match_environment, match_task, words
 
 # Nouns that take no article.
@@ -95,15 +96,19 @@ def compose(
     extra = entry.objects if entry else {}
     objects = _object_names(chosen, extra)
     existence = _existence(chosen, cfg.named_existence_uniform if task.regions else 0.0)
+    adjacency = _adjacency(chosen, cfg)
+    levels = levels_of(task.task, chosen, existence, adjacency)
+    regions = [_region(one, share, bool(task.regions), cfg) for one, share in zip(chosen, existence, strict=True)]
     return Prior(
         environment=task.environment,
         task=task.task,
         vocabulary=task.regions,
-        regions=[_region(one, share, bool(task.regions), cfg) for one, share in zip(chosen, existence, strict=True)],
+        regions=[msgspec.structs.replace(one, parent="") for one in regions] if levels else regions,
         objects=[_object(name, chosen, cfg) for name in objects],
         containment=_containment(chosen, objects, extra, cfg).astype(np.float32),
-        adjacency=_adjacency(chosen, cfg).astype(np.float32),
+        adjacency=adjacency.astype(np.float32),
         provenance=provenance,
+        levels=levels,
     )
 
 

@@ -4,6 +4,8 @@ from dataclasses import dataclass
 
 import msgspec
 
+from prior_sg.schemas.levels import NamedLevel
+
 
 class Size(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
     """What size an object usually is: the line of numbers in `library/sizes.toml`; metres."""
@@ -23,7 +25,7 @@ class RegionEntry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     existence: float  # share of the environment's places expected to be of this region; only ratios matter
     objects: dict[str, float]  # P(o | r) of the objects worth naming; the rest has Config.unlisted_containment
     synonyms: list[str] = []
-    parent: str = ""  # zone above the region
+    parent: str = ""  # zone above the region, unless a level of the environment says it
     inclination_deg: float = 0.0  # of the walkable surface against the horizontal
     inclination_std_deg: float = 11.5
     query_radius_m: float = 0.75  # r_Q
@@ -41,6 +43,18 @@ class TaskEntry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     objects: dict[str, dict[str, float]] = {}  # objects that matter to this task only -> base region -> P(o | r)
 
 
+class LevelEntry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What the parts of one level above regions are called. Of several of one name the task chooses, by keywords."""
+
+    name: NamedLevel
+    entries: list[str]
+    parents: dict[str, str | dict[str, float]]  # base region -> the entry that it is in, or P(entry | region)
+    otherwise: str | dict[str, float] = {}  # of the base regions not listed; without it, any entry alike
+    task: str = ""  # whose words the entries are
+    keywords: list[str] = []
+    adjacent: dict[str, dict[str, float]] = {}  # P(ei <-> ej), written at one of the two
+
+
 class Environment(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Everything known about one kind of environment."""
 
@@ -49,6 +63,7 @@ class Environment(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     tasks: list[TaskEntry]
     synonyms: list[str] = []
     objects: dict[str, list[str]] = {}  # further phrases of an object
+    levels: list[LevelEntry] = []  # above the regions, beyond the zones that they name as their parents
     sizes: dict[str, Size] = {}  # of objects that are of another size here than elsewhere
 
     def region(self, name: str) -> RegionEntry:
@@ -98,6 +113,8 @@ def check_environment(environment: Environment) -> None:
         raise ValueError(f"{where}: region names are not unique")
     for entry in environment.regions:
         _check_region(entry, environment, where)
+    for level in environment.levels:
+        _check_level(level, names, f"{where}, level {level.name!r}")
     if [task.generic for task in environment.tasks].count(True) != 1:
         raise ValueError(f"{where}: exactly one task must be generic")
     for task in environment.tasks:
@@ -106,6 +123,22 @@ def check_environment(environment: Environment) -> None:
             raise ValueError(f"{where}, task {task.name!r}: not a partition: {sorted(set(members) ^ set(names))}")
         if unknown := {region for held in task.objects.values() for region in held} - set(names):
             raise ValueError(f"{where}, task {task.name!r}: objects in unknown regions {sorted(unknown)}")
+
+
+def _check_level(level: LevelEntry, regions: list[str], where: str) -> None:
+    if not level.entries or len(set(level.entries)) != len(level.entries):
+        raise ValueError(f"{where}: needs entries of different names")
+    if unknown := sorted(set(level.parents) - set(regions)):
+        raise ValueError(f"{where}: parents of unknown regions {unknown}")
+    for said in (*level.parents.values(), level.otherwise):
+        shares = {said: 1.0} if isinstance(said, str) else said
+        if unknown := sorted(set(shares) - set(level.entries)):
+            raise ValueError(f"{where}: parents {unknown}, which are no entries")
+        if not all(0 < share <= 1 for share in shares.values()) or sum(shares.values()) > 1 + 1e-9:
+            raise ValueError(f"{where}: {shares} are no probabilities")
+    for one, others in level.adjacent.items():
+        if not {one, *others} <= set(level.entries) or not all(0 < value <= 1 for value in others.values()):
+            raise ValueError(f"{where}: adjacency of {one!r} is not of its entries, or not in (0, 1]")
 
 
 def _check_region(entry: RegionEntry, environment: Environment, where: str) -> None:

@@ -11,6 +11,7 @@ from typing import Literal, NamedTuple
 import msgspec
 import numpy as np
 
+from prior_sg.schemas.levels import LevelName, LevelNode, rank
 from prior_sg.schemas.objects import ObjectDelta, SceneObject
 from prior_sg.schemas.places import PlaceDelta
 from prior_sg.schemas.priors import Task
@@ -95,6 +96,7 @@ class Graph:
     neighbours: dict[int, set[int]] = field(default_factory=dict)
     sightings: dict[int, Sighting] = field(default_factory=dict)  # by frame id
     regions: dict[int, Region] = field(default_factory=dict)
+    nodes: dict[tuple[LevelName, int], LevelNode] = field(default_factory=dict)  # of the levels above regions
     beliefs: dict[int, Belief] = field(default_factory=dict)  # by place id
     objects: dict[int, SceneObject] = field(default_factory=dict)
     alignment: Alignment = field(default_factory=Alignment)
@@ -173,6 +175,7 @@ def apply_regions(graph: Graph, delta: RegionDelta) -> Changes:
     changes = Changes(replaced=delta.snapshot or delta.epoch != graph.region_cursor.epoch)
     if changes.replaced:
         graph.regions.clear()
+        graph.nodes.clear()
         graph.beliefs.clear()
     elif tuple(delta.labels) != graph.alignment.labels:
         changes.beliefs.update(graph.beliefs)
@@ -186,6 +189,9 @@ def apply_regions(graph: Graph, delta: RegionDelta) -> Changes:
     for entry in delta.regions:
         graph.regions[entry.id] = entry
         changes.regions.add(entry.id)
+    for key in delta.removed_nodes:
+        graph.nodes.pop(key, None)
+    graph.nodes.update({(node.level, node.id): node for node in delta.nodes})
     columns = (delta.place_ids.tolist(), delta.place_regions.tolist(), delta.posteriors, delta.unknown.tolist())
     predicted = set(delta.predicted_ids.tolist())
     for place, region, posterior, unknown in zip(*columns, strict=True):
@@ -289,6 +295,7 @@ def scene(graph: Graph) -> Scene:
         objects=[graph.objects[number] for number in sorted(graph.objects)],
         origin_m=graph.origin_m,
         revision=graph.revision,
+        nodes=sorted(graph.nodes.values(), key=rank),
         **_details(graph),
     )
 

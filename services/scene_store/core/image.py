@@ -5,6 +5,7 @@ from typing import Annotated
 import numpy as np
 
 from prior_sg.schemas.codec import Message, Shape
+from prior_sg.schemas.levels import LevelNode
 from prior_sg.schemas.objects import SceneObject
 from prior_sg.schemas.priors import Task
 from prior_sg.schemas.regions import Region
@@ -44,6 +45,7 @@ class GraphImage(Message, frozen=True, kw_only=True):
     predicted: Annotated[np.ndarray, Shape("bool", "belief")]
     objects: list[SceneObject]
     given: Task | None  # the newest task
+    nodes: list[LevelNode] = []
 
 
 def image_of(graph: core.Graph) -> GraphImage:
@@ -82,6 +84,7 @@ def image_of(graph: core.Graph) -> GraphImage:
         predicted=np.array([belief.predicted for belief in beliefs], np.bool_),
         objects=list(graph.objects.values()),
         given=graph.task,
+        nodes=list(graph.nodes.values()),
     )
 
 
@@ -115,6 +118,7 @@ def _restore_regions(graph: core.Graph, image: GraphImage) -> None:
         image.prior_digest, image.environment, image.task, image.space, tuple(image.labels), image.energy
     )
     graph.regions = {entry.id: entry for entry in image.regions}
+    graph.nodes = {(node.level, node.id): node for node in image.nodes}
     columns = (image.believed.tolist(), image.posteriors, image.unknown.tolist(), image.predicted.tolist())
     for (place, region), posterior, unknown, predicted in zip(*columns, strict=True):
         graph.beliefs[place] = core.Belief(region, posterior, unknown, predicted)

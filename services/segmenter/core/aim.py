@@ -7,10 +7,12 @@ import numpy as np
 
 from prior_sg.schemas.codec import Message, copied
 from prior_sg.schemas.features import TextEmbeddings, TextRequest
+from prior_sg.schemas.levels import LevelPrior
 from prior_sg.schemas.priors import Prior, PriorList, Task, TaskInForce, TaskRequest
 from prior_sg.services import intent
 from prior_sg.services.intent import Intent
 from prior_sg.services.segmenter.core.config import Config
+from prior_sg.services.segmenter.core.layers.stacking import LevelInForce
 
 
 @dataclass(frozen=True)
@@ -21,6 +23,7 @@ class PriorInForce:
     digest: str
     text: TextEmbeddings
     pairwise: np.ndarray  # (label, label), see border_costs
+    levels: dict[str, LevelInForce]  # above the regions, by name
 
     @property
     def labels(self) -> list[str]:
@@ -99,7 +102,8 @@ class Aim:
         text = self.text_of(space, region_concepts(prior, cfg.object_phrases))
         if text is None:
             return None
-        self.in_force = PriorInForce(prior, digest, text, border_costs(prior, cfg))
+        levels = {level.name: LevelInForce(level, border_costs(level, cfg)) for level in prior.levels_above}
+        self.in_force = PriorInForce(prior, digest, text, border_costs(prior, cfg), levels)
         return self.in_force
 
     def translate(self, text: TextEmbeddings | None) -> None:
@@ -138,7 +142,7 @@ class Aim:
         return self.in_force is not None and self.in_force.digest == digest
 
 
-def border_costs(prior: Prior, cfg: Config) -> np.ndarray:
+def border_costs(prior: Prior | LevelPrior, cfg: Config) -> np.ndarray:
     """Pairwise costs (label, label), zero on the diagonal: eq. pairwise_potential without the edge's weight, and with
     the prior's adjacency against chance, see AdjacencyConfig."""
     log_adjacency = np.log(np.maximum(prior.adjacency.astype(np.float64), cfg.probability_floor))

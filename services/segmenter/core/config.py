@@ -13,6 +13,7 @@ from prior_sg.services.segmenter.core.evidence.handover import SpacesConfig
 from prior_sg.services.segmenter.core.evidence.kernel import KernelConfig
 from prior_sg.services.segmenter.core.experts import REGISTRY
 from prior_sg.services.segmenter.core.experts.context import ObjectSettings
+from prior_sg.services.segmenter.core.layers.stacking import LayersConfig
 from prior_sg.services.segmenter.core.map.inclination import GeometryConfig
 from prior_sg.services.segmenter.core.objects.sizes import SizeConfig
 from prior_sg.services.segmenter.core.objects.tracks import TrackingConfig
@@ -68,6 +69,7 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
     information: InformationConfig = msgspec.field(default_factory=InformationConfig)  # beyond the paper
     unmixing: UnmixingConfig = msgspec.field(default_factory=UnmixingConfig)  # beyond the paper
     region_cost: float = 20.0  # of each region, in the energy's unit; 0 = none (paper)
+    layers: LayersConfig = msgspec.field(default_factory=LayersConfig)  # beyond the paper
     balance: BalanceConfig = msgspec.field(default_factory=BalanceConfig)  # beyond the paper
     adaptation: AdaptationConfig = msgspec.field(default_factory=AdaptationConfig)  # beyond the paper
     temperature: float = 3.0  # of the posteriors, see prior_sg.services.segmenter.core.energy.posteriors

@@ -26,7 +26,10 @@ from prior_sg.services.segmenter.core.state import State
 def publish(state: State, events: list[RegionEvent], everything: bool, cfg: Config) -> RegionDelta | None:
     """What followers do not know yet; with `everything`, all."""
     places, regions = state.map.places, state.regions
+    changed = everything or bool(regions.disturbed)
     regions.describe(_described(state, everything, cfg))
+    if changed:
+        _renew_layers(state, cfg)
     fresh = np.arange(len(places.labels)) if everything else np.flatnonzero(places.unbelieved)
     places.unbelieved[:] = False
     return regions.ledger.tell(
@@ -35,9 +38,22 @@ def publish(state: State, events: list[RegionEvent], everything: bool, cfg: Conf
         _beliefs(state, fresh, cfg),
         regions.known,
         events,
+        nodes=state.layers.known,
         everything=everything,
         tolerance=cfg.posterior_change,
     )
+
+
+def _renew_layers(state: State, cfg: Config) -> None:
+    """Find the levels above the regions again, and name each region's zone."""
+    regions = state.regions
+    assert regions.storeys is not None
+    levels = state.aim.aligned.levels
+    state.layers.renew(regions.known, state.map.places, regions.storeys, levels, cfg.layers)
+    for number, region in regions.known.items():
+        zone = state.layers.zone_of(number)
+        if zone != region.parent:
+            regions.known[number] = msgspec.structs.replace(region, parent=zone)
 
 
 def _head(state: State) -> RegionDelta:
@@ -118,7 +134,6 @@ def _believed(state: State, rows: np.ndarray, cfg: Config) -> dict[str, Any]:
     predicted = state.seen.evidence.trust[places.slots[rows]] < cfg.predicted_trust
     return {
         "label": state.aim.aligned.labels[label],
-        "parent": state.aim.aligned.prior.regions[label].parent,
         "probability": round(float(places.posteriors[rows, label].mean()), 2),
         "unknown": round(1.0 - float(known_mass(state, rows, cfg).mean()), 2),
         "predicted": bool(predicted.mean() > 0.5),

@@ -11,6 +11,7 @@ from prior_sg.services.segmenter.core.energy.solver import Solver
 from prior_sg.services.segmenter.core.evidence.handover import Spaces
 from prior_sg.services.segmenter.core.evidence.seen import Seen
 from prior_sg.services.segmenter.core.labelling import Labelling
+from prior_sg.services.segmenter.core.layers.layer_map import LayerMap
 from prior_sg.services.segmenter.core.map.place_map import PlaceMap
 from prior_sg.services.segmenter.core.objects.object_map import ObjectMap
 from prior_sg.services.segmenter.core.objects.tracks import Tracks
@@ -31,6 +32,7 @@ class State:
     labelling: Labelling
     map: PlaceMap = field(default_factory=PlaceMap)
     regions: RegionMap = field(default_factory=RegionMap)
+    layers: LayerMap = field(default_factory=LayerMap)
     corrections: PoseCorrections = field(default_factory=PoseCorrections)
     report: PriorReport = field(default_factory=PriorReport)
     catching_up: CatchingUp = field(default_factory=CatchingUp)

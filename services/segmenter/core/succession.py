@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from prior_sg.schemas.features import Pyramid
+from prior_sg.schemas.levels import LEVELS, LevelName, LevelNode
 from prior_sg.schemas.objects import Detections, ObjectDelta, SceneObject
 from prior_sg.schemas.regions import NO_REGION, Region, RegionDelta
 from prior_sg.schemas.scene import Scene
@@ -32,10 +33,12 @@ class Legacy:
     place_regions: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))  # of each
     seen_ids: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))  # places that were looked at
     regions: list[Region] = field(default_factory=list)
+    nodes: list[LevelNode] = field(default_factory=list)
     objects: list[SceneObject] = field(default_factory=list)
     digest: str = ""  # of the prior that regions were labelled by
     next_region_id: int = 0
     next_object_id: int = 0
+    next_node_ids: dict[LevelName, int] = field(default_factory=dict)  # of the levels above regions
 
     def hear(self, told: RegionDelta | ObjectDelta | Scene) -> None:
         """Take a snapshot, or the stored scene."""
@@ -43,7 +46,7 @@ class Legacy:
             self.place_ids, self.place_regions = np.array(told.place_ids), np.array(told.place_regions)
             labelled = self.place_regions != NO_REGION
             self.seen_ids = np.setdiff1d(self.place_ids[labelled], told.predicted_ids)
-            self.regions, self.digest = list(told.regions), told.prior_digest
+            self.regions, self.nodes, self.digest = list(told.regions), list(told.nodes), told.prior_digest
             self.next_region_id = max(self.next_region_id, *(region.id + 1 for region in told.regions), 0)
         if isinstance(told, ObjectDelta | Scene):
             self.objects = list(told.objects)
@@ -98,6 +101,7 @@ class CatchingUp:
                     self.legacy.hear(told)
             self.legacy.next_region_id = max(self.legacy.next_region_id, bequest.next_ids.get("regions", 0))
             self.legacy.next_object_id = max(self.legacy.next_object_id, bequest.next_ids.get("objects", 0))
+            self.legacy.next_node_ids = {level: bequest.next_ids.get(level, 0) for level in LEVELS}
 
     def tick(self, seen: int) -> None:
         """Half a second has passed; so many of the places that were looked at before have been again."""

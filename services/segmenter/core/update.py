@@ -265,6 +265,7 @@ def _tell_all(state: State, cfg: Config) -> Iterator[RegionDelta | ObjectDelta]:
     assert legacy is not None
     state.map.places.regions = legacy.regions_of(state.map.graph.ids)
     state.regions.inherit(legacy.regions, legacy.next_region_id)
+    state.layers.inherit(legacy.nodes, legacy.next_node_ids)
     state.objects.inherit(legacy.objects, legacy.next_object_id, cfg.tracking)
     yield from follow_objects(state, cfg)
     yield from _segment(state, switched=False, idle=False, cfg=cfg)
@@ -276,7 +277,7 @@ def _segment(state: State, switched: bool, idle: bool, cfg: Config) -> Iterator[
         return
     inference.evaluate_experts(state, idle or switched, cfg)
     inference.settle(state, cfg, hurried=not (idle or switched))
-    changes = state.regions.partition(state.map, state.aim.in_force.labels)
+    changes = state.regions.partition(state.map, state.aim.in_force.labels, cfg.layers.storeys)
     inference.believe(state, cfg)
     delta = report.publish(state, changes, switched or state.regions.ledger.head is None, cfg)
     state.labelling.labelled()

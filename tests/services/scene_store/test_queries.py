@@ -9,6 +9,7 @@ import pytest
 
 from prior_sg.deploy.benches.queries import KINDS, LABELS, changed, synthetic_scene
 from prior_sg.schemas import queries as q
+from prior_sg.schemas.levels import LevelNode
 from prior_sg.schemas.places import PlaceDelta
 from prior_sg.schemas.priors import Task
 from prior_sg.schemas.regions import NO_REGION
@@ -343,3 +344,43 @@ def test_every_kind_of_question_about_an_empty_scene_has_an_answer():
     answers = reply(empty, q.SceneQuery(robot="r", questions=QUESTIONS)).answers
     for question, found in zip(QUESTIONS, answers, strict=True):
         assert isinstance(question, q.WordsInUse) or found.reason or not found.things, question
+
+
+def levelled():
+    """Regions 1 to 4 in two wards on one floor."""
+
+    def node(level, number, label, members, of):
+        return LevelNode(level=level, id=number, label=label, probability=1.0, member_ids=members, members=of)
+
+    nodes = [
+        node("zone", 2, "Ward", [1, 2], "region"),
+        node("zone", 6, "surgery", [3, 4], "region"),
+        node("floor", 0, "floor 0", [2, 6], "zone"),
+    ]
+    return Index(msgspec.structs.replace(SCENE, nodes=nodes))
+
+
+def regions_by_node(found):
+    return {(one.node.level, one.node.id): [region.id for region in one.regions] for one in found.nodes}
+
+
+def test_levels_are_asked_for_by_label_by_id_and_by_what_they_hold():
+    index = levelled()
+    assert regions_by_node(answer(index, q.NodesOf(label="ward"))) == {("zone", 2): [1, 2]}
+    assert regions_by_node(answer(index, q.NodesOf(level="zone", id=6))) == {("zone", 6): [3, 4]}
+    assert regions_by_node(answer(index, q.NodesOf(region=3))) == {("zone", 6): [3, 4], ("floor", 0): [1, 2, 3, 4]}
+    some = answer(index, q.NodesOf(limit=1))
+    assert some.total == 3 and len(some.nodes) == 1
+
+
+@pytest.mark.parametrize(
+    ("question", "reason"),
+    [
+        (q.NodesOf(region=10**6), "there is no region 1000000"),
+        (q.NodesOf(label="wart"), "no zone, floor, building or district is labelled 'wart'; there are: Ward"),
+        (q.NodesOf(level="zone", id=3), "there is no such zone; there are: zone 2 (Ward), zone 6 (surgery)"),
+        (q.NodesOf(level="district"), "the scene has no district yet"),
+    ],
+)
+def test_levels_that_are_not_there_are_told(question, reason):
+    assert answer(levelled(), question).reason.startswith(reason)

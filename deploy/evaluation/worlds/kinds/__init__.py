@@ -5,9 +5,11 @@ from collections.abc import Callable
 import numpy as np
 
 from prior_sg.deploy.evaluation.worlds.kinds.campus import campus
+from prior_sg.deploy.evaluation.worlds.kinds.clinic import clinic
 from prior_sg.deploy.evaluation.worlds.kinds.home import home
 from prior_sg.deploy.evaluation.worlds.kinds.hospital import hospital
 from prior_sg.deploy.evaluation.worlds.kinds.hotel import hotel
+from prior_sg.deploy.evaluation.worlds.kinds.house import house
 from prior_sg.deploy.evaluation.worlds.kinds.office import office
 from prior_sg.deploy.evaluation.worlds.kinds.school import school
 from prior_sg.deploy.evaluation.worlds.kinds.shop import shop
@@ -25,4 +27,6 @@ KINDS: dict[str, Callable[[np.random.Generator], Plan]] = {
     "school": school,
     "tower": tower,
     "campus": campus,
+    "house": house,
+    "clinic": clinic,
 }

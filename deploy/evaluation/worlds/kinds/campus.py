@@ -34,6 +34,10 @@ def campus(rng: np.random.Generator) -> Plan:
     for zone in zones:
         _dress(plan, zone)
     furnished(plan, *plan.rooms[len(zones) :])
+    for number, room in enumerate(plan.rooms):
+        inside = number >= len(zones)
+        room.within = {"building": ("building" if inside else "outdoors", 0), "floor": ("floor 0", int(inside))}
+        room.within["zone"] = ("indoors" if inside else "outdoors", 0)
     return plan
 
 

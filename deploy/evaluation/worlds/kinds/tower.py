@@ -25,17 +25,17 @@ def tower(rng: np.random.Generator) -> Plan:
     levels = [Level(STOREY_M * number, STOREY_M - SLAB_M) for number in range(count)]
     for level in levels:
         plan.storey(shell, level)
-    staircase = _staircase(plan, south, levels)
+    stairs = staircase(plan, south, levels)
     for level in levels:
         corridor = _storey(plan, shell.cut_y([south, LANDING_M, north]), level, offices)
-        plan.door(corridor, staircase, 0.9)
+        plan.door(corridor, stairs, 0.9)
     for room in plan.rooms[1:]:
         plan.window(room, shell)
     furnished(plan, *plan.rooms[1:])
     return plan
 
 
-def _staircase(plan: Plan, south: float, levels: list[Level]) -> Room:
+def staircase(plan: Plan, south: float, levels: list[Level]) -> Room:
     """Two flights for each storey, beside each other with a wall between."""
     run = length_m(STOREY_M / 2)
     shaft = Rect(0, south, 2 * FLIGHT_M + WALL_M, south + LANDING_M + run + LANDING_M)

@@ -321,7 +321,7 @@ function regionTold() {
   const inside = scene.objects.filter((item) => region.objects.includes(item.id) && item.label).map((item) => item.label);
   return {
     title: region.label, color: rgb(region.label), belief: beliefOf(region), unknown: region.unknown,
-    about: `region ${region.id}${region.parent ? `, ${region.parent}` : ""} · ${region.area.toFixed(1)} m² · ${kept} places${region.predicted ? " · predicted from its surroundings" : ""}`,
+    about: `region ${region.id}${region.within.map((name) => `, ${name}`).join("")} · ${region.area.toFixed(1)} m² · ${kept} places${region.predicted ? " · predicted from its surroundings" : ""}`,
     lists: [["Objects", inside.join(", ")], ["Ways out", region.ways.map(([to, clearance, door]) =>
       `${door ? "door" : "opening"} to ${label(to)} (${(2 * clearance).toFixed(2)} m wide)`).join(", ")]],
   };

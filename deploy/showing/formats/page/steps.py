@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from prior_sg.deploy.showing.material import Moment
+from prior_sg.schemas.levels import LevelNode, nodes_above
 from prior_sg.schemas.objects import SceneObject
 from prior_sg.schemas.regions import Region
 from prior_sg.schemas.scene import Scene
@@ -25,8 +26,9 @@ def steps_of(moments: Sequence[Moment], every: int = 1) -> Iterator[dict[str, An
     for moment in moments:
         scene = moment.scene
         places_now, edges_now = _places(scene, every), _edges(scene, every)
+        above = nodes_above(scene.nodes)
         now = {
-            "regions": [_region(region) for region in scene.regions],
+            "regions": [_region(region, above.get(region.id, [])) for region in scene.regions],
             "objects": [_object(item) for item in scene.objects],
             "labels": list(scene.labels),
         }
@@ -72,12 +74,12 @@ def _edges(scene: Scene, every: int) -> dict[tuple[int, int], float]:
     return {(a, b): width for (a, b), width in rows if a % every == 0 and b % every == 0}
 
 
-def _region(region: Region) -> dict[str, Any]:
+def _region(region: Region, above: list[LevelNode]) -> dict[str, Any]:
     x, y, _ = region.position_m
     return {
         "id": region.id,
         "label": region.label,
-        "parent": region.parent,
+        "within": [f"{node.label} ({node.level} {node.id})" for node in above],
         "probability": round(region.probability, 3),
         "unknown": round(region.unknown, 3),
         "predicted": region.predicted,

@@ -14,6 +14,7 @@ from prior_sg.schemas.queries import (
     InRadius,
     Nearest,
     NeighboursOf,
+    NodesOf,
     ObjectsInRegions,
     Question,
     RouteBetween,
@@ -22,7 +23,7 @@ from prior_sg.schemas.queries import (
     WordsInUse,
 )
 from prior_sg.schemas.scene import Scene
-from prior_sg.services.scene_store.core.queries import beliefs, changes, labels, ranking, routes, spatial
+from prior_sg.services.scene_store.core.queries import beliefs, changes, labels, levels, ranking, routes, spatial
 from prior_sg.services.scene_store.core.queries.index import Index
 
 Older = Callable[[int], Scene | None]  # the scene at a revision; None = it is not kept
@@ -70,6 +71,8 @@ def answer(index: Index, question: Question, older: Older = no_history) -> Answe
             return beliefs.words(index)
         case AnswersTo():
             return ranking.ranking(index, question)
+        case NodesOf():
+            return levels.nodes(index, question)
 
 
 def _changed(index: Index, question: ChangedSince, older: Older) -> Difference:

@@ -7,9 +7,11 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
+from prior_sg.schemas.levels import LevelName, LevelNode, rank
 from prior_sg.schemas.regions import Region, RegionDelta, RegionEvent
 
 _NONE = np.zeros(0, dtype=np.int64)
+Nodes = dict[tuple[LevelName, int], LevelNode]
 
 
 class Beliefs(NamedTuple):
@@ -62,6 +64,7 @@ class Ledger:
     revision: int = -1
     head: RegionDelta | None = None  # from what the last delta was made, without what it told
     regions: dict[int, Region] = field(default_factory=dict)
+    nodes: Nodes = field(default_factory=dict)
     told: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=bool))  # (slot,)
     beliefs: Beliefs = field(default_factory=lambda: Beliefs.none(0))  # (slot,)
     gone: dict[int, Beliefs] = field(default_factory=dict)  # places that have left, but followers do not know yet
@@ -81,6 +84,7 @@ class Ledger:
         regions: dict[int, Region],
         events: list[RegionEvent],
         *,
+        nodes: Nodes,
         everything: bool,
         tolerance: float,
     ) -> RegionDelta | None:
@@ -95,8 +99,20 @@ class Ledger:
         sent = np.flatnonzero(~self.told[slots] | self._differs(slots, now, tolerance))
         upserts = [region for _, region in sorted(regions.items()) if self.regions.get(region.id) != region]
         gone_regions = sorted(self.regions.keys() - regions.keys())
+        moved_nodes = [node for key, node in nodes.items() if self.nodes.get(key) != node]
+        gone_nodes = sorted(self.nodes.keys() - nodes.keys())
         moved_on = self.head is not None and head.space != self.head.space
-        if not (everything or moved_on or len(sent) or upserts or gone_regions or self.gone or events):
+        if not (
+            everything
+            or moved_on
+            or len(sent)
+            or upserts
+            or gone_regions
+            or self.gone
+            or events
+            or moved_nodes
+            or gone_nodes
+        ):
             return None
         for known, news in zip(self.beliefs, now, strict=True):
             known[slots[sent]] = news[sent]
@@ -104,6 +120,7 @@ class Ledger:
         gone_places = [] if everything else sorted(self.gone)
         self.gone.clear()
         self.head, self.regions, self.revision = head, dict(regions), self.revision + 1
+        self.nodes = dict(nodes)
         listed = list(self.regions.values()) if everything else upserts
         return self._delta(
             head,
@@ -111,6 +128,7 @@ class Ledger:
             now.at(sent),
             removed=([] if everything else gone_regions, gone_places),
             events=events,
+            nodes=([] if everything else gone_nodes, list(nodes.values()) if everything else moved_nodes),
             snapshot=everything,
         )
 
@@ -122,7 +140,9 @@ class Ledger:
         whole = whole.at(np.argsort(whole.place_ids, kind="stable"))
         listed = [region for _, region in sorted(self.regions.items())]
         head = nothing(robot, epoch) if self.head is None else self.head
-        return self._delta(head, listed, whole, removed=([], []), events=[], snapshot=True)
+        return self._delta(
+            head, listed, whole, removed=([], []), events=[], nodes=([], list(self.nodes.values())), snapshot=True
+        )
 
     def _delta(
         self,
@@ -132,6 +152,7 @@ class Ledger:
         *,
         removed: tuple[list[int], list[int]],
         events: list[RegionEvent],
+        nodes: tuple[list[tuple[LevelName, int]], list[LevelNode]],
         snapshot: bool,
     ) -> RegionDelta:
         return msgspec.structs.replace(
@@ -147,6 +168,8 @@ class Ledger:
             removed_place_ids=np.array(removed[1], dtype=np.int64),
             predicted_ids=beliefs.place_ids[beliefs.predicted],
             events=events,
+            removed_nodes=nodes[0],
+            nodes=sorted(nodes[1], key=rank),
         )
 
     def _differs(self, slots: np.ndarray, now: Beliefs, tolerance: float) -> np.ndarray:

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from prior_sg.schemas.regions import Region, RegionEvent
+from prior_sg.services.segmenter.core.layers.storeys import StoreyConfig, Storeys, split, storeys_of
 from prior_sg.services.segmenter.core.map.place_map import MapChange, PlaceMap
 from prior_sg.services.segmenter.core.map.received import with_neighbours
 from prior_sg.services.segmenter.core.regions import components
@@ -19,6 +20,7 @@ class RegionMap:
     known: dict[int, Region] = field(default_factory=dict)
     disturbed: set[int] = field(default_factory=set)  # regions whose beliefs, ways or objects may have changed
     reformed: set[int] = field(default_factory=set)  # regions whose places came, went or moved
+    storeys: Storeys | None = None  # as of the last partition
     ledger: Ledger = field(default_factory=Ledger)
 
     def inherit(self, regions: list[Region], next_id: int) -> None:
@@ -38,10 +40,11 @@ class RegionMap:
         self.ledger.forget(change.gone_slots)
         self.reformed.update(place_map.places.regions[change.step.upserted].tolist())
 
-    def partition(self, place_map: PlaceMap, names: list[str]) -> list[RegionEvent]:
+    def partition(self, place_map: PlaceMap, names: list[str], cfg: StoreyConfig) -> list[RegionEvent]:
         """Regions of the labels as they are, with ids that last; returns what became of whom."""
         places, graph, previous = place_map.places, place_map.graph, place_map.places.regions
-        component = components.numbered(places.labels, graph.edges)
+        self.storeys = storeys_of(graph, cfg)
+        component = split(components.numbered(places.labels, graph.edges), graph.edges, self.storeys, cfg)
         places.regions, self.next_id = components.track(component, previous, self.next_id)
         moved = places.regions != previous
         places.unbelieved |= moved  # so that followers learn the region of places far from the change

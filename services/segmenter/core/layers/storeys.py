@@ -1,0 +1,124 @@
+"""Storeys from the geometry of places, and regions that end where a storey does (pure).
+
+A place's free space ends at its centre's height less its radius. In a storey most of these bottoms, weighted by the
+ground that the places cover, lie on its floor: furniture, corners and ceilings spread a little upwards, stairs evenly
+from one floor to the next. So floors are modes of the bottoms, far enough from each other, with a valley between them:
+on a slope, where no height stands out, there is one storey. A place is in the highest storey whose floor lies below its
+bottom.
+"""
+
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+
+from prior_sg.services.segmenter.core.map.received import ReceivedGraph
+from prior_sg.services.segmenter.core.regions.components import numbered
+
+CELL_M = 0.1  # of the profile of heights
+SMOOTH_M = 0.2  # standard deviation over which it is smoothed
+LARGEST_M = 2.0  # radius up to which the ground that a place covers counts
+MOST_CELLS = 20_000  # of the profile: heights beyond are taken for mistakes of a map, which is then one storey
+
+
+class StoreyConfig(msgspec.Struct, frozen=True, kw_only=True):
+    """What counts as a storey."""
+
+    least_height_m: float = 2.2  # from floor to floor
+    least_m2: float = 12.0  # of places' discs on a floor
+    part_m2: float = 3.0  # the same of a region's part on one storey, where it is torn
+    valley: float = 0.5  # density between two floors at most, of that at the lesser one
+    tolerance_m: float = 0.3  # a bottom so far below a floor is still on it
+    clutter_m: float = 0.8  # bottoms up to so far above a floor are on it
+    stairs: float = 0.4  # share of a region between floors from which on it is stairs, which span storeys
+
+    def __post_init__(self) -> None:
+        if min(self.least_height_m, self.least_m2, self.part_m2, self.tolerance_m) <= 0 or not 0 < self.stairs <= 1:
+            raise ValueError("a height or an area is not positive, or stairs not in (0, 1]")
+        if self.tolerance_m + self.clutter_m >= self.least_height_m or self.clutter_m < 0 or self.valley < 0:
+            raise ValueError("tolerance_m and clutter_m leave nothing between two floors, or valley is negative")
+
+
+class Storeys(NamedTuple):
+    """Where the floors are, and which place is on which."""
+
+    floors_m: np.ndarray  # (storey,) heights, ascending; at least one where there are places
+    of_place: np.ndarray  # (place,) storey
+    grounded: np.ndarray  # (place,) on the storey's floor or what stands there
+    between: np.ndarray  # (place,) between two floors
+    weights_m2: np.ndarray  # (place,) ground that it covers
+
+
+def storeys_of(graph: ReceivedGraph, cfg: StoreyConfig) -> Storeys:
+    """The storeys of a map."""
+    heights_m, radii_m = graph.positions_m[:, 2], np.minimum(graph.radii_m, LARGEST_M)
+    bottoms_m = heights_m if graph.on_ground else heights_m - graph.radii_m
+    weights_m2 = np.pi * radii_m**2
+    floors_m = floors_of(bottoms_m, weights_m2, cfg)
+    storey = np.maximum(np.searchsorted(floors_m, bottoms_m + cfg.tolerance_m, side="right") - 1, 0)
+    above_m = bottoms_m - floors_m[storey] if len(floors_m) else np.zeros(0)
+    grounded = above_m <= cfg.clutter_m
+    return Storeys(floors_m, storey, grounded, ~grounded & (storey < len(floors_m) - 1), weights_m2)
+
+
+def floors_of(bottoms_m: np.ndarray, weights_m2: np.ndarray, cfg: StoreyConfig) -> np.ndarray:
+    """Heights (storey,) of the floors, ascending; the lowest mode alone where none other qualifies."""
+    if not len(bottoms_m):
+        return np.zeros(0)
+    low_m, high_m = float(bottoms_m.min()), float(bottoms_m.max())
+    if not high_m - low_m < MOST_CELLS * CELL_M:
+        return np.array([low_m])
+    profile = _profile(bottoms_m - low_m, weights_m2, round((high_m - low_m) / CELL_M) + 1)
+    padded = np.concatenate(([-1.0], profile, [-1.0]))
+    modes = np.flatnonzero((padded[1:-1] > padded[:-2]) & (padded[1:-1] >= padded[2:]))
+    apart = cfg.least_height_m / CELL_M
+    floors: list[int] = []
+    for mode in modes[np.argsort(-profile[modes], kind="stable")].tolist():
+        reach = slice(max(mode - round(cfg.tolerance_m / CELL_M), 0), mode + round(cfg.clutter_m / CELL_M) + 1)
+        ground_m2 = float(profile[reach].sum()) * CELL_M
+        distant = all(abs(mode - floor) >= apart for floor in floors)
+        if not floors or (distant and ground_m2 >= cfg.least_m2 and _valleys(profile, mode, floors, cfg)):
+            floors.append(mode)
+    return low_m + CELL_M * np.array(sorted(floors))
+
+
+def _profile(heights_m: np.ndarray, weights_m2: np.ndarray, cells: int) -> np.ndarray:
+    """Density (cell,) of the ground by height, m2 per m, smoothed."""
+    counts = np.bincount(np.rint(heights_m / CELL_M).astype(np.int64), weights_m2, minlength=cells) / CELL_M
+    reach = round(3 * SMOOTH_M / CELL_M)
+    kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) * CELL_M / SMOOTH_M) ** 2)
+    return np.convolve(counts, kernel / kernel.sum())[reach : reach + len(counts)]
+
+
+def _valleys(profile: np.ndarray, mode: int, floors: list[int], cfg: StoreyConfig) -> bool:
+    """Whether the profile falls low enough between a mode and the floors below and above it."""
+    beside = [*sorted(floor for floor in floors if floor < mode)[-1:], *sorted(f for f in floors if f > mode)[:1]]
+    spans = [slice(min(mode, floor), max(mode, floor) + 1) for floor in beside]
+    return all(profile[span].min() <= cfg.valley * profile[mode] for span in spans)
+
+
+def split(component: np.ndarray, edges: np.ndarray, storeys: Storeys, cfg: StoreyConfig) -> np.ndarray:
+    """Component number (place,) as from `numbered`, of parts none of which spans storeys unless it is stairs.
+
+    A component spans the storeys on whose floors it has ground of its own; what is above one of these belongs to it.
+    """
+    count = len(storeys.floors_m)
+    if count < 2 or not len(component):
+        return component
+    number = component * count + storeys.of_place
+    size = (int(component.max()) + 1) * count
+    weights = storeys.weights_m2
+    ground_m2 = np.bincount(number, weights * storeys.grounded, minlength=size).reshape(-1, count)
+    own = ground_m2 >= cfg.part_m2
+    whole_m2, between_m2 = (
+        np.bincount(component, weights * mask, minlength=len(own)) for mask in (True, storeys.between)
+    )
+    stairs = between_m2 >= cfg.stairs * whole_m2
+    torn = (own.sum(axis=1) > 1) & ~stairs
+    if not torn.any():
+        return component
+    below = np.where(own, np.arange(count), -1)
+    standing = np.maximum.accumulate(below, axis=1)  # (component, storey) the one to which what is there belongs
+    standing = np.where(standing < 0, own.argmax(axis=1)[:, None], standing)
+    part = np.where(torn[component], standing[component, storeys.of_place], 0)
+    return numbered(component * count + part, edges)
