@@ -6,6 +6,7 @@ import msgspec
 import numpy as np
 
 from prior_sg.schemas.codec import Message, Number, NumberOrNone, Part, Shape, Stamp
+from prior_sg.schemas.foresight import Foresight
 
 NO_REGION = -1  # in place of a region id: not labelled yet
 _NO_IDS = msgspec.field(default_factory=lambda: np.zeros(0, np.int64))
@@ -79,6 +80,7 @@ class RegionDelta(Message, frozen=True, kw_only=True):
     predicted_ids: Annotated[np.ndarray, Shape("int64", "predicted")] = _NO_IDS  # those of `place_ids` whose label
     # rests on their surroundings: seen from afar, barely or never
     events: list[RegionEvent] = []  # since the previous revision
+    foresight: Foresight | None = None  # all of it, where it is news; None = as before
 
     def check(self) -> None:
         if self.posteriors.shape[1] != len(self.labels):

@@ -5,6 +5,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from prior_sg.schemas.foresight import Foresight
 from prior_sg.schemas.objects import SceneObject
 from prior_sg.schemas.regions import NO_REGION, Region
 from prior_sg.schemas.scene import Scene
@@ -37,6 +38,7 @@ def scene_of_json(told: dict[str, Any]) -> Scene:
         predicted_ids=np.array([place["id"] for place in places if place["predicted"]], np.int64),
         origin_m=tuple(told["origin_m"]),
         revision=-1,  # of no store
+        foresight=msgspec.convert(told.get("foresight", {}), Foresight),
         **_openings([place for place in places if place["frontier"]]),
         **_grounds([place for place in places if place["ellipse"]]),
     )

@@ -3,7 +3,19 @@
 import msgspec
 import numpy as np
 
-from prior_sg.schemas import features, frames, objects, places, priors, queries, regions, scene, status, succession
+from prior_sg.schemas import (
+    features,
+    foresight,
+    frames,
+    objects,
+    places,
+    priors,
+    queries,
+    regions,
+    scene,
+    status,
+    succession,
+)
 from prior_sg.schemas.codec import M, Message
 
 CAMERA = frames.Intrinsics(640, 480, 525.5, 526.5, 319.5, 239.5)
@@ -134,6 +146,27 @@ OBJECT = objects.SceneObject(
     frames=3,
 )
 SPOT = queries.Spot(point_m=(1.0, 2.0, 3.0), what="region", id=4, label="hall", here=True)
+FORESIGHT = foresight.Foresight(
+    openings=[
+        foresight.Opening(
+            place_id=2,
+            position_m=(4.0, 5.0, 6.0),
+            beyond_m=(5.0, 5.0, 6.0),
+            width_m=0.875,
+            region=4,
+            same=0.25,
+            labels=[
+                foresight.ForeseenLabel(
+                    label="hall", next=0.5, within=0.75, adjacency=0.875, existence=0.25, found=1, met=2
+                )
+            ],
+        )
+    ],
+    missing=[foresight.MissingLabel(label="hall", probability=0.75, found=1)],
+    steps=3,
+    look_m=2.5,
+    elsewhere_m=40.5,
+)
 QUESTIONS = [
     queries.ById(what="region", id=4),
     queries.ByLabel(label="oven", what="object", limit=5),
@@ -147,6 +180,8 @@ QUESTIONS = [
     queries.BeliefsOf(region=4, limit=2),
     queries.WordsInUse(),
     queries.AnswersTo(text="eat", regions={"kitchen": 0.75}, objects={"stove": 0.5}, what="region", limit=4),
+    queries.WhereToLook(label="kitchen", start=SPOT, clearance_m=0.25, limit=3),
+    queries.WhatIsMissing(limit=5),
 ]
 THING = queries.Thing(
     what="object",
@@ -207,6 +242,27 @@ ANSWERS = [
         objects={"stove": 2},
     ),
     queries.Ranking(things=[THING], note="n", reason="r"),
+    queries.Outlook(
+        label="hall",
+        prospects=[queries.Prospect(opening=FORESIGHT.openings[0], probability=0.75, expected_m=12.5, way_m=3.5)],
+        probability=0.875,
+        route=queries.Route(
+            found=True,
+            reason="r",
+            start=THING,
+            goal=THING,
+            place_ids=[1, 2],
+            waypoints_m=[(1.0, 2.0, 3.0), (4.0, 5.0, 6.0)],
+            length_m=2.5,
+            clearance_m=0.25,
+            regions=[THING],
+            start_gap_m=0.5,
+            goal_gap_m=0.75,
+        ),
+        found=[THING],
+        reason="r",
+    ),
+    queries.Missing(labels=FORESIGHT.missing, openings=2, reason="r"),
 ]
 
 EXAMPLES: list[Message] = [
@@ -333,6 +389,7 @@ EXAMPLES: list[Message] = [
         energy=-1.5,
         predicted_ids=i8(1),
         events=[regions.RegionEvent(kind="split", region=4, label="kitchen", other=5, former_label="hall")],
+        foresight=FORESIGHT,
     ),
     regions.PosteriorRequest(robot="r", place_id=1),
     regions.PosteriorReply(
@@ -426,6 +483,7 @@ EXAMPLES: list[Message] = [
         hulls_m=f4([0, 0], [1, 0], [0, 1]),
         origin_m=(512e3, 5.4e6, 312.0),
         revision=9,
+        foresight=FORESIGHT,
     ),
     queries.SceneQuery(robot="r", questions=QUESTIONS),
     queries.SceneAnswer(robot="r", revision=2, stamp_ns=3, answers=ANSWERS),

@@ -40,7 +40,15 @@ from prior_sg.schemas.frames import Intrinsics
 from prior_sg.schemas.regions import Region
 from prior_sg.schemas.scene import Scene
 
-LAYERS = ("regions", "edges", "objects", "unnamed", "frontiers", "trajectory")  # of entities; the rest are points
+LAYERS = (
+    "regions",
+    "edges",
+    "objects",
+    "unnamed",
+    "frontiers",
+    "foreseen",
+    "trajectory",
+)  # of entities; the rest are points
 PLACES, MAP, IMAGE, CALIBRATION = "/map/places", "/map/surface", "/camera/image", "/camera/calibration"
 DEPTH = "/camera/depth"
 TRANSFORMS, SCENE, NOTES = "/tf", "/scene", "/notes"

@@ -5,6 +5,7 @@ from typing import Annotated
 import numpy as np
 
 from prior_sg.schemas.codec import Message, Shape
+from prior_sg.schemas.foresight import Foresight
 from prior_sg.schemas.objects import SceneObject
 from prior_sg.schemas.priors import Task
 from prior_sg.schemas.regions import Region
@@ -44,6 +45,7 @@ class GraphImage(Message, frozen=True, kw_only=True):
     predicted: Annotated[np.ndarray, Shape("bool", "belief")]
     objects: list[SceneObject]
     given: Task | None  # the newest task
+    foresight: Foresight = Foresight()
 
 
 def image_of(graph: core.Graph) -> GraphImage:
@@ -82,6 +84,7 @@ def image_of(graph: core.Graph) -> GraphImage:
         predicted=np.array([belief.predicted for belief in beliefs], np.bool_),
         objects=list(graph.objects.values()),
         given=graph.task,
+        foresight=graph.foresight,
     )
 
 
@@ -115,6 +118,7 @@ def _restore_regions(graph: core.Graph, image: GraphImage) -> None:
         image.prior_digest, image.environment, image.task, image.space, tuple(image.labels), image.energy
     )
     graph.regions = {entry.id: entry for entry in image.regions}
+    graph.foresight = image.foresight
     columns = (image.believed.tolist(), image.posteriors, image.unknown.tolist(), image.predicted.tolist())
     for (place, region), posterior, unknown, predicted in zip(*columns, strict=True):
         graph.beliefs[place] = core.Belief(region, posterior, unknown, predicted)

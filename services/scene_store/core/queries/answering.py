@@ -19,10 +19,12 @@ from prior_sg.schemas.queries import (
     RouteBetween,
     SceneAnswer,
     SceneQuery,
+    WhatIsMissing,
+    WhereToLook,
     WordsInUse,
 )
 from prior_sg.schemas.scene import Scene
-from prior_sg.services.scene_store.core.queries import beliefs, changes, labels, ranking, routes, spatial
+from prior_sg.services.scene_store.core.queries import beliefs, changes, labels, ranking, routes, spatial, unseen
 from prior_sg.services.scene_store.core.queries.index import Index
 
 Older = Callable[[int], Scene | None]  # the scene at a revision; None = it is not kept
@@ -70,6 +72,10 @@ def answer(index: Index, question: Question, older: Older = no_history) -> Answe
             return beliefs.words(index)
         case AnswersTo():
             return ranking.ranking(index, question)
+        case WhereToLook():
+            return unseen.outlook(index, question)
+        case WhatIsMissing():
+            return unseen.missing(index, question)
 
 
 def _changed(index: Index, question: ChangedSince, older: Older) -> Difference:

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
+from prior_sg.schemas.foresight import Foresight
 from prior_sg.schemas.regions import Region, RegionDelta, RegionEvent
 
 _NONE = np.zeros(0, dtype=np.int64)
@@ -65,6 +66,7 @@ class Ledger:
     told: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=bool))  # (slot,)
     beliefs: Beliefs = field(default_factory=lambda: Beliefs.none(0))  # (slot,)
     gone: dict[int, Beliefs] = field(default_factory=dict)  # places that have left, but followers do not know yet
+    foresight: Foresight | None = None
 
     def forget(self, slots: np.ndarray) -> None:
         """These slots' places have left the graph; the slots may be given to others."""
@@ -81,6 +83,7 @@ class Ledger:
         regions: dict[int, Region],
         events: list[RegionEvent],
         *,
+        foresight: Foresight | None = None,
         everything: bool,
         tolerance: float,
     ) -> RegionDelta | None:
@@ -88,6 +91,7 @@ class Ledger:
 
         `head` is a delta that says from what this one is made, with nothing to tell, see `nothing`. `now` holds the
         places in `slots` (sorted by id), which are all that may have changed, or all with `everything`.
+        `foresight` is what is news of it, None = nothing.
         A belief is sent when the region of the place changed or a probability moved by more than `tolerance` since it
         was last sent.
         """
@@ -96,8 +100,10 @@ class Ledger:
         upserts = [region for _, region in sorted(regions.items()) if self.regions.get(region.id) != region]
         gone_regions = sorted(self.regions.keys() - regions.keys())
         moved_on = self.head is not None and head.space != self.head.space
-        if not (everything or moved_on or len(sent) or upserts or gone_regions or self.gone or events):
+        nothing_new = foresight is None and not (len(sent) or upserts or gone_regions or self.gone or events)
+        if nothing_new and not (everything or moved_on):
             return None
+        self.foresight = self.foresight if foresight is None else foresight
         for known, news in zip(self.beliefs, now, strict=True):
             known[slots[sent]] = news[sent]
         self.told[slots[sent]] = True
@@ -112,6 +118,7 @@ class Ledger:
             removed=([] if everything else gone_regions, gone_places),
             events=events,
             snapshot=everything,
+            foresight=self.foresight if everything else foresight,
         )
 
     def snapshot(self, robot: str, epoch: int) -> RegionDelta:
@@ -122,7 +129,7 @@ class Ledger:
         whole = whole.at(np.argsort(whole.place_ids, kind="stable"))
         listed = [region for _, region in sorted(self.regions.items())]
         head = nothing(robot, epoch) if self.head is None else self.head
-        return self._delta(head, listed, whole, removed=([], []), events=[], snapshot=True)
+        return self._delta(head, listed, whole, removed=([], []), events=[], snapshot=True, foresight=self.foresight)
 
     def _delta(
         self,
@@ -133,6 +140,7 @@ class Ledger:
         removed: tuple[list[int], list[int]],
         events: list[RegionEvent],
         snapshot: bool,
+        foresight: Foresight | None,
     ) -> RegionDelta:
         return msgspec.structs.replace(
             head,
@@ -147,6 +155,7 @@ class Ledger:
             removed_place_ids=np.array(removed[1], dtype=np.int64),
             predicted_ids=beliefs.place_ids[beliefs.predicted],
             events=events,
+            foresight=foresight,
         )
 
     def _differs(self, slots: np.ndarray, now: Beliefs, tolerance: float) -> np.ndarray:
