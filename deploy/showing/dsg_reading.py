@@ -8,6 +8,7 @@ import numpy as np
 import spark_dsg
 
 from prior_sg.deploy.showing.dsg import MESH_PLACES
+from prior_sg.schemas.foresight import Foresight
 from prior_sg.schemas.objects import SceneObject
 from prior_sg.schemas.regions import NO_REGION, Region
 from prior_sg.schemas.scene import Scene
@@ -62,6 +63,7 @@ def scene_of_graph(graph: spark_dsg.DynamicSceneGraph) -> Scene:
         trajectory=np.array(about.get("trajectory_m", ()), np.float32).reshape(-1, 3),
         origin_m=tuple(about.get("origin_m", (0.0, 0.0, 0.0))),
         revision=-1,  # of no store
+        foresight=msgspec.convert(about.get("foresight", {}), Foresight),
         **_edges(graph, places),
         **columns,
     )

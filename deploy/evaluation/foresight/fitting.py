@@ -42,7 +42,7 @@ def fitted(walks: Sequence[Walk], cfg: ForesightConfig = ForesightConfig()) -> F
     *by_width, by_area, by_spread = np.round(same, 2).tolist()
     return msgspec.structs.replace(
         cfg,
-        same_by_width=by_width,
+        same_by_width=tuple(by_width),
         same_by_area=by_area,
         same_by_spread=by_spread,
         adjacency=adjacency,

@@ -19,8 +19,8 @@ class ForesightConfig(msgspec.Struct, frozen=True, kw_only=True):
     least_places: int = 3  # a region of fewer places does not count as found
 
     # That the same region goes on: logit by width of the opening, and by what was seen of the region.
-    widths_m: list[float] = [0.6, 0.8, 1.1, 1.6, 2.5, 4.0]  # where the classes of width begin, after the first
-    same_by_width: list[float] = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]
+    widths_m: tuple[float, ...] = (0.6, 0.8, 1.1, 1.6, 2.5, 4.0)  # where the classes of width begin, after the first
+    same_by_width: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     same_by_area: float = 0.0  # by log(1 + seen area of the region / m2)
     same_by_spread: float = 0.0  # by log of the mean number of other regions that touch one of its label
 
