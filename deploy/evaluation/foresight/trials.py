@@ -3,7 +3,7 @@
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cache
+from functools import lru_cache
 
 import numpy as np
 
@@ -76,7 +76,7 @@ class Moment:
     seen: np.ndarray  # (label,) bool: one has been found
 
 
-@cache
+@lru_cache(32)
 def vocabulary(kind: str) -> dict[str, tuple[str, ...]]:
     """Labels that plans of a kind hold, by the environment's name."""
     found: dict[str, dict[str, None]] = {}
@@ -89,7 +89,7 @@ def vocabulary(kind: str) -> dict[str, tuple[str, ...]]:
     return {environment: tuple(sorted(labels)) for environment, labels in found.items()}
 
 
-@cache
+@lru_cache(32)
 def prior_of(kind: str, environment: str) -> Prior:
     """The library's, for all labels that such worlds may hold."""
     return library_prior(environment, DEMO_TASK, list(vocabulary(kind)[environment]))

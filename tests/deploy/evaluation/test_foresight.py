@@ -11,7 +11,7 @@ from prior_sg.deploy.evaluation.foresight.predictors import PREDICTORS
 from prior_sg.deploy.evaluation.foresight.scores import figures, judge, search_figures
 from prior_sg.deploy.evaluation.foresight.searches import POLICIES, Quest, metres
 from prior_sg.deploy.evaluation.foresight.trials import SAME, Moment, Trial, go
-from prior_sg.deploy.evaluation.worlds.ways import CELL_M, LEVELS, Ways, ways_of
+from prior_sg.deploy.evaluation.worlds.ways import CELL_M, LEVELS, ways_of
 from prior_sg.services.segmenter.core.foresight.beyond import Views
 from prior_sg.services.segmenter.core.foresight.config import ForesightConfig
 from prior_sg.services.segmenter.core.foresight.expectation import Found, expected
