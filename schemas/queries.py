@@ -12,6 +12,7 @@ from typing import Annotated, Literal
 import msgspec
 
 from prior_sg.schemas.codec import Message, NumberOrNone, Part, Stamp
+from prior_sg.schemas.foresight import MissingLabel, Opening
 from prior_sg.schemas.levels import LevelName, LevelNode
 from prior_sg.schemas.names import LONGEST_TEXT
 from prior_sg.schemas.objects import SceneObject
@@ -154,6 +155,22 @@ class NodesOf(Part, frozen=True, kw_only=True, tag="nodes_of"):
     limit: Limit = MOST_LISTED
 
 
+class WhereToLook(Part, frozen=True, kw_only=True, tag="where_to_look"):
+    """Behind which opening a region of a label that nobody has seen is most likely found first → Outlook, the least
+    expected metres first."""
+
+    label: Text
+    start: Spot = Spot(here=True)
+    clearance_m: Metres = 0.0
+    limit: Limit = MOST_RANKED
+
+
+class WhatIsMissing(Part, frozen=True, kw_only=True, tag="what_is_missing"):
+    """Which labels are probably still to be found behind the map's openings → Missing."""
+
+    limit: Limit = MOST_RANKED
+
+
 Question = (
     ById
     | ByLabel
@@ -168,6 +185,8 @@ Question = (
     | WordsInUse
     | AnswersTo
     | NodesOf
+    | WhereToLook
+    | WhatIsMissing
 )
 
 
@@ -327,7 +346,37 @@ class Nodes(Part, frozen=True, kw_only=True, tag="nodes"):
     reason: str = ""
 
 
-Answer = Things | Details | Neighbourhood | Route | Difference | RegionBeliefs | Words | Ranking | Nodes
+class Prospect(Part, frozen=True, kw_only=True):
+    """One opening as a place to look behind."""
+
+    opening: Opening
+    probability: float  # that such a region is met behind it, within the steps of the foresight
+    expected_m: float  # metres until one is found if this opening comes first; a score, as sure as the probabilities
+    way_m: float  # to the opening
+
+
+class Outlook(Part, frozen=True, kw_only=True, tag="outlook"):
+    """Where a region may be that has not been seen: predictions."""
+
+    label: str = ""
+    prospects: list[Prospect] = []
+    probability: float = 0.0  # that one is behind any opening
+    route: Route | None = None  # to the first of them
+    found: list[Thing] = []  # regions of the label that have been seen already
+    reason: str = ""
+
+
+class Missing(Part, frozen=True, kw_only=True, tag="missing"):
+    """What is probably still to be found: predictions, the most probable first."""
+
+    labels: list[MissingLabel] = []
+    openings: int = 0  # that it may be behind
+    reason: str = ""
+
+
+Answer = (
+    Things | Details | Neighbourhood | Route | Difference | RegionBeliefs | Words | Ranking | Nodes | Outlook | Missing
+)
 
 
 class SceneQuery(Message, frozen=True, kw_only=True):

@@ -6,6 +6,7 @@ import msgspec
 import numpy as np
 
 from prior_sg.schemas.codec import Message, Number, NumberOrNone, Part, Shape, Stamp
+from prior_sg.schemas.foresight import Foresight
 from prior_sg.schemas.levels import LevelName, LevelNode
 
 NO_REGION = -1  # in place of a region id: not labelled yet
@@ -82,6 +83,7 @@ class RegionDelta(Message, frozen=True, kw_only=True):
     events: list[RegionEvent] = []  # since the previous revision
     removed_nodes: list[tuple[LevelName, int]] = []  # of the levels above, to be removed before `nodes` are put
     nodes: list[LevelNode] = []
+    foresight: Foresight | None = None  # all of it, where it is news; None = as before
 
     def check(self) -> None:
         if self.posteriors.shape[1] != len(self.labels):

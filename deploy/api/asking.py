@@ -11,6 +11,7 @@ import numpy as np
 from prior_sg.deploy.api.errors import NotInSceneError
 from prior_sg.deploy.api.spots import spot_in
 from prior_sg.deploy.api.vectors import RecentVectors
+from prior_sg.schemas.foresight import MissingLabel
 from prior_sg.schemas.levels import LevelName
 from prior_sg.schemas.objects import SceneObject
 from prior_sg.schemas.priors import Prior
@@ -31,6 +32,7 @@ from prior_sg.schemas.queries import (
     NodesOf,
     NodeWithRegions,
     ObjectsInRegions,
+    Outlook,
     Point,
     Question,
     RegionBeliefs,
@@ -39,6 +41,8 @@ from prior_sg.schemas.queries import (
     Spot,
     Thing,
     What,
+    WhatIsMissing,
+    WhereToLook,
     WordsInUse,
 )
 from prior_sg.schemas.regions import Region
@@ -141,6 +145,21 @@ class Asking(ABC):
         question = NodesOf(level=level, label=label, id=number, region=region, limit=limit)
         found: list[NodeWithRegions] = self._understood(question).nodes
         return found
+
+    def where_to_look(
+        self, label: str, start: SpotLike = "here", clearance_m: float = 0.0, limit: int = MOST_RANKED
+    ) -> Outlook:
+        """Where a region of a label that nobody has seen is likely found first: openings to unobserved space, the least
+        expected metres first, and the way to the first. All of it is predicted.
+        """
+        question = WhereToLook(label=label, start=_spot(start), clearance_m=clearance_m, limit=limit)
+        outlook: Outlook = self._understood(question)
+        return outlook
+
+    def missing(self, limit: int = MOST_RANKED) -> list[MissingLabel]:
+        """Labels that are probably still to be found behind the map's openings, the most probable first."""
+        labels: list[MissingLabel] = self._understood(WhatIsMissing(limit=limit)).labels
+        return labels
 
     def candidates(self, region: int, limit: int = MOST_RANKED) -> RegionBeliefs:
         """What a region may be: labels with their probabilities, what is unknown, and how much is a prediction."""

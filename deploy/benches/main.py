@@ -101,6 +101,13 @@ def exchanged() -> tuple[dict, dict]:
     return exchange_bench(ROWS, SAMPLE)
 
 
+def foresight() -> tuple[dict, dict]:
+    """Regions foreseen and searched for in generated worlds; see `prior_sg.deploy.benches.foresight`."""
+    from prior_sg.deploy.benches.foresight import foresight_bench  # compiles the worlds' loops
+
+    return foresight_bench()
+
+
 def hydra() -> tuple[dict, dict]:
     """The bridge to Hydra; see `prior_sg.deploy.benches.hydra`."""
     from prior_sg.deploy.benches.hydra import hydra_bench  # needs the extra `hydra`
@@ -152,6 +159,7 @@ LONG: dict[str, Callable[[float], tuple[dict, dict]]] = {  # no part of `all`; t
     "lidar": lambda seconds: lidar(),  # seven minutes and more
     "levels": lambda seconds: levels(),  # ten minutes
     "exchange": lambda seconds: exchanged(),  # nine runs of the sample at half its pace
+    "foresight": lambda seconds: foresight(),  # worlds of every kind: ten minutes
     "view": lambda seconds: view(),  # needs an extra and a browser
     "hydra": lambda seconds: hydra(),  # needs an extra
 }

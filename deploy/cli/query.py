@@ -15,7 +15,17 @@ from prior_sg.schemas.levels import LEVELS
 
 if TYPE_CHECKING:
     from prior_sg.deploy.api.asking import Asking
-    from prior_sg.schemas.queries import Details, Difference, Neighbour, NodeWithRegions, RegionBeliefs, Route, Thing
+    from prior_sg.schemas.foresight import MissingLabel
+    from prior_sg.schemas.queries import (
+        Details,
+        Difference,
+        Neighbour,
+        NodeWithRegions,
+        Outlook,
+        RegionBeliefs,
+        Route,
+        Thing,
+    )
 
 FORMS = """\
 what to ask:
@@ -29,6 +39,8 @@ what to ask:
   region ID, place ID, object ID   one of them in full: beliefs, neighbours, what it holds
   route FROM TO                    the shortest way; each a label, here (where the camera was last), place:ID,
                                    region:ID, object:ID or X,Y,Z
+  unseen LABEL                     where a region that was not seen may be, and the way there from here (--start SPOT)
+  missing                          what is probably still to be found behind the map's openings
   changed REVISION                 what is different since a revision (running store only)
 
 examples:
@@ -59,6 +71,9 @@ def add_commands(commands: Commands) -> None:
     parser.add_argument(
         "--clearance", type=float, default=0.0, metavar="METRES", help="of routes: nothing is closer to them"
     )
+    parser.add_argument(
+        "--start", default="here", metavar="SPOT", help="of unseen: where the way begins, as a route's ends"
+    )
     parser.add_argument("--json", action="store_true", help="print JSON")
     add_bus(parser)
 
@@ -74,7 +89,7 @@ def cmd_query(arguments: argparse.Namespace) -> int:
     if arguments.object:
         arguments.what, arguments.label = "object", arguments.object
     word, *rest = arguments.words
-    run, show = ASKED.get(word, (_find, _show_things)) if rest else (_find, _show_things)
+    run, show = ASKED.get(word, FOUND) if rest else ALONE.get(word, FOUND)
     try:
         with warnings.catch_warnings(record=True) as said, _opened(arguments) as scene:
             warnings.simplefilter("always", UserWarning)
@@ -148,6 +163,14 @@ def _route(scene: "Asking", arguments: argparse.Namespace, words: Sequence[str])
     if len(words) != 2:
         raise UserError("a route needs two ends: prior-sg query route kitchen bedroom (quote names of several words)")
     return scene.route(words[0], words[1], arguments.clearance)
+
+
+def _unseen(scene: "Asking", arguments: argparse.Namespace, words: Sequence[str]) -> "Outlook":
+    return scene.where_to_look(" ".join(words), arguments.start, arguments.clearance, arguments.limit)
+
+
+def _missing(scene: "Asking", arguments: argparse.Namespace, words: Sequence[str]) -> "list[MissingLabel]":
+    return scene.missing(arguments.limit)
 
 
 def _changed(scene: "Asking", arguments: argparse.Namespace, words: Sequence[str]) -> "Difference":
@@ -246,6 +269,38 @@ def _show_route(found: "Route") -> None:
     console.print(table)
 
 
+def _show_outlook(found: "Outlook") -> None:
+    if found.found:
+        console.print(f"seen already: {', '.join(f'{one.label} {one.id}' for one in found.found)}")
+    console.print(f"another {found.label} behind any opening: {found.probability:.2f} (predicted)")
+    table = Table(
+        "expected m", "probability", "way m", "opening at place", "width m", "out of region", "beyond m", "why"
+    )
+    for one in found.prospects:
+        opening = one.opening
+        why = next(entry for entry in opening.labels if entry.label == found.label)
+        table.add_row(
+            f"{one.expected_m:.1f}",
+            f"{one.probability:.2f}",
+            f"{one.way_m:.1f}",
+            str(opening.place_id),
+            f"{opening.width_m:.1f}",
+            str(opening.region),
+            _at(opening.beyond_m),
+            f"adjacency {why.adjacency:.2f}, existence {why.existence:.2f}, found {why.found}, met {why.met}",
+        )
+    console.print(table)
+    if found.route is not None:
+        _show_route(found.route)
+
+
+def _show_missing(found: "list[MissingLabel]") -> None:
+    table = Table("label", "probability (predicted)", "found so far")
+    for one in found:
+        table.add_row(one.label, f"{one.probability:.2f}", str(one.found))
+    console.print(table if found else "nothing")
+
+
 def _show_difference(found: "Difference") -> None:
     for title, things in (("appeared", found.appeared), ("gone", found.gone)):
         if things:
@@ -274,5 +329,8 @@ ASKED: dict[str, Asked] = {  # by first word; whatever else is a sentence
     "place": (_one, _show_one),
     "object": (_one, _show_one),
     "route": (_route, _show_route),
+    "unseen": (_unseen, _show_outlook),
     "changed": (_changed, _show_difference),
 }
+FOUND: Asked = (_find, _show_things)
+ALONE: dict[str, Asked] = {"missing": (_missing, _show_missing)}

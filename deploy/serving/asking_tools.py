@@ -24,10 +24,13 @@ from prior_sg.schemas.queries import (
     NeighboursOf,
     NodesOf,
     ObjectsInRegions,
+    Outlook,
     Question,
     Route,
     RouteBetween,
     What,
+    WhatIsMissing,
+    WhereToLook,
 )
 from prior_sg.services.errors import PriorSgError
 
@@ -175,6 +178,28 @@ async def route(system: System, start: End, goal: End, clearance_m: Distance = 0
 
 
 @asking
+async def where_to_look(
+    system: System, label: Label, start: End = "here", clearance_m: Distance = 0.0, limit: Count = 5
+) -> str:
+    """Where a region of a label that nobody has seen yet is most likely: openings to unobserved space with the
+    probability that it is behind, the metres to expect, why, and the way to the first. All of it is predicted."""
+    question = _made(lambda: WhereToLook(label=label, start=spot_in(start), clearance_m=clearance_m, limit=limit))
+    found = await system.answers(system.robot, question)
+    answer: Any
+    (answer,) = found.answers
+    if isinstance(answer, Outlook):
+        answer = msgspec.structs.replace(answer, route=_thinned(answer.route))
+    return lean_json(msgspec.structs.replace(found, answers=[answer]))
+
+
+@asking
+async def missing(system: System, limit: Count = 10) -> str:
+    """Labels of regions that are probably still to be found behind the map's openings, the most probable first. All of
+    it is predicted."""
+    return await _answer(system, lambda: WhatIsMissing(limit=limit))
+
+
+@asking
 async def changes(system: System, since: Number) -> str:
     """What is new, gone and renamed since an older revision; every answer of these tools says its revision."""
     return await _answer(system, lambda: ChangedSince(revision=since))
@@ -191,6 +216,8 @@ ASKING = [
     levels,
     region_candidates,
     route,
+    where_to_look,
+    missing,
     changes,
 ]
 

@@ -14,6 +14,7 @@ from prior_sg.deploy.serving.errors import FaultyRequestError
 from prior_sg.deploy.serving.parameters import FAULTS, Coordinate, Count, Distance, Label, Robot, system_of
 from prior_sg.deploy.serving.system import EVERYWHERE, LONGEST_SEARCH, MOST_QUESTIONS
 from prior_sg.schemas.levels import LevelName
+from prior_sg.schemas.names import LONGEST_NAME
 from prior_sg.schemas.queries import (
     MOST_LISTED,
     MOST_RANKED,
@@ -34,6 +35,8 @@ from prior_sg.schemas.queries import (
     RouteBetween,
     SceneAnswer,
     What,
+    WhatIsMissing,
+    WhereToLook,
     WordsInUse,
 )
 from prior_sg.schemas.status import ServiceStatus
@@ -216,6 +219,28 @@ async def search(
     return _first(await system_of(state).find(robot, q, what, k))
 
 
+@get("/v1/{robot:str}/unseen", responses=FAULTS)
+async def unseen(
+    state: State,
+    robot: Robot,
+    *,
+    label: Annotated[str, QueryParameter(min_length=1, max_length=LONGEST_NAME)],
+    start: Annotated[str, QueryParameter(name="from", max_length=120, description=ENDS)] = "here",
+    clearance_m: Distance = 0.0,
+    limit: Count = MOST_RANKED,
+) -> Answered:
+    """Behind which openings a region of a label that has not been seen is likely found first, and the way to the first.
+    All of it is predicted."""
+    begin = _asked(spot_in, text=start)
+    return await _one(state, robot, _asked(WhereToLook, label=label, start=begin, clearance_m=clearance_m, limit=limit))
+
+
+@get("/v1/{robot:str}/missing", responses=FAULTS)
+async def missing(state: State, robot: Robot, limit: Count = MOST_RANKED) -> Answered:
+    """Labels of regions that are probably still to be found behind the map's openings. All of it is predicted."""
+    return await _one(state, robot, _asked(WhatIsMissing, limit=limit))
+
+
 @get("/v1/{robot:str}/changes", responses=FAULTS)
 async def changes(state: State, robot: Robot, since: Annotated[int, QueryParameter(ge=-1)]) -> Answered:
     """What is new, gone and renamed since a revision; `reason` where that one is not kept."""
@@ -249,6 +274,8 @@ READING = [
     within,
     route,
     search,
+    unseen,
+    missing,
     changes,
     source,
     task,

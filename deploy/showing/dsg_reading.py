@@ -8,6 +8,7 @@ import numpy as np
 import spark_dsg
 
 from prior_sg.deploy.showing.dsg import MESH_PLACES
+from prior_sg.schemas.foresight import Foresight
 from prior_sg.schemas.levels import LevelNode
 from prior_sg.schemas.objects import SceneObject
 from prior_sg.schemas.regions import NO_REGION, Region
@@ -64,6 +65,7 @@ def scene_of_graph(graph: spark_dsg.DynamicSceneGraph) -> Scene:
         origin_m=tuple(about.get("origin_m", (0.0, 0.0, 0.0))),
         revision=-1,  # of no store
         nodes=[msgspec.convert(node, LevelNode) for node in about.get("levels", ())],
+        foresight=msgspec.convert(about.get("foresight", {}), Foresight),
         **_edges(graph, places),
         **columns,
     )

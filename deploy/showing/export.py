@@ -17,6 +17,9 @@
     objects       [{id, label, probability, known, position_m, min_m, max_m, frames, place}]   place = the nearest
     edges         [{a, b, clearance_m}]           between places
     trajectory_m  [[x, y, z]]                     camera centres in order of time
+    foresight     {is_predicted true, openings [{is_predicted true, place_id, position_m, beyond_m, width_m, region,
+                    same, labels [{label, next, within, adjacency, existence, found, met}]}],
+                    missing [{label, probability, found}], steps, look_m, elsewhere_m}   as schemas/foresight.py has it
 
 Two regions are adjacent when an edge joins a place of one with a place of the other.
 """
@@ -31,6 +34,7 @@ from prior_sg.deploy.json_text import json_text
 from prior_sg.deploy.showing.map import draw_map
 from prior_sg.deploy.showing.places import draw_places
 from prior_sg.deploy.truth import GroundTruth
+from prior_sg.schemas.foresight import Foresight
 from prior_sg.schemas.levels import LevelName, regions_in
 from prior_sg.schemas.objects import SceneObject
 from prior_sg.schemas.places import VoxelMap
@@ -90,7 +94,13 @@ def scene_json(scene: Scene) -> dict[str, Any]:
             for (a, b), clearance_m in zip(scene.edges.tolist(), scene.clearances_m, strict=True)
         ],
         "trajectory_m": _short(scene.trajectory),
+        "foresight": _foresight_json(scene.foresight),
     }
+
+
+def _foresight_json(foresight: Foresight) -> dict[str, Any]:
+    told: dict[str, Any] = msgspec.to_builtins(foresight)
+    return told | {"is_predicted": True, "openings": [one | {"is_predicted": True} for one in told["openings"]]}
 
 
 def _object_json(item: SceneObject, place: int | None) -> dict[str, Any]:

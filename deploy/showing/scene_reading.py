@@ -5,6 +5,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from prior_sg.schemas.foresight import Foresight
 from prior_sg.schemas.levels import LevelNode
 from prior_sg.schemas.objects import SceneObject
 from prior_sg.schemas.regions import NO_REGION, Region
@@ -39,6 +40,7 @@ def scene_of_json(told: dict[str, Any]) -> Scene:
         origin_m=tuple(told["origin_m"]),
         revision=-1,  # of no store
         nodes=[msgspec.convert(node, LevelNode) for node in told.get("levels", ())],  # files before had none
+        foresight=msgspec.convert(told.get("foresight", {}), Foresight),
         **_openings([place for place in places if place["frontier"]]),
         **_grounds([place for place in places if place["ellipse"]]),
     )

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from prior_sg.schemas.foresight import Opening
 from prior_sg.schemas.names import shown
 from prior_sg.schemas.objects import SceneObject
 from prior_sg.schemas.regions import NO_REGION, Region
@@ -24,6 +25,7 @@ LONGEST_NAME, LONGEST_TASK = 15, 40  # tokens
 FOR_OMISSIONS = 60  # tokens that are kept for saying what was left out
 CANDIDATES, LEAST_BELIEF = 3, 0.05
 MOST_IDS = 8  # of objects with one label in one region
+MOST_EXPECTED, LEAST_EXPECTED = 6, 0.2  # labels that are expected and not seen
 REGIONS = "Regions, with the width of the ways out of them:\n"
 PIECES = re.compile(r"[A-Za-z]+|[^ ]")
 
@@ -51,7 +53,8 @@ def scene_text(scene: Scene, budget_tokens: int = USUAL_TOKENS) -> str:
         raise ValueError(f"a budget lies between {LEAST_TOKENS} and {MOST_TOKENS} tokens, not at {budget_tokens}")
     head = "".join(_head(scene))
     budget = Budget(budget_tokens - tokens_of(head) - FOR_OMISSIONS)
-    body = [*_camera(scene, budget), *_regions(scene, budget), *_elsewhere(scene, budget), *_frontiers(scene, budget)]
+    parts = (_camera, _regions, _elsewhere, _expected, _frontiers)
+    body = [line for part in parts for line in part(scene, budget)]
     return head + "".join(body) + _omissions(budget.omitted)
 
 
@@ -165,6 +168,22 @@ def _elsewhere(scene: Scene, budget: Budget) -> Iterator[str]:
     bare = int((scene.place_regions == NO_REGION).sum())
     if bare and budget.take(line := f"{bare} places belong to no region yet.\n", "other lines"):
         yield line
+
+
+def _expected(scene: Scene, budget: Budget) -> Iterator[str]:
+    """What nobody has seen: labels that are probably still to be found, and the surest place to look for each."""
+    for entry in scene.foresight.missing[:MOST_EXPECTED]:
+        behind = max(scene.foresight.openings, key=lambda opening: _chance(opening, entry.label), default=None)
+        if behind is None or entry.probability < LEAST_EXPECTED:
+            continue
+        where = f"p {_chance(behind, entry.label):.2f} beyond {_point(np.array(behind.beyond_m))}"
+        line = f"Expected, not seen: {_short(entry.label)} p {entry.probability:.2f}, most likely {where}\n"
+        if budget.take(line, "expectations"):
+            yield line
+
+
+def _chance(opening: Opening, label: str) -> float:
+    return next((entry.within for entry in opening.labels if entry.label == label), 0.0)
 
 
 def _frontiers(scene: Scene, budget: Budget) -> Iterator[str]:

@@ -30,6 +30,8 @@ FLOOR_OPACITY, PREDICTED_OPACITY, DIMMED_OPACITY = 0.5, 0.16, 0.1
 DASH_M = 0.18
 ABOVE_REGIONS_M, LEVEL_NAME_ABOVE_M = 0.06, 0.9  # outlines of the levels above, each so much over the one below
 PATH_DASH_M, ROBOT_NAME_ABOVE_M = 0.12, 0.45
+LEAST_FORESEEN, MOST_FORESEEN = 0.1, 16  # expected regions: least probability, and how many are drawn
+DISC_M, DISC_CORNERS = 0.6, 24
 SHORT_ARROW_M, LONG_ARROW_M = 0.25, 0.8
 CORNERS = np.array([(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)])
 EDGES_OF_BOX = [(a, b) for a in range(8) for b in range(a) if abs(CORNERS[a] - CORNERS[b]).sum() == 1]
@@ -96,8 +98,40 @@ class Painter:
         picture |= _edges(self.theme, scene, tints)
         picture |= _objects(self.theme, scene, lit)
         picture |= _openings(self.theme, scene)
+        picture |= self._foreseen(scene)
         picture |= _path(self.theme, scene)
         return picture
+
+    def _foreseen(self, scene: Scene) -> Picture:
+        """Regions expected beyond openings: translucent discs in the colour of the likeliest label, which is named."""
+        likely = [
+            (opening, max(opening.labels, key=lambda entry: entry.next))
+            for opening in scene.foresight.openings
+            if opening.labels
+        ]
+        likely = [pair for pair in likely if pair[1].next >= LEAST_FORESEEN]
+        likely = sorted(likely, key=lambda pair: -pair[1].next)[:MOST_FORESEEN]
+        colors = self.colors.of(entry.label for _, entry in likely)
+        picture: Picture = {}
+        for opening, entry in likely:
+            root = f"/foreseen/{opening.place_id}"
+            x, y, z = opening.beyond_m
+            way = np.array([[opening.position_m, opening.beyond_m]], np.float32)
+            told = f"{shown(entry.label)} {100 * entry.next:.0f} %, expected"
+            picture[f"{root}/disc"] = disc(opening.beyond_m, colors[entry.label], PREDICTED_OPACITY)
+            picture[f"{root}/way"] = Lines(dashed(way, PATH_DASH_M), np.array(self.theme.opening, np.uint8), 1.5)
+            picture[f"{root}/name"] = Name(told, (x, y, z + ROBOT_NAME_ABOVE_M), 0.65)
+        return picture
+
+
+def disc(center_m: tuple[float, float, float], color: Color, opacity: float) -> Mesh:
+    """A level disc."""
+    angles = np.linspace(0, 2 * np.pi, DISC_CORNERS, endpoint=False)
+    rim = np.stack((np.cos(angles), np.sin(angles), np.zeros(DISC_CORNERS)), axis=1) * DISC_M
+    following = (np.arange(DISC_CORNERS) + 1) % DISC_CORNERS
+    faces = np.stack((np.zeros(DISC_CORNERS), np.arange(DISC_CORNERS) + 1, following + 1), axis=1)
+    vertices = (np.vstack((np.zeros(3), rim)) + center_m).astype(np.float32)
+    return Mesh(vertices, faces.astype(np.uint32), color, opacity)
 
 
 def _region(theme: Theme, region: Region, ground: Footprint | None, color: Color, lit: Lit) -> Picture:

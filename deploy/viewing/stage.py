@@ -44,6 +44,7 @@ LAYERS = (
     Layer("trajectory", "Robot's way", True),
     Layer("camera", "Camera", True),
     Layer("frontiers", "Openings", False),
+    Layer("foreseen", "Expected beyond", True),
     Layer("answers", "Answers", True),
 )
 

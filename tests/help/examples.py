@@ -5,6 +5,7 @@ import numpy as np
 
 from prior_sg.schemas import (
     features,
+    foresight,
     frames,
     levels,
     objects,
@@ -165,6 +166,27 @@ OBJECT = objects.SceneObject(
     frames=3,
 )
 SPOT = queries.Spot(point_m=(1.0, 2.0, 3.0), what="region", id=4, label="hall", here=True)
+FORESIGHT = foresight.Foresight(
+    openings=[
+        foresight.Opening(
+            place_id=2,
+            position_m=(4.0, 5.0, 6.0),
+            beyond_m=(5.0, 5.0, 6.0),
+            width_m=0.875,
+            region=4,
+            same=0.25,
+            labels=[
+                foresight.ForeseenLabel(
+                    label="hall", next=0.5, within=0.75, adjacency=0.875, existence=0.25, found=1, met=2
+                )
+            ],
+        )
+    ],
+    missing=[foresight.MissingLabel(label="hall", probability=0.75, found=1)],
+    steps=3,
+    look_m=2.5,
+    elsewhere_m=40.5,
+)
 QUESTIONS = [
     queries.ById(what="region", id=4),
     queries.ByLabel(label="oven", what="object", limit=5),
@@ -179,6 +201,8 @@ QUESTIONS = [
     queries.WordsInUse(),
     queries.AnswersTo(text="eat", regions={"kitchen": 0.75}, objects={"stove": 0.5}, what="region", limit=4),
     queries.NodesOf(level="zone", label="ward", id=2, region=4, limit=3),
+    queries.WhereToLook(label="kitchen", start=SPOT, clearance_m=0.25, limit=3),
+    queries.WhatIsMissing(limit=5),
 ]
 THING = queries.Thing(
     what="object",
@@ -240,6 +264,27 @@ ANSWERS = [
     ),
     queries.Ranking(things=[THING], note="n", reason="r"),
     queries.Nodes(nodes=[queries.NodeWithRegions(node=LEVEL_NODE, regions=[THING])], total=2, reason="r"),
+    queries.Outlook(
+        label="hall",
+        prospects=[queries.Prospect(opening=FORESIGHT.openings[0], probability=0.75, expected_m=12.5, way_m=3.5)],
+        probability=0.875,
+        route=queries.Route(
+            found=True,
+            reason="r",
+            start=THING,
+            goal=THING,
+            place_ids=[1, 2],
+            waypoints_m=[(1.0, 2.0, 3.0), (4.0, 5.0, 6.0)],
+            length_m=2.5,
+            clearance_m=0.25,
+            regions=[THING],
+            start_gap_m=0.5,
+            goal_gap_m=0.75,
+        ),
+        found=[THING],
+        reason="r",
+    ),
+    queries.Missing(labels=FORESIGHT.missing, openings=2, reason="r"),
 ]
 
 EXAMPLES: list[Message] = [
@@ -369,6 +414,7 @@ EXAMPLES: list[Message] = [
         events=[regions.RegionEvent(kind="split", region=4, label="kitchen", other=5, former_label="hall")],
         removed_nodes=[("zone", 5)],
         nodes=[LEVEL_NODE],
+        foresight=FORESIGHT,
     ),
     regions.PosteriorRequest(robot="r", place_id=1),
     regions.PosteriorReply(
@@ -463,6 +509,7 @@ EXAMPLES: list[Message] = [
         origin_m=(512e3, 5.4e6, 312.0),
         revision=9,
         nodes=[LEVEL_NODE],
+        foresight=FORESIGHT,
     ),
     queries.SceneQuery(robot="r", questions=QUESTIONS),
     queries.SceneAnswer(robot="r", revision=2, stamp_ns=3, answers=ANSWERS),

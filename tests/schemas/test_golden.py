@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from prior_sg.schemas.codec import ARRAY_EXT_CODE, DTYPES, Message, decode, encode, message_types
+from prior_sg.schemas.foresight import Foresight
 from prior_sg.schemas.migrations import current
 from prior_sg.schemas.queries import Spot
 from tests.help.examples import EXAMPLES, unset_fields
@@ -67,6 +68,14 @@ def test_what_was_written_before_the_store_kept_history_means_the_present(name, 
     for field in defaults:
         del fields[field]
     assert decode(type(message), msgpack.packb(fields)) == msgspec.structs.replace(message, **defaults)
+
+
+@pytest.mark.parametrize(("name", "default"), [("RegionDelta", None), ("Scene", Foresight())])
+def test_what_was_written_before_anything_was_foreseen_foresees_nothing(name, default):
+    message = next(example for example in EXAMPLES if by_name(example) == name)
+    fields = msgpack.unpackb(encode(message), ext_hook=msgpack.ExtType)
+    del fields["foresight"]
+    assert decode(type(message), msgpack.packb(fields)) == msgspec.structs.replace(message, foresight=default)
 
 
 def test_what_was_written_before_robots_had_several_cameras_is_of_the_only_one():

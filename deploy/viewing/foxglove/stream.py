@@ -49,6 +49,7 @@ LAYERS = (
     "objects",
     "unnamed",
     "frontiers",
+    "foreseen",
     "trajectory",
 )  # of entities; the rest are points
 PLACES, MAP, IMAGE, CALIBRATION = "/map/places", "/map/surface", "/camera/image", "/camera/calibration"

@@ -11,6 +11,7 @@ from typing import Literal, NamedTuple
 import msgspec
 import numpy as np
 
+from prior_sg.schemas.foresight import Foresight
 from prior_sg.schemas.levels import LevelName, LevelNode, rank
 from prior_sg.schemas.objects import ObjectDelta, SceneObject
 from prior_sg.schemas.places import PlaceDelta
@@ -100,6 +101,7 @@ class Graph:
     beliefs: dict[int, Belief] = field(default_factory=dict)  # by place id
     objects: dict[int, SceneObject] = field(default_factory=dict)
     alignment: Alignment = field(default_factory=Alignment)
+    foresight: Foresight = field(default_factory=Foresight)
     task: Task | None = None
     origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of the world, as the place graph says
     place_cursor: Cursor = field(default_factory=Cursor)
@@ -177,9 +179,12 @@ def apply_regions(graph: Graph, delta: RegionDelta) -> Changes:
         graph.regions.clear()
         graph.nodes.clear()
         graph.beliefs.clear()
+        graph.foresight = Foresight()
     elif tuple(delta.labels) != graph.alignment.labels:
         changes.beliefs.update(graph.beliefs)
         graph.beliefs.clear()
+    if delta.foresight is not None:
+        graph.foresight = delta.foresight
     for place in delta.removed_place_ids.tolist():
         graph.beliefs.pop(place, None)
         changes.beliefs.add(place)
@@ -296,6 +301,7 @@ def scene(graph: Graph) -> Scene:
         origin_m=graph.origin_m,
         revision=graph.revision,
         nodes=sorted(graph.nodes.values(), key=rank),
+        foresight=graph.foresight,
         **_details(graph),
     )
 

@@ -5,6 +5,7 @@ from typing import Annotated
 import numpy as np
 
 from prior_sg.schemas.codec import Message, Shape
+from prior_sg.schemas.foresight import Foresight
 from prior_sg.schemas.levels import LevelNode
 from prior_sg.schemas.objects import SceneObject
 from prior_sg.schemas.priors import Task
@@ -46,6 +47,7 @@ class GraphImage(Message, frozen=True, kw_only=True):
     objects: list[SceneObject]
     given: Task | None  # the newest task
     nodes: list[LevelNode] = []
+    foresight: Foresight = Foresight()
 
 
 def image_of(graph: core.Graph) -> GraphImage:
@@ -85,6 +87,7 @@ def image_of(graph: core.Graph) -> GraphImage:
         objects=list(graph.objects.values()),
         given=graph.task,
         nodes=list(graph.nodes.values()),
+        foresight=graph.foresight,
     )
 
 
@@ -119,6 +122,7 @@ def _restore_regions(graph: core.Graph, image: GraphImage) -> None:
     )
     graph.regions = {entry.id: entry for entry in image.regions}
     graph.nodes = {(node.level, node.id): node for node in image.nodes}
+    graph.foresight = image.foresight
     columns = (image.believed.tolist(), image.posteriors, image.unknown.tolist(), image.predicted.tolist())
     for (place, region), posterior, unknown, predicted in zip(*columns, strict=True):
         graph.beliefs[place] = core.Belief(region, posterior, unknown, predicted)

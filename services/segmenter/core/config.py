@@ -13,6 +13,7 @@ from prior_sg.services.segmenter.core.evidence.handover import SpacesConfig
 from prior_sg.services.segmenter.core.evidence.kernel import KernelConfig
 from prior_sg.services.segmenter.core.experts import REGISTRY
 from prior_sg.services.segmenter.core.experts.context import ObjectSettings
+from prior_sg.services.segmenter.core.foresight.config import ForesightConfig
 from prior_sg.services.segmenter.core.layers.stacking import LayersConfig
 from prior_sg.services.segmenter.core.map.inclination import GeometryConfig
 from prior_sg.services.segmenter.core.objects.sizes import SizeConfig
@@ -79,6 +80,7 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
     door_clearance_m: float = 0.7  # a way between regions with at most this clearance is a door
     posterior_change: float = 0.01  # smaller changes of a belief are not sent
     footprint_cell_m: float = 0.1  # grid of the regions' areas
+    foresight: ForesightConfig = msgspec.field(default_factory=ForesightConfig)  # beyond the paper
     evidence_ticks: int = 40  # ticks between two reports of what the map shows of its prior; 0 = none
     evidence_places: int = 5  # a region of fewer places is not counted there: most are mistakes
     catch_up_ticks: int = 20  # ticks without progress after which a successor of a dead process tells what it has

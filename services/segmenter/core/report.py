@@ -5,6 +5,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from prior_sg.schemas.foresight import Foresight
 from prior_sg.schemas.regions import (
     ExpertVote,
     NeighbourPull,
@@ -17,14 +18,16 @@ from prior_sg.schemas.regions import (
 from prior_sg.services.segmenter.core.config import Config
 from prior_sg.services.segmenter.core.energy import posteriors
 from prior_sg.services.segmenter.core.energy.mrf import energy
+from prior_sg.services.segmenter.core.foresight.openings import openings_of
+from prior_sg.services.segmenter.core.foresight.telling import differs, foresight
 from prior_sg.services.segmenter.core.inference import field_of, temperature, votes
 from prior_sg.services.segmenter.core.map.table import UNLABELLED
 from prior_sg.services.segmenter.core.regions import components, ledger
 from prior_sg.services.segmenter.core.state import State
 
 
-def publish(state: State, events: list[RegionEvent], everything: bool, cfg: Config) -> RegionDelta | None:
-    """What followers do not know yet; with `everything`, all."""
+def publish(state: State, events: list[RegionEvent], everything: bool, idle: bool, cfg: Config) -> RegionDelta | None:
+    """What followers do not know yet; with `everything`, all. What lies beyond is told if `idle`."""
     places, regions = state.map.places, state.regions
     changed = everything or bool(regions.disturbed)
     regions.describe(_described(state, everything, cfg))
@@ -32,6 +35,7 @@ def publish(state: State, events: list[RegionEvent], everything: bool, cfg: Conf
         _renew_layers(state, cfg)
     fresh = np.arange(len(places.labels)) if everything else np.flatnonzero(places.unbelieved)
     places.unbelieved[:] = False
+    foreseen = _foreseen(state, cfg) if (idle or everything) and cfg.foresight.enabled else None
     return regions.ledger.tell(
         _head(state),
         places.slots[fresh],
@@ -39,6 +43,7 @@ def publish(state: State, events: list[RegionEvent], everything: bool, cfg: Conf
         regions.known,
         events,
         nodes=state.layers.known,
+        foresight=foreseen,
         everything=everything,
         tolerance=cfg.posterior_change,
     )
@@ -54,6 +59,14 @@ def _renew_layers(state: State, cfg: Config) -> None:
         zone = state.layers.zone_of(number)
         if zone != region.parent:
             regions.known[number] = msgspec.structs.replace(region, parent=zone)
+
+
+def _foreseen(state: State, cfg: Config) -> Foresight | None:
+    """What is expected beyond the map's openings, when it is news."""
+    place_map, held = state.map, state.regions
+    found = openings_of(place_map.graph, place_map.places, place_map.frontiers, cfg.foresight)
+    now = foresight(found, held.known, state.aim.aligned.prior, cfg.foresight)
+    return now if differs(held.ledger.foresight, now, cfg.foresight) else None
 
 
 def _head(state: State) -> RegionDelta:

@@ -20,10 +20,21 @@ from prior_sg.schemas.queries import (
     RouteBetween,
     SceneAnswer,
     SceneQuery,
+    WhatIsMissing,
+    WhereToLook,
     WordsInUse,
 )
 from prior_sg.schemas.scene import Scene
-from prior_sg.services.scene_store.core.queries import beliefs, changes, labels, levels, ranking, routes, spatial
+from prior_sg.services.scene_store.core.queries import (
+    beliefs,
+    changes,
+    labels,
+    levels,
+    ranking,
+    routes,
+    spatial,
+    unseen,
+)
 from prior_sg.services.scene_store.core.queries.index import Index
 
 Older = Callable[[int], Scene | None]  # the scene at a revision; None = it is not kept
@@ -73,6 +84,10 @@ def answer(index: Index, question: Question, older: Older = no_history) -> Answe
             return ranking.ranking(index, question)
         case NodesOf():
             return levels.nodes(index, question)
+        case WhereToLook():
+            return unseen.outlook(index, question)
+        case WhatIsMissing():
+            return unseen.missing(index, question)
 
 
 def _changed(index: Index, question: ChangedSince, older: Older) -> Difference:

@@ -46,6 +46,14 @@ def route(index: Index, question: RouteBetween) -> Route:
     return _told(index, rows, start, goal)
 
 
+def lengths_from(index: Index, start: Spot, clearance_m: float) -> np.ndarray:
+    """Metres (place,) from a start to each place, inf = no way. Raises NoSuchSpot."""
+    ways = index.ways(clearance_m)
+    sources = [end.row for end in _ends(index, start, ways, "start", clearance_m)]
+    lengths_m: np.ndarray = dijkstra(ways.graph, indices=sources, min_only=True)
+    return lengths_m
+
+
 def _told(index: Index, rows: list[int], start: End, goal: End) -> Route:
     """A way by its places (place,)."""
     steps = [_edge(index, a, b) for a, b in itertools.pairwise(rows)]

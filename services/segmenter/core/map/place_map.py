@@ -9,6 +9,7 @@ from prior_sg.schemas.places import PlaceDelta
 from prior_sg.services.deltas import Follower
 from prior_sg.services.segmenter.core.config import Config
 from prior_sg.services.segmenter.core.map import inclination
+from prior_sg.services.segmenter.core.map.frontiers import Frontiers
 from prior_sg.services.segmenter.core.map.received import ReceivedGraph, Step, apply, with_neighbours
 from prior_sg.services.segmenter.core.map.table import Places
 
@@ -31,6 +32,7 @@ class PlaceMap:
     graph: ReceivedGraph = field(default_factory=ReceivedGraph)
     weights: np.ndarray = field(default_factory=lambda: np.zeros(0))  # (edge,) w_dist
     places: Places = field(default_factory=Places.none)
+    frontiers: Frontiers = field(default_factory=Frontiers)
     asked_snapshot: bool = False
 
     def take(self, delta: PlaceDelta) -> list[PlaceDelta]:
@@ -47,8 +49,10 @@ class PlaceMap:
 
     def advance(self, delta: PlaceDelta, cfg: Config) -> MapChange:
         """Apply a delta, and mark the places around which it changed the graph."""
-        step = apply(self.graph, delta, replaces=delta.snapshot or delta.epoch != self.epoch)
+        replaces = delta.snapshot or delta.epoch != self.epoch
+        step = apply(self.graph, delta, replaces)
         before, places, gone = self.graph, self.places, step.removed
+        self.frontiers.follow(delta, before.ids[gone], replaces)
         change = MapChange(step, before.ids[gone], places.slots[gone], places.regions[gone])
         self.graph, self.epoch = step.graph, delta.epoch
         self.weights = edge_weights(self.graph, cfg)

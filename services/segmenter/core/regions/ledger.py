@@ -7,6 +7,7 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
+from prior_sg.schemas.foresight import Foresight
 from prior_sg.schemas.levels import LevelName, LevelNode, rank
 from prior_sg.schemas.regions import Region, RegionDelta, RegionEvent
 
@@ -68,6 +69,7 @@ class Ledger:
     told: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=bool))  # (slot,)
     beliefs: Beliefs = field(default_factory=lambda: Beliefs.none(0))  # (slot,)
     gone: dict[int, Beliefs] = field(default_factory=dict)  # places that have left, but followers do not know yet
+    foresight: Foresight | None = None
 
     def forget(self, slots: np.ndarray) -> None:
         """These slots' places have left the graph; the slots may be given to others."""
@@ -85,6 +87,7 @@ class Ledger:
         events: list[RegionEvent],
         *,
         nodes: Nodes,
+        foresight: Foresight | None = None,
         everything: bool,
         tolerance: float,
     ) -> RegionDelta | None:
@@ -92,6 +95,7 @@ class Ledger:
 
         `head` is a delta that says from what this one is made, with nothing to tell, see `nothing`. `now` holds the
         places in `slots` (sorted by id), which are all that may have changed, or all with `everything`.
+        `foresight` is what is news of it, None = nothing.
         A belief is sent when the region of the place changed or a probability moved by more than `tolerance` since it
         was last sent.
         """
@@ -102,18 +106,10 @@ class Ledger:
         moved_nodes = [node for key, node in nodes.items() if self.nodes.get(key) != node]
         gone_nodes = sorted(self.nodes.keys() - nodes.keys())
         moved_on = self.head is not None and head.space != self.head.space
-        if not (
-            everything
-            or moved_on
-            or len(sent)
-            or upserts
-            or gone_regions
-            or self.gone
-            or events
-            or moved_nodes
-            or gone_nodes
-        ):
+        changed = len(sent) or upserts or gone_regions or self.gone or events or moved_nodes or gone_nodes
+        if not (everything or moved_on or changed or foresight is not None):
             return None
+        self.foresight = self.foresight if foresight is None else foresight
         for known, news in zip(self.beliefs, now, strict=True):
             known[slots[sent]] = news[sent]
         self.told[slots[sent]] = True
@@ -130,6 +126,7 @@ class Ledger:
             events=events,
             nodes=([] if everything else gone_nodes, list(nodes.values()) if everything else moved_nodes),
             snapshot=everything,
+            foresight=self.foresight if everything else foresight,
         )
 
     def snapshot(self, robot: str, epoch: int) -> RegionDelta:
@@ -141,7 +138,14 @@ class Ledger:
         listed = [region for _, region in sorted(self.regions.items())]
         head = nothing(robot, epoch) if self.head is None else self.head
         return self._delta(
-            head, listed, whole, removed=([], []), events=[], nodes=([], list(self.nodes.values())), snapshot=True
+            head,
+            listed,
+            whole,
+            removed=([], []),
+            events=[],
+            nodes=([], list(self.nodes.values())),
+            snapshot=True,
+            foresight=self.foresight,
         )
 
     def _delta(
@@ -154,6 +158,7 @@ class Ledger:
         events: list[RegionEvent],
         nodes: tuple[list[tuple[LevelName, int]], list[LevelNode]],
         snapshot: bool,
+        foresight: Foresight | None,
     ) -> RegionDelta:
         return msgspec.structs.replace(
             head,
@@ -170,6 +175,7 @@ class Ledger:
             events=events,
             removed_nodes=nodes[0],
             nodes=sorted(nodes[1], key=rank),
+            foresight=foresight,
         )
 
     def _differs(self, slots: np.ndarray, now: Beliefs, tolerance: float) -> np.ndarray:

@@ -1,0 +1,184 @@
+"""A light explorer on a world's true floor plan: it sees by lines of sight, knows what it has not seen, and walks.
+
+The plan is that of `worlds.ways`: surfaces of cells of 0.1 m on all levels. A ray goes from cell to cell at the height
+of the surface, up and down stairs, and over furniture that is lower than the eye. What is seen is told by its true
+region. A frontier is a seen cell beside one that can be walked on and was not seen: real robots also see openings where
+there is nothing, this one does not.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from prior_sg.deploy.evaluation.foresight import loops
+from prior_sg.deploy.evaluation.foresight.loops import FAR
+from prior_sg.deploy.evaluation.worlds.plan import NOTHING
+from prior_sg.deploy.evaluation.worlds.walk import NARROW_CELLS
+from prior_sg.deploy.evaluation.worlds.ways import CELL_M, NONE, STEP_M, Ways, ways_of
+from prior_sg.deploy.evaluation.worlds.world import World
+from prior_sg.schemas.regions import NO_REGION
+
+EYE_M = 1.4
+RAYS = 480
+RANGE_M = {False: 5.0, True: 15.0}  # of sight, indoors and outdoors: as far as the place graph fuses depth
+LOOK_EVERY_CELLS = 6  # on the way
+LEAST_CELLS = 3  # of a frontier; smaller ones are cracks
+BEYOND_CELLS = 20  # what an opening reveals first: walkable cells at most so far from it
+ABOVE_M = 0.05  # the floor, where a surface is asked which region it is in
+BORDER_CELLS = 4  # as thick a border may be, in a doorway
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """What there is to be seen: surfaces, the region of each, and what stops a look."""
+
+    ways: Ways
+    blocked: np.ndarray  # (x, y, z) bool: matter in the cell's block of voxels, by layer
+    regions: np.ndarray  # (node,) index of the true region, NO_REGION = none
+    labels: tuple[str, ...]  # of the true regions
+    range_cells: int
+    step: int  # voxels
+    eye: int  # voxels
+
+
+@dataclass(eq=False)
+class Frontiers:
+    """The frontiers of one moment."""
+
+    nodes: list[np.ndarray]  # cells of each
+    targets: np.ndarray  # (frontier,) the node to walk to
+    steps: np.ndarray  # (frontier,) cells on the way there, in fifths
+    centers_m: np.ndarray  # (frontier, 3)
+    widths_m: np.ndarray  # (frontier,)
+    regions: np.ndarray  # (frontier,) index of the true region it opens from
+
+
+@dataclass(eq=False)
+class Explorer:
+    """Where the explorer is and what it has seen."""
+
+    plan: Plan
+    node: int
+    known: np.ndarray = field(init=False)  # (node,) bool
+    walked_m: float = 0.0
+
+    def __post_init__(self) -> None:
+        self.known = np.zeros(self.plan.ways.heights.size, bool)
+        self.look()
+
+    def look(self) -> None:
+        """See what is in sight from here."""
+        plan = self.plan
+        loops.look(plan.ways.heights, plan.blocked, self.known, self.node, plan.range_cells, RAYS, plan.step, plan.eye)
+
+    def reach(self) -> tuple[np.ndarray, np.ndarray]:
+        """Cost (node,) in fifths of a cell, FAR = not to be reached through what is known, and the node before."""
+        ways = self.plan.ways
+        return loops.reach(ways.heights, ways.clearance, self.known, self.node, NARROW_CELLS, self.plan.step)
+
+    def seen_m2(self) -> np.ndarray:
+        """Seen area (region,) of each true region."""
+        seen = self.plan.regions[self.known]
+        return np.bincount(seen[seen != NO_REGION], minlength=len(self.plan.labels)) * CELL_M**2
+
+    def frontiers(self, cost: np.ndarray) -> Frontiers:
+        """Frontiers that can be walked to."""
+        plan = self.plan
+        edge = loops.edges(plan.ways.heights, plan.ways.clearance, self.known, plan.step)
+        group = loops.grouped(plan.ways.heights, edge, plan.step)
+        order = np.flatnonzero(group >= 0)
+        order = order[np.argsort(group[order], kind="stable")]
+        parts = np.split(order, np.flatnonzero(np.diff(group[order])) + 1) if len(order) else []
+        kept, targets, widths, centers, regions = [], [], [], [], []
+        for nodes in parts:
+            reached = nodes[cost[nodes] < FAR]
+            if len(nodes) < LEAST_CELLS or not len(reached):
+                continue
+            points_m = plan.ways.position_m(nodes)
+            center_m = points_m.mean(axis=0)
+            at_m = plan.ways.position_m(reached)
+            held = plan.regions[nodes]
+            held = held[held != NO_REGION]
+            if not len(held):
+                continue
+            kept.append(nodes)
+            targets.append(reached[np.linalg.norm(at_m - center_m, axis=1).argmin()])
+            widths.append(np.linalg.norm(np.ptp(points_m[:, :2], axis=0)) + CELL_M)
+            centers.append(center_m)
+            regions.append(np.bincount(held).argmax())
+        found = np.array(targets, np.int64)
+        return Frontiers(
+            kept, found, cost[found], np.array(centers).reshape(-1, 3), np.array(widths), np.array(regions, np.int64)
+        )
+
+    def revealed(self, nodes: np.ndarray) -> int:
+        """Index of the true region that most of the unseen cells just beyond a frontier belong to; NO_REGION = none."""
+        plan = self.plan
+        first = loops.beyond(plan.ways.heights, plan.ways.clearance, self.known, nodes, BEYOND_CELLS, plan.step)
+        held = plan.regions[first]
+        held = held[held != NO_REGION]
+        return int(np.bincount(held).argmax()) if len(held) else NO_REGION
+
+    def walk(self, before: np.ndarray, target: int, until: np.ndarray) -> None:
+        """Walk towards a node, looking around on the way, until there or until nothing is unseen beside `until`."""
+        way = [target]
+        while way[-1] != self.node:
+            way.append(int(before[way[-1]]))
+        way.reverse()
+        points_m = self.plan.ways.position_m(np.array(way))
+        steps_m = np.linalg.norm(np.diff(points_m, axis=0), axis=1)
+        for number, node in enumerate(way[1:], 1):
+            self.node = node
+            self.walked_m += float(steps_m[number - 1])
+            if number % LOOK_EVERY_CELLS and number < len(way) - 1:
+                continue
+            self.look()
+            if not self.open(until):
+                return
+
+    def close(self, nodes: np.ndarray) -> None:
+        """See all that is beside these nodes."""
+        plan = self.plan
+        loops.close(plan.ways.heights, self.known, nodes, plan.step)
+
+    def open(self, nodes: np.ndarray) -> bool:
+        """Whether anything beside these nodes has not been seen."""
+        plan = self.plan
+        return bool(loops.any_edge(plan.ways.heights, plan.ways.clearance, self.known, nodes, plan.step))
+
+
+def plan_of(world: World) -> Plan:
+    """The plan of a world."""
+    ways = ways_of(world.grid, world.origin_m, world.voxel_m)
+    block = round(CELL_M / world.voxel_m)
+    nx, ny, nz = world.grid.shape[0] // block, world.grid.shape[1] // block, world.grid.shape[2]
+    matter = world.grid[: nx * block, : ny * block].reshape(nx, block, ny, block, nz) != NOTHING
+    nodes = np.flatnonzero(ways.heights.reshape(-1) != NONE)
+    points_m = ways.position_m(nodes) + np.array((0.0, 0.0, ABOVE_M))
+    regions = np.full(ways.heights.size, NO_REGION, np.int64)
+    numbers = {region.id: number for number, region in enumerate(world.truth.regions)}
+    held = world.truth.region_of(points_m)
+    regions[nodes] = [numbers.get(one, NO_REGION) for one in held.tolist()]
+    return Plan(
+        ways=ways,
+        blocked=matter.any(axis=(1, 3)),
+        regions=regions,
+        labels=tuple(region.label for region in world.truth.regions),
+        range_cells=round(RANGE_M[world.outdoors] / CELL_M),
+        step=round(STEP_M / world.voxel_m),
+        eye=round(EYE_M / world.voxel_m),
+    )
+
+
+def crossings(plan: Plan) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes (n,) and (n,) on both sides of all borders that one can walk across."""
+    return loops.crossings(plan.ways.heights, plan.ways.clearance, plan.regions, BORDER_CELLS, plan.step)
+
+
+def starts_of(plan: Plan) -> np.ndarray:
+    """Nodes in a region where one can stand, all in reach of each other."""
+    roomy = (plan.ways.clearance.reshape(-1) >= NARROW_CELLS) & (plan.regions != NO_REGION)
+    nodes = np.flatnonzero(roomy)
+    first = nodes[np.argmax(plan.ways.clearance.reshape(-1)[nodes])]
+    reached = plan.ways.reached(int(first), NARROW_CELLS)
+    return nodes[reached[nodes]]

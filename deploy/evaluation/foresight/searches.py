@@ -1,0 +1,104 @@
+"""Searches for a named region that has not been seen: metres walked, by who chooses the next opening."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from prior_sg.deploy.evaluation.foresight.explorer import Explorer, Frontiers
+from prior_sg.deploy.evaluation.foresight.trials import MOST_DECISIONS, Trial, go
+from prior_sg.deploy.evaluation.worlds.ways import CELL_M
+from prior_sg.services.exploring import expected_metres
+from prior_sg.services.segmenter.core.foresight.beyond import beyond
+from prior_sg.services.segmenter.core.foresight.config import ForesightConfig
+from prior_sg.services.segmenter.core.foresight.expectation import expected
+
+STRAIGHT = 5  # cost of a straight step of one cell
+GOAL_M2 = 1.0  # of the goal's region, seen: it is found ...
+GOAL_SHARE = 0.5  # ... or this share of a smaller one
+
+
+@dataclass(frozen=True)
+class Quest:
+    """A region that is looked for, and where from."""
+
+    trial: Trial
+    goal: int  # label
+    start: int  # node
+
+
+@dataclass(frozen=True)
+class Sight:
+    """What a policy may choose by."""
+
+    quest: Quest
+    explorer: Explorer
+    frontiers: Frontiers
+    seen_m2: np.ndarray
+    rng: np.random.Generator
+    cfg: ForesightConfig
+
+
+Policy = Callable[[Sight], int]
+
+
+def ours(sight: Sight) -> int:
+    """The least expected metres by the product's score."""
+    one, cfg = sight.quest.trial, sight.cfg
+    expectation = expected(one.prior, one.found(sight.explorer, sight.seen_m2), cfg)
+    foreseen = beyond(one.views(sight.frontiers, sight.seen_m2), expectation, cfg)
+    metres = expected_metres(
+        sight.frontiers.steps * CELL_M / STRAIGHT,
+        sight.frontiers.centers_m,
+        foreseen.within[:, sight.quest.goal],
+        cfg.look_m,
+        cfg.elsewhere_m,
+    )
+    return int(metres.argmin())
+
+
+POLICIES: dict[str, Policy] = {
+    "ours": ours,
+    "nearest": lambda sight: int(sight.frontiers.steps.argmin()),
+    "largest": lambda sight: int(sight.frontiers.widths_m.argmax()),
+    "random": lambda sight: int(sight.rng.integers(len(sight.frontiers.targets))),
+}
+
+
+def quests(one: Trial, count: int) -> list[Quest]:
+    """Different goals of one world, none of them seen at the start; fewer where there are not so many."""
+    rng = one.random(2)
+    found: list[Quest] = []
+    for _ in range(10 * count):
+        start = int(rng.choice(one.starts))
+        seen_m2 = Explorer(one.plan, start).seen_m2()
+        reachable = np.unique(one.plan.regions[one.starts])
+        seen = {int(label) for label in one.labels[seen_m2 > 0]}
+        goals = sorted(
+            {int(one.labels[region]) for region in reachable} - seen - {quest.goal for quest in found} - {-1}
+        )
+        if goals:
+            found.append(Quest(one, int(rng.choice(goals)), start))
+        if len(found) == count:
+            break
+    return found
+
+
+def metres(quest: Quest, policy: Policy, cfg: ForesightConfig) -> float:
+    """Metres walked until enough of the goal has been seen; those of the whole walk where it never is."""
+    one = quest.trial
+    explorer = Explorer(one.plan, quest.start)
+    whole_m2 = np.bincount(one.plan.regions[one.starts], minlength=len(one.labels)) * CELL_M**2
+    enough_m2 = np.minimum(GOAL_M2, GOAL_SHARE * whole_m2)
+    goals = np.flatnonzero((one.labels == quest.goal) & (whole_m2 > 0))
+    rng = one.random(3)
+    for _ in range(MOST_DECISIONS):
+        seen_m2 = explorer.seen_m2()
+        if (seen_m2[goals] >= enough_m2[goals]).any():
+            break
+        cost, before = explorer.reach()
+        frontiers = explorer.frontiers(cost)
+        if not len(frontiers.targets):
+            break
+        go(explorer, before, frontiers, policy(Sight(quest, explorer, frontiers, seen_m2, rng, cfg)))
+    return explorer.walked_m

@@ -1,0 +1,47 @@
+"""What is expected beyond what a robot has seen: openings, the regions behind them, and what is missing."""
+
+from prior_sg.schemas.codec import Part
+
+Point = tuple[float, float, float]  # world, metres
+
+
+class ForeseenLabel(Part, frozen=True, kw_only=True):
+    """One label that a region behind an opening may have, and why."""
+
+    label: str
+    next: float  # probability that the very next region behind the opening is another one, with this label
+    within: float  # that such a region is met within the steps of the foresight
+    adjacency: float = 0.0  # why: P(ri <-> rj) of the prior with the label of the region that the opening belongs to
+    existence: float = 0.0  # P(r | E0)
+    found: int = 0  # regions of this label that the map holds
+    met: int = 0  # borders in the map between regions of these two labels
+
+
+class Opening(Part, frozen=True, kw_only=True):
+    """Frontiers of neighbouring places that lead to the same unobserved space, and what lies behind."""
+
+    place_id: int  # the place with the largest frontier
+    position_m: Point  # of its centre
+    beyond_m: Point  # a point in the unobserved space
+    width_m: float
+    region: int  # that it opens from
+    same: float  # probability that this region goes on behind it; with `next` of all labels, these sum to one
+    labels: list[ForeseenLabel] = []  # the most probable first; others left out
+
+
+class MissingLabel(Part, frozen=True, kw_only=True):
+    """A label that is probably still to be found behind the openings."""
+
+    label: str
+    probability: float  # that one more region of it is behind any opening
+    found: int = 0  # regions of it that the map holds
+
+
+class Foresight(Part, frozen=True, kw_only=True):
+    """All that is foreseen of one map: nodes that are predictions."""
+
+    openings: list[Opening] = []
+    missing: list[MissingLabel] = []  # the most probable first
+    steps: int = 0  # regions behind an opening that `within` reaches
+    look_m: float = 0.0  # what is walked behind an opening to see what is there
+    elsewhere_m: float = 0.0  # what is walked to find what is behind none of the openings

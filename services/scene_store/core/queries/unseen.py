@@ -1,0 +1,79 @@
+"""What has not been seen: where a region of a label may be, the way there, and what is missing (pure)."""
+
+import numpy as np
+
+from prior_sg.schemas.foresight import Foresight, Opening
+from prior_sg.schemas.names import same
+from prior_sg.schemas.queries import Missing, Outlook, Prospect, RouteBetween, Spot, WhatIsMissing, WhereToLook
+from prior_sg.services.exploring import expected_metres
+from prior_sg.services.scene_store.core.queries.index import Index
+from prior_sg.services.scene_store.core.queries.labels import AFTER_A_TASK, nearest_labels
+from prior_sg.services.scene_store.core.queries.routes import NoSuchSpot, lengths_from, route
+from prior_sg.services.scene_store.core.queries.things import things
+
+DIGITS = 2
+
+
+def outlook(index: Index, question: WhereToLook) -> Outlook:
+    """Openings behind which a region of the label may be, the least expected metres first, and the way to the first."""
+    foresight, label = index.scene.foresight, _known(index, question.label)
+    if not label:
+        return Outlook(label=question.label, reason=_unknown(index, question.label))
+    seen = things(index, "region", index.labelled("region", label))
+    held = [opening for opening in foresight.openings if index.row("place", opening.place_id) is not None]
+    if not held:
+        return Outlook(label=label, found=seen, reason="nothing is known to be open: no opening to unobserved space")
+    try:
+        lengths_m = lengths_from(index, question.start, question.clearance_m)
+    except NoSuchSpot as error:
+        return Outlook(label=label, found=seen, reason=str(error))
+    rows = [index.row("place", opening.place_id) for opening in held]
+    ways_m = lengths_m[rows]
+    chances = np.array([_chance(opening, label) for opening in held])
+    prospects = _prospects(foresight, held, ways_m, chances, index.points_m[rows])[: question.limit]
+    missing = {entry.label: entry.probability for entry in foresight.missing}
+    if not prospects:
+        reason = f"no way leads to any opening behind which {label!r} is at all likely"
+        return Outlook(label=label, probability=missing.get(label, 0.0), found=seen, reason=reason)
+    goal = Spot(what="place", id=prospects[0].opening.place_id)
+    way = route(index, RouteBetween(start=question.start, goal=goal, clearance_m=question.clearance_m))
+    return Outlook(label=label, prospects=prospects, probability=missing.get(label, 0.0), route=way, found=seen)
+
+
+def missing(index: Index, question: WhatIsMissing) -> Missing:
+    """What is probably behind the openings."""
+    foresight = index.scene.foresight
+    reason = "" if foresight.openings or index.scene.task else f"nothing is expected yet: {AFTER_A_TASK}"
+    return Missing(labels=foresight.missing[: question.limit], openings=len(foresight.openings), reason=reason)
+
+
+def _prospects(
+    foresight: Foresight, held: list[Opening], ways_m: np.ndarray, chances: np.ndarray, points_m: np.ndarray
+) -> list[Prospect]:
+    likely = np.flatnonzero((chances > 0) & np.isfinite(ways_m))
+    metres = expected_metres(ways_m[likely], points_m[likely], chances[likely], foresight.look_m, foresight.elsewhere_m)
+    return [
+        Prospect(
+            opening=held[likely[at]],
+            probability=float(chances[likely[at]]),
+            expected_m=round(float(metres[at]), DIGITS),
+            way_m=round(float(ways_m[likely[at]]), DIGITS),
+        )
+        for at in np.argsort(metres, kind="stable").tolist()
+    ]
+
+
+def _chance(opening: Opening, label: str) -> float:
+    return next((entry.within for entry in opening.labels if entry.label == label), 0.0)
+
+
+def _known(index: Index, label: str) -> str:
+    """The prior's label of that name, whatever its case; empty = it has none."""
+    return next((one for one in index.scene.labels if same(one) == same(label)), "")
+
+
+def _unknown(index: Index, label: str) -> str:
+    if not index.scene.labels:
+        return f"no region is expected yet: {AFTER_A_TASK}"
+    near = nearest_labels(label, index.scene.labels)
+    return f"the task knows no region {label!r}; it knows {', '.join(near or index.scene.labels)}"

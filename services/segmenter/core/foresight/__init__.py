@@ -1,0 +1,1 @@
+"""What lies beyond the map's openings: regions expected by the prior and by what has been found."""

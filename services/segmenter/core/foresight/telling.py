@@ -1,0 +1,92 @@
+"""What is foreseen as it travels, and whether it is news (pure)."""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from prior_sg.schemas.foresight import ForeseenLabel, Foresight, MissingLabel, Opening
+from prior_sg.schemas.priors import Prior
+from prior_sg.schemas.regions import Region
+from prior_sg.services.segmenter.core.foresight.beyond import Beyond, Views, beyond
+from prior_sg.services.segmenter.core.foresight.config import ForesightConfig
+from prior_sg.services.segmenter.core.foresight.expectation import Found, expected
+from prior_sg.services.segmenter.core.foresight.openings import Openings
+
+DIGITS = 3
+
+
+def foresight(openings: Openings, regions: Mapping[int, Region], prior: Prior, cfg: ForesightConfig) -> Foresight:
+    """What lies beyond the openings of a map with these regions."""
+    names = [region.name for region in prior.regions]
+    found = Found.of(regions.values(), names, cfg.least_places)
+    areas_m2 = np.array([regions[region].area_m2 for region in openings.regions.tolist()])
+    views = Views(openings.beliefs, openings.widths_m, areas_m2)
+    foreseen = beyond(views, expected(prior, found, cfg), cfg)
+    missing = foreseen.missing()
+    return Foresight(
+        openings=[
+            _opening(openings, row, foreseen=foreseen, prior=prior, found=found, cfg=cfg)
+            for row in range(len(openings.place_ids))
+        ],
+        missing=[
+            MissingLabel(label=names[label], probability=_short(missing[label]), found=int(found.regions[label]))
+            for label in np.argsort(-missing, kind="stable").tolist()
+            if missing[label] >= cfg.least_told
+        ],
+        steps=cfg.steps,
+        look_m=cfg.look_m,
+        elsewhere_m=cfg.elsewhere_m,
+    )
+
+
+def differs(told: Foresight | None, now: Foresight, cfg: ForesightConfig) -> bool:
+    """Whether an opening came or went, or a probability changed by more than what is told."""
+    before, after = _figures(told or Foresight()), _figures(now)
+    return any(
+        abs(after.get(key, 0.0) - before.get(key, 0.0)) > cfg.told_change for key in before.keys() | after.keys()
+    )
+
+
+def _figures(one: Foresight) -> dict[tuple[int, str], float]:
+    """Every probability by opening and label; openings as a whole count as likely."""
+    found = {(opening.place_id, ""): 1.0 + opening.same for opening in one.openings}
+    found |= {(opening.place_id, entry.label): entry.within for opening in one.openings for entry in opening.labels}
+    return found | {(-1, entry.label): entry.probability for entry in one.missing}
+
+
+def _opening(
+    openings: Openings, row: int, *, foreseen: Beyond, prior: Prior, found: Found, cfg: ForesightConfig
+) -> Opening:
+    here = int(openings.beliefs[row].argmax())
+    within = foreseen.within[row]
+    likely = np.argsort(-within, kind="stable")[: cfg.told_labels].tolist()
+    return Opening(
+        place_id=int(openings.place_ids[row]),
+        position_m=_point(openings.positions_m[row]),
+        beyond_m=_point(openings.beyond_m[row]),
+        width_m=round(float(openings.widths_m[row]), 2),
+        region=int(openings.regions[row]),
+        same=_short(foreseen.same[row]),
+        labels=[
+            ForeseenLabel(
+                label=prior.regions[label].name,
+                next=_short(foreseen.next[row, label]),
+                within=_short(within[label]),
+                adjacency=_short(prior.adjacency[here, label]),
+                existence=_short(prior.regions[label].existence),
+                found=int(found.regions[label]),
+                met=int(found.borders[here, label]),
+            )
+            for label in likely
+            if within[label] >= cfg.least_told
+        ],
+    )
+
+
+def _point(point_m: np.ndarray) -> tuple[float, float, float]:
+    x, y, z = np.round(point_m, 2).tolist()
+    return x, y, z
+
+
+def _short(probability: float) -> float:
+    return round(float(probability), DIGITS)

@@ -1,0 +1,164 @@
+"""The light explorer on a plan made by hand, scores on events made by hand, and fitting of what is known."""
+
+import msgspec
+import numpy as np
+import pytest
+
+from prior_sg.deploy.evaluation.foresight.explorer import Explorer, Plan, crossings
+from prior_sg.deploy.evaluation.foresight.fitting import fitted
+from prior_sg.deploy.evaluation.foresight.loops import FAR
+from prior_sg.deploy.evaluation.foresight.predictors import PREDICTORS
+from prior_sg.deploy.evaluation.foresight.scores import figures, judge, search_figures
+from prior_sg.deploy.evaluation.foresight.searches import POLICIES, Quest, metres
+from prior_sg.deploy.evaluation.foresight.trials import SAME, Moment, Trial, go
+from prior_sg.deploy.evaluation.worlds.ways import CELL_M, LEVELS, ways_of
+from prior_sg.services.segmenter.core.foresight.beyond import Views
+from prior_sg.services.segmenter.core.foresight.config import ForesightConfig
+from prior_sg.services.segmenter.core.foresight.expectation import Found, expected
+from tests.help.world import prior
+
+LABELS = ["hall", "bath", "kitchen"]
+ROOM, HEIGHT = 40, 25  # cells of 0.1 m
+
+
+def three_rooms():
+    """Bath, hall and kitchen in a row from west to east, with doors of 1 m at the middle of the walls between."""
+    grid = np.zeros((3 * ROOM + 4, ROOM + 2, HEIGHT), np.uint8)
+    grid[:, :, :2] = 1
+    for x in (0, ROOM + 1, 2 * ROOM + 2, 3 * ROOM + 3):
+        grid[x] = 1
+    grid[:, [0, -1]] = 1
+    for x in (ROOM + 1, 2 * ROOM + 2):
+        grid[x, ROOM // 2 - 5 : ROOM // 2 + 5, 2:22] = 0
+    ways = ways_of(grid, np.zeros(3), CELL_M)
+    regions = np.full(ways.heights.shape, -1)
+    for number, label in ((1, 0), (0, 1), (2, 2)):
+        low = number * (ROOM + 1) + 1
+        regions[low : low + ROOM, 1:-1] = label
+    regions[ways.heights < 0] = -1
+    return Plan(ways, grid != 0, regions.reshape(-1), ("hall", "bath", "kitchen"), 30, 2, 14)
+
+
+PLAN = three_rooms()
+
+
+def node(x, y):
+    """The node on the floor of a cell."""
+    level = int(np.flatnonzero(PLAN.ways.heights[x, y] >= 0)[0])
+    return (x * PLAN.ways.heights.shape[1] + y) * LEVELS + level
+
+
+HALL = node(ROOM + 1 + ROOM // 2, ROOM // 2)
+
+
+def home_trial():
+    matrix = np.full((3, 3), 0.5, np.float32)
+    np.fill_diagonal(matrix, 1.0)
+    labels = np.arange(3)
+    nodes = np.flatnonzero((PLAN.ways.clearance.reshape(-1) >= 4) & (PLAN.regions >= 0))
+    return Trial("home", 1, PLAN, prior(LABELS, adjacency=matrix), labels, labels, crossings(PLAN), nodes)
+
+
+def test_an_explorer_sees_its_room_and_what_doors_let_through():
+    explorer = Explorer(PLAN, HALL)
+    hall_m2, bath_m2, kitchen_m2 = explorer.seen_m2()
+    assert hall_m2 > 15 and bath_m2 < 3 and kitchen_m2 < 3
+    assert bath_m2 > 0 and bath_m2 == pytest.approx(kitchen_m2, abs=0.3)
+
+
+def test_doors_are_frontiers_that_reveal_the_rooms_behind():
+    explorer = Explorer(PLAN, HALL)
+    cost, before = explorer.reach()
+    frontiers = explorer.frontiers(cost)
+    revealed = {PLAN.labels[explorer.revealed(nodes)] for nodes in frontiers.nodes}
+    assert {"bath", "kitchen"} <= revealed
+    assert cost[HALL] == 0 and cost[node(3, 3)] == FAR
+    at = next(at for at, nodes in enumerate(frontiers.nodes) if PLAN.labels[explorer.revealed(nodes)] == "bath")
+    straight_m = np.linalg.norm(PLAN.ways.position_m(frontiers.targets)[at] - PLAN.ways.position_m(np.array([HALL]))[0])
+    assert straight_m <= frontiers.steps[at] * CELL_M / 5 < 1.2 * straight_m
+    go(explorer, before, frontiers, at)
+    assert explorer.walked_m == pytest.approx(frontiers.steps[at] * CELL_M / 5, rel=0.02) or explorer.seen_m2()[1] > 3
+
+
+def test_following_frontiers_sees_everything_once():
+    explorer = Explorer(PLAN, HALL)
+    for _ in range(50):
+        cost, before = explorer.reach()
+        frontiers = explorer.frontiers(cost)
+        if not len(frontiers.targets):
+            break
+        go(explorer, before, frontiers, int(frontiers.steps.argmin()))
+    whole_m2 = np.bincount(PLAN.regions[PLAN.regions >= 0]) * CELL_M**2
+    assert (explorer.seen_m2() > 0.95 * whole_m2).all()
+
+
+def test_regions_that_touch_through_a_door_are_found_as_such():
+    one = home_trial()
+    explorer = Explorer(PLAN, HALL)
+    explorer.known[:] = True
+    found = one.found(explorer, explorer.seen_m2())
+    assert found.regions.tolist() == [1, 1, 1]
+    assert found.borders.tolist() == [[0, 1, 1], [1, 0, 0], [1, 0, 0]]
+
+
+@pytest.mark.parametrize("policy", POLICIES)
+def test_every_policy_finds_what_is_there(policy):
+    walked_m = metres(Quest(home_trial(), 1, node(3 * ROOM, ROOM // 2)), POLICIES[policy], ForesightConfig())
+    assert 4 < walked_m < 40
+
+
+def moment(outcomes, widths_m=None, label=0):
+    count = len(outcomes)
+    views = Views(
+        np.tile(np.eye(3)[label], (count, 1)), np.full(count, 0.9) if widths_m is None else widths_m, np.ones(count)
+    )
+    return Moment(
+        views, Found(np.array([1.0, 0, 0]), np.zeros((3, 3))), np.array(outcomes), np.ones(3, bool), np.zeros(3, bool)
+    )
+
+
+@pytest.mark.parametrize("name", PREDICTORS)
+def test_predictors_give_distributions(name):
+    given = PREDICTORS[name](moment([SAME, 1, 2]), home_trial().prior, ForesightConfig())
+    assert given.shape == (3, 4)
+    np.testing.assert_allclose(given.sum(axis=1), 1.0)
+
+
+def test_scores_of_a_uniform_predictor():
+    said = judge("home", [moment([SAME, 1]), moment([]), moment([2, 2])], home_trial().prior, ForesightConfig())
+    found = figures([said["uniform"]])
+    assert found["nll_another"] == pytest.approx(np.log(3)) and found["events"] == 4
+    assert found["nll"] == pytest.approx(-np.mean([np.log(1 / 2), *[np.log(1 / 6)] * 3]))
+    assert found["top1"] == 0.25 and found["top1_another"] == 0.0 and found["top3_another"] == 1.0
+
+
+def test_savings_are_paired():
+    found = search_figures({"ours": [1.0, 4.0], "nearest": [2.0, 8.0]})
+    assert found["saved_against_nearest"] == pytest.approx(0.5) and found["ours_m"] == 2.5
+
+
+def test_fitting_finds_the_weights_that_made_the_events():
+    """Outcomes drawn from the model with known weights give these back."""
+    rng, cfg = np.random.default_rng(4), ForesightConfig()
+    matrix = np.array([[1, 0.9, 0.1], [0.9, 1, 0.3], [0.1, 0.3, 1]], np.float32)
+    the_prior = prior(LABELS, adjacency=matrix)
+    true = msgspec.structs.replace(
+        cfg, adjacency=1.5, found_once=-2.0, again=-1.0, same_by_width=(0, 0, -2.0, 0, 0, 0, 3.0)
+    )
+    walk = []
+    for _ in range(600):
+        counts = rng.integers(0, 2, 3).astype(float)
+        at, widths_m = int(rng.integers(3)), rng.choice([0.9, 5.0], 4)
+        bare = moment([0] * 4, widths_m, at)
+        bare = Moment(bare.views, Found(counts, np.zeros((3, 3))), bare.outcomes, bare.left, bare.seen)
+        given = PREDICTORS["ours"](bare, the_prior, true)
+        outcomes = [int(rng.choice(4, p=row)) - 1 for row in given]
+        walk.append(Moment(bare.views, bare.found, np.array(outcomes), bare.left, bare.seen))
+    found = fitted([(walk, the_prior)], cfg)
+    chain, wanted = (
+        expected(the_prior, Found(np.array([1.0, 0, 1]), np.zeros((3, 3))), one).next for one in (found, true)
+    )
+    np.testing.assert_allclose(chain, wanted, atol=0.06)
+    same = [PREDICTORS["ours"](moment([0], np.array([width])), the_prior, found)[0, 0] for width in (0.9, 5.0)]
+    wanted_same = [PREDICTORS["ours"](moment([0], np.array([width])), the_prior, true)[0, 0] for width in (0.9, 5.0)]
+    assert same == pytest.approx(wanted_same, abs=0.05)

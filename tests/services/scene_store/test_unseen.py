@@ -1,0 +1,97 @@
+"""Where to look for what has not been seen, and what is missing, over a stored scene."""
+
+import msgspec
+import numpy as np
+import pytest
+
+from prior_sg.deploy.benches.queries import synthetic_scene
+from prior_sg.schemas import queries as q
+from prior_sg.schemas.foresight import ForeseenLabel, Foresight, MissingLabel, Opening
+from prior_sg.services.scene_store.core.queries.answering import answer
+from prior_sg.services.scene_store.core.queries.index import Index
+
+SCENE = synthetic_scene(600, 50)
+LABEL, OTHER = SCENE.labels[:2]
+
+
+def opening(row, within):
+    x, y, z = SCENE.positions_m[row].tolist()
+    return Opening(
+        place_id=int(SCENE.place_ids[row]),
+        position_m=(x, y, z),
+        beyond_m=(x + 1, y, z),
+        width_m=0.9,
+        region=int(SCENE.place_regions[row]),
+        same=0.1,
+        labels=[ForeseenLabel(label=LABEL, next=within / 2, within=within)],
+    )
+
+
+def index_of(*openings):
+    foresight = Foresight(
+        openings=list(openings),
+        missing=[MissingLabel(label=LABEL, probability=0.8)],
+        steps=3,
+        look_m=2.0,
+        elsewhere_m=30.0,
+    )
+    return Index(msgspec.structs.replace(SCENE, foresight=foresight))
+
+
+NEAR = index_of(opening(40, 0.3), opening(300, 0.3))
+START = q.Spot(what="place", id=int(SCENE.place_ids[40]))
+
+
+def ask(index, **fields):
+    return answer(index, q.WhereToLook(**({"label": LABEL, "start": START} | fields)))
+
+
+def test_of_equal_chances_the_nearer_comes_first_with_the_way_there():
+    found = ask(NEAR, label=LABEL.upper())
+    assert found.label == LABEL and found.reason == "" and found.probability == 0.8
+    assert [one.opening.place_id for one in found.prospects] == [int(SCENE.place_ids[row]) for row in (40, 300)]
+    assert found.prospects[0].way_m == 0 and found.prospects[0].expected_m < found.prospects[1].expected_m
+    assert found.route.found and found.route.place_ids == [int(SCENE.place_ids[40])]
+
+
+def test_a_surer_one_is_worth_a_walk_and_the_route_is_the_shortest_way():
+    found = ask(index_of(opening(40, 0.02), opening(300, 0.95)))
+    best = found.prospects[0]
+    assert best.opening.place_id == int(SCENE.place_ids[300])
+    way = answer(NEAR, q.RouteBetween(start=START, goal=q.Spot(what="place", id=best.opening.place_id)))
+    assert found.route.place_ids == way.place_ids
+    assert best.way_m == pytest.approx(way.length_m, abs=0.01)
+    assert ask(index_of(opening(40, 0.02), opening(300, 0.95)), limit=1).prospects == [best]
+
+
+@pytest.mark.parametrize(
+    ("index", "fields", "said"),
+    [
+        (NEAR, {"label": "xyzzy"}, "the task knows no region 'xyzzy'"),
+        (NEAR, {"label": OTHER}, "no way leads to any opening"),
+        (index_of(), {}, "no opening"),
+        (NEAR, {"start": q.Spot(what="place", id=10**6)}, "there is no place"),
+        (
+            Index(msgspec.structs.replace(SCENE, labels=[], posteriors=np.zeros((600, 0), np.float16))),
+            {},
+            "no region is expected",
+        ),
+    ],
+)
+def test_why_there_is_no_answer(index, fields, said):
+    found = ask(index, **fields)
+    assert found.prospects == [] and said in found.reason
+
+
+def test_an_opening_whose_place_is_gone_is_left_out():
+    gone = msgspec.structs.replace(opening(40, 0.9), place_id=10**6)
+    assert [one.opening.place_id for one in ask(index_of(gone, opening(300, 0.1))).prospects] == [
+        int(SCENE.place_ids[300])
+    ]
+
+
+def test_what_is_missing_is_told_with_the_openings_it_may_be_behind():
+    found = answer(NEAR, q.WhatIsMissing(limit=5))
+    assert [one.label for one in found.labels] == [LABEL] and found.openings == 2
+    bare = msgspec.structs.replace(SCENE, task="")
+    assert "none was given" in answer(Index(bare), q.WhatIsMissing()).reason

@@ -1,0 +1,234 @@
+"""What lies beyond openings: distributions, what moves them, how frontiers merge, and when it is told."""
+
+import msgspec
+import numpy as np
+import pytest
+
+from prior_sg.schemas.foresight import Foresight
+from prior_sg.schemas.priors import RegionPrior
+from prior_sg.schemas.regions import RegionDelta
+from prior_sg.schemas.status import Tick
+from prior_sg.services.segmenter.core import update
+from prior_sg.services.segmenter.core.config import Config
+from prior_sg.services.segmenter.core.foresight.beyond import Views, beyond
+from prior_sg.services.segmenter.core.foresight.config import ForesightConfig
+from prior_sg.services.segmenter.core.foresight.expectation import Found, expected
+from prior_sg.services.segmenter.core.foresight.openings import openings_of
+from prior_sg.services.segmenter.core.foresight.telling import differs, foresight
+from prior_sg.services.segmenter.core.map.frontiers import Frontiers
+from prior_sg.services.segmenter.core.map.received import ReceivedGraph
+from prior_sg.services.segmenter.core.map.table import Places
+from prior_sg.services.segmenter.core.report import snapshot
+from prior_sg.services.segmenter.core.state import empty
+from tests.help.world import ROBOT, place_delta, place_grid, prior, task, text, walk
+
+CFG = ForesightConfig()
+LABELS = ["hall", "bath", "kitchen", "bedroom"]
+
+
+def home(**adjacency):
+    """A prior of four regions; adjacency by pairs such as hall_bath."""
+    matrix = np.full((4, 4), 0.1, np.float32)
+    np.fill_diagonal(matrix, 1.0)
+    for pair, value in adjacency.items():
+        a, b = (LABELS.index(name) for name in pair.split("_"))
+        matrix[a, b] = matrix[b, a] = value
+    return prior(LABELS, adjacency=matrix)
+
+
+def found(**counts):
+    regions = np.zeros(4)
+    for name, count in counts.items():
+        regions[LABELS.index(name)] = count
+    return Found(regions, np.zeros((4, 4)))
+
+
+def views(label="hall", width_m=0.9, area_m2=8.0):
+    return Views(np.eye(4)[[LABELS.index(label)]], np.array([width_m]), np.array([area_m2]))
+
+
+def foreseen(the_prior, the_found, the_views=None, cfg=CFG):
+    return beyond(the_views or views(), expected(the_prior, the_found, cfg), cfg)
+
+
+def random_case(seed):
+    rng = np.random.default_rng(seed)
+    adjacency = rng.uniform(0.01, 1, (4, 4))
+    existence = rng.dirichlet(np.ones(4))
+    regions = [
+        RegionPrior(name=name, phrases=["x"], existence=float(share))
+        for name, share in zip(LABELS, existence, strict=True)
+    ]
+    the_prior = prior(LABELS, adjacency=((adjacency + adjacency.T) / 2).astype(np.float32), regions=regions)
+    borders = rng.integers(0, 3, (4, 4)).astype(float)
+    the_found = Found(rng.integers(0, 4, 4).astype(float), borders + borders.T)
+    many = Views(rng.dirichlet(np.ones(4), 7), rng.uniform(0.3, 6, 7), rng.uniform(0, 60, 7))
+    return the_prior, the_found, many
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_what_is_expected_is_a_distribution_and_more_steps_reach_no_less(seed):
+    the_prior, the_found, many = random_case(seed)
+    result = foreseen(the_prior, the_found, many)
+    np.testing.assert_allclose(result.same + result.next.sum(axis=1), 1.0)
+    assert (result.next >= 0).all() and (result.within <= 1).all() and (result.within >= result.next - 1e-12).all()
+    chain = expected(the_prior, the_found, CFG)
+    np.testing.assert_allclose(chain.next.sum(axis=1), 1.0)
+    one, two, three = (chain.ahead(steps, 0.6) for steps in (1, 2, 3))
+    assert (two >= one - 1e-12).all() and (three >= two - 1e-12).all()
+
+
+def test_two_steps_are_those_over_every_region_between():
+    the_prior, the_found, _ = random_case(5)
+    chain = expected(the_prior, the_found, CFG)
+    leads = np.minimum(0.6 * chain.spread / chain.spread.mean(), 1)
+    for i in range(4):
+        for r in range(4):
+            by_hand = chain.next[i, r] + sum(chain.next[i, k] * leads[k] * chain.next[k, r] for k in range(4) if k != r)
+            assert chain.ahead(2, 0.6)[i, r] == pytest.approx(min(by_hand, 1))
+
+
+def test_what_usually_touches_is_likelier():
+    near, far = (foreseen(home(hall_bath=value), found()).next[0, 1] for value in (0.9, 0.1))
+    assert near > 2 * far
+
+
+def test_what_is_there_once_is_less_likely_again():
+    assert foreseen(home(), found(bath=1)).next[0, 1] < foreseen(home(), found()).next[0, 1]
+
+
+def test_narrow_openings_lead_elsewhere_and_wide_ones_show_more_of_the_same():
+    door, hall = (foreseen(home(), found(), views(width_m=width)).same[0] for width in (0.9, 6.0))
+    assert door < hall
+
+
+def test_a_region_two_rooms_on_is_met_through_the_one_between():
+    chained = home(hall_bedroom=0.9, bedroom_bath=0.9, hall_bath=0.01)
+    apart = home(hall_bedroom=0.9, bedroom_bath=0.01, hall_bath=0.01)
+    assert foreseen(chained, found()).within[0, 1] > foreseen(apart, found()).within[0, 1]
+
+
+def a_map():
+    """A row of five places 1 m apart: a hall of four and a bath; frontiers north of 0 and 1, south of 1, up from 2."""
+    graph = ReceivedGraph(
+        ids=np.arange(5) * 10,
+        positions_m=np.column_stack((np.arange(5.0), np.zeros(5), np.ones(5))),
+        radii_m=np.full(5, 0.5),
+        edges=np.array([(0, 1), (1, 2), (2, 3), (3, 4)]),
+        clearances_m=np.full(4, 0.5),
+    )
+    places = Places.none()
+    places.regions = np.array([7, 7, 7, 7, 8])
+    places.posteriors = np.array([[0.8, 0.1, 0.1, 0.0]] * 4 + [[0.1, 0.9, 0.0, 0.0]])
+    return graph, places
+
+
+def opened(*rows):
+    frontiers = Frontiers()
+    frontiers.held = {place: np.array([*direction, area]) for place, direction, area in rows}
+    return frontiers
+
+
+def test_neighbouring_frontiers_that_look_the_same_way_are_one_opening():
+    graph, places = a_map()
+    north, south, up = (0, 1, 0), (0, -1, 0), (0, 0, 1)
+    result = openings_of(graph, places, opened((0, north, 1.0), (10, north, 2.0), (20, up, 3.0)), CFG)
+    assert result.place_ids.tolist() == [10]
+    assert result.widths_m == pytest.approx([1.5])
+    assert result.beyond_m[0] == pytest.approx([1.0, 0.5 + CFG.beyond_m, 1.0])
+    assert result.beliefs[0] == pytest.approx([0.8, 0.1, 0.1, 0.0])
+    assert openings_of(graph, places, opened((0, north, 1.0), (10, south, 2.0)), CFG).place_ids.tolist() == [10, 0]
+    assert openings_of(graph, places, opened((30, north, 1.0), (40, north, 1.0)), CFG).regions.tolist() == [7, 8]
+
+
+@pytest.mark.parametrize("rows", [[], [(99, (0, 1, 0), 1.0)], [(0, (0, 1, 0), 0.1)]])
+def test_no_openings_foresee_nothing(rows):
+    graph, places = a_map()
+    result = foresight(openings_of(graph, places, opened(*rows), CFG), {}, home(), CFG)
+    assert result.openings == [] and result.missing == []
+
+
+def test_frontiers_follow_deltas():
+    frontiers, none = Frontiers(), np.zeros(0, np.int64)
+    positions, edges = place_grid(1)
+    told = place_delta(positions, edges, **columns((1, 0.5), (2, 0.7)))
+    frontiers.follow(told, none, replaces=True)
+    frontiers.follow(place_delta(positions, edges, **columns((2, 0.0), (3, 0.2))), np.array([1]), replaces=False)
+    assert frontiers.columns()[0].tolist() == [3]
+
+
+def columns(*rows):
+    return {
+        "frontier_ids": np.array([place for place, _ in rows], np.int64),
+        "frontier_directions": np.tile(np.array([1, 0, 0], np.float32), (len(rows), 1)),
+        "frontier_areas_m2": np.array([area for _, area in rows], np.float32),
+    }
+
+
+def test_only_what_changes_visibly_is_news():
+    graph, places = a_map()
+    state_of = {7: region(7, "hall"), 8: region(8, "bath")}
+    openings = openings_of(graph, places, opened((0, (0, 1, 0), 2.0)), CFG)
+    now = foresight(openings, state_of, home(), CFG)
+    assert differs(None, now, CFG) and not differs(now, now, CFG) and differs(now, Foresight(), CFG)
+    assert not differs(None, Foresight(), CFG)
+    moved = [msgspec.structs.replace(now.openings[0], same=now.openings[0].same + shift) for shift in (0.01, 0.2)]
+    assert [differs(now, msgspec.structs.replace(now, openings=[one]), CFG) for one in moved] == [False, True]
+
+
+def region(number, label, neighbours=()):
+    from prior_sg.schemas.regions import Region
+
+    return Region(
+        id=number,
+        label=label,
+        place_count=9,
+        probability=0.9,
+        position_m=(0, 0, 0),
+        area_m2=9.0,
+        neighbour_ids=list(neighbours),
+    )
+
+
+def test_regions_and_borders_are_counted_by_label():
+    regions = [region(1, "hall", [2, 3]), region(2, "bath", [1]), region(3, "hall", [1])]
+    counted = Found.of(regions, LABELS, least_places=3)
+    assert counted.regions.tolist() == [2, 1, 0, 0]
+    assert counted.borders.tolist() == [[1, 1, 0, 0], [1, 0, 0, 0], [0, 0, 0, 0], [0, 0, 0, 0]]
+    assert Found.of(regions, LABELS, least_places=10).regions.sum() == 0
+
+
+def run(*messages, cfg=Config()):
+    """Deltas of a segmenter; texts are those of rooms' basis vectors."""
+    state, deltas = empty(cfg, ROBOT, 1), []
+    waiting = list(messages)
+    while waiting:
+        for output in update.update(state, waiting.pop(0), cfg):
+            if type(output).__name__ == "TextRequest":
+                waiting.insert(0, text(np.eye(3)[: len(output.concepts)]))
+            elif isinstance(output, RegionDelta):
+                deltas.append(output)
+    return state, deltas
+
+
+def test_a_segmenter_tells_what_it_foresees_once():
+    positions, edges = place_grid(2)
+    rooms = prior(["kitchen", "hall"])
+    delta = place_delta(positions, edges, **columns((30, 2.0)))
+    state, deltas = run(delta, task(), rooms, *walk(2), Tick(stamp_ns=1), Tick(stamp_ns=2))
+    told = [one.foresight for one in deltas if one.foresight is not None]
+    assert [opening.place_id for opening in told[-1].openings] == [30]
+    assert snapshot(state).foresight == told[-1]
+    closed = place_delta(positions[:0], edges[:0], revision=1, **columns((30, 0.0)))
+    after = [output for message in (closed, Tick(stamp_ns=3)) for output in update.update(state, message, Config())]
+    assert [one.foresight for one in after if isinstance(one, RegionDelta)][-1] == Foresight(
+        steps=CFG.steps, look_m=CFG.look_m, elsewhere_m=CFG.elsewhere_m
+    )
+
+
+def test_foresight_can_be_switched_off():
+    positions, edges = place_grid(2)
+    cfg = Config(foresight=ForesightConfig(enabled=False))
+    delta = place_delta(positions, edges, **columns((30, 2.0)))
+    _, deltas = run(delta, task(), prior(["kitchen", "hall"]), *walk(2), Tick(stamp_ns=1), cfg=cfg)
+    assert deltas and all(one.foresight is None for one in deltas)
