@@ -22,7 +22,7 @@ from scipy.special import betaln
 from prior_sg.schemas.priors import Prior, PriorEvidence
 from prior_sg.services.prior_gateway.core.turns import LEAST, MOST
 
-STRENGTHS = (0.125, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)  # times the first guess
+STRENGTHS = (1 / 64, 1 / 16, 1 / 4, 1.0, 4.0, 16.0)  # times the first guess
 DOUBT = 1.5  # standard deviation of the logarithm of such a factor
 SAME = 0.1  # P(touching) of two regions of one name that were not taken for one
 LEAST_SHARE = 1e-4

@@ -1,7 +1,7 @@
 """A prior revised by a language model that sees what was expected and what was observed (pure).
 
 First the percentages in which the two disagree, entry by entry. Then, where the task left the regions to the prior and
-robots have met places that none of them explains, the regions: a model may name those that are missing, or a part of one
+robots have met places that none explains, the regions: a model may name those that are missing, or a part of one
 that is a region of its own. It describes each as it describes those of a new prior.
 """
 

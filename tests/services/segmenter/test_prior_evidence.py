@@ -12,6 +12,7 @@ from prior_sg.services.runtime.service import Identity
 from prior_sg.services.segmenter.core import prior_evidence
 from prior_sg.services.segmenter.core.config import Config
 from prior_sg.services.segmenter.core.experts.context import ObjectView
+from prior_sg.services.segmenter.core.regions.contents import held
 from prior_sg.services.segmenter.service import SERVICE
 from tests.help.world import ROBOT, place_delta, place_grid, prior, task, text, walk
 
@@ -79,10 +80,8 @@ def test_objects_count_for_the_region_of_their_nearest_place_by_their_best_candi
         concepts=np.array([[0.9, 0.1], [0.4, 0.6], [0.2, 0.8], [1.0, 0.0], [1.0, 0.0]]),
         weights=np.array([1.0, 1.0, 0.5, 1.0, 1.0]),
     )
-    held = prior_evidence._held(
-        view, positions_m, regions, np.array([7, 9])
-    )  # 8 is too small, the object at 12 too far
-    np.testing.assert_allclose(held, [[0.9, 0.6], [0.1, 0.4]])
+    found = held(view, positions_m, regions, np.array([7, 9]))  # 8 is too small, the object at 12 too far
+    np.testing.assert_allclose(found, [[0.9, 0.6], [0.1, 0.4]])
 
 
 def seen_with(weight: float) -> PriorEvidence:

@@ -6,7 +6,7 @@ from prior_sg.schemas.priors import Prior
 from prior_sg.services.segmenter.core.experts.context import Context
 
 LEAST = 0.02  # P(o | r) below which a prior's number says no more: something else may have been mistaken for it
-TESTED_HALF = 4.0  # observed regions of a name after which its row counts half
+TESTED_HALF = 2.0  # observed regions of a name after which its row counts half
 
 
 def contents(context: Context) -> tuple[np.ndarray, np.ndarray]:
