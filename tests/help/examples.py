@@ -84,6 +84,8 @@ PRIOR = priors.Prior(
         made_ns=3,
         signer="s",
         signature="00ff",
+        root_digest="o",
+        contributors=["r", "s"],
     ),
     spread=priors.Spread(
         existence=f4(0.1, 0.2),
@@ -91,6 +93,7 @@ PRIOR = priors.Prior(
         adjacency=f4([0.3, 0.4], [0.4, 0.3]),
         support=f4(1.0, 0.5),
     ),
+    tested=priors.Tested(regions=f4(2.0, 0.5)),
 )
 EVIDENCE = priors.PriorEvidence(
     robot="r",
@@ -107,6 +110,10 @@ EVIDENCE = priors.PriorEvidence(
     holding=f4([1.0], [0.5]),
     pairs=f4([2.0, 1.0], [1.0, 2.0]),
     touching=f4([1.0, 0.5], [0.5, 1.0]),
+    sizes=f4(3.0, 2.0),
+    looks=f4([-0.5, -1.5], [-2.0, -0.25]),
+    contents=f4([1.0], [0.25]),
+    links=np.array([[0, 1]], np.int32),
 )
 REGION = regions.Region(
     id=4,
@@ -291,6 +298,7 @@ EXAMPLES: list[Message] = [
     priors.TaskRequest(robot="r"),
     priors.TaskInForce(robot="r", task=TASK),
     PRIOR.spread,
+    PRIOR.tested,
     PRIOR,
     priors.PriorRequest(digest="d", environment="home", task="tidy up", regions=["kitchen"]),
     priors.PriorList(priors=[PRIOR], reason="r", pending=True),
