@@ -23,6 +23,7 @@ from prior_sg.schemas.priors import Prior, PriorEvidence
 from prior_sg.services.prior_gateway.core.turns import LEAST, MOST
 
 STRENGTHS = (1 / 64, 1 / 16, 1 / 4, 1.0, 4.0, 16.0)  # times the first guess
+USUAL = 1.0  # observed regions that an object's frequency in all regions is worth in one that has been observed
 DOUBT = 1.5  # standard deviation of the logarithm of such a factor
 SAME = 0.1  # P(touching) of two regions of one name that were not taken for one
 LEAST_SHARE = 1e-4
@@ -31,9 +32,9 @@ LEAST_SHARE = 1e-4
 class EstimationConfig(msgspec.Struct, frozen=True, kw_only=True):
     """How the regions of maps are named anew."""
 
-    looks: float = 4.0  # weight of what the average place of a region looks like, as of the visual expert
+    looks: float = 2.0  # weight of what the average place of a region looks like, half of the visual expert's
     contents: float = 1.0  # of what it holds
-    neighbours: float = 1.0  # of which regions it touches
+    neighbours: float = 0.5  # of which regions it touches
     rounds: int = 12  # of naming and counting
     robot_share: float = 0.34  # of all observed regions that one robot brings at most, or its equal share if more
 
@@ -206,15 +207,16 @@ def nothing(prior: Prior) -> Totals:
 
 
 def named(seen: SeenMap, belief: np.ndarray, says: Statements, cfg: EstimationConfig) -> np.ndarray:
-    """Belief (piece, region) in what each region of a map is, the others being what `belief` says (mean field)."""
-    touching, apart = np.log(says.adjacency), np.log(1 - says.adjacency)
-    for rates, once in ((touching, SAME), (apart, 1 - SAME)):
-        np.fill_diagonal(rates, np.log(once))
-    beside = seen.touching @ belief @ touching
-    away = (1 - seen.touching - np.eye(len(belief))) @ belief @ apart
+    """Belief (piece, region) in what each region of a map is, the others being what `belief` says (mean field).
+
+    Of neighbours those that touch count, against chance: that two regions do not is the rule in a map of many.
+    """
+    rates = says.adjacency.copy()
+    np.fill_diagonal(rates, SAME)
+    beside = seen.touching @ belief @ np.log(rates / (says.existence @ rates)[:, None])
     held = seen.contents @ np.log(says.containment).T + (seen.sought - seen.contents) @ np.log(1 - says.containment).T
-    scores = cfg.looks * seen.looks + np.log(says.existence)
-    return _shares(scores + cfg.contents * held + cfg.neighbours * (beside + away))
+    scores = cfg.looks * seen.looks + np.log(says.existence) + cfg.contents * held + cfg.neighbours * beside
+    return _shares(scores)
 
 
 def revised_statements(prior: Prior, seen: Totals, strength: float) -> Statements:
@@ -224,12 +226,16 @@ def revised_statements(prior: Prior, seen: Totals, strength: float) -> Statement
     existence = (strength * existence + seen.shares) / (strength + seen.maps)
     held, touching = prior.containment.astype(float), prior.adjacency.astype(float)
     of_rows = strengths(held, seen.instances, seen.holding, strength)[:, None]
+    usual = ((of_rows * held + seen.holding) / (of_rows + seen.instances)).mean(axis=0)
+    of_usual = USUAL * np.minimum(seen.instances, 1.0)
     others = 1 - np.eye(len(existence))
     of_ends = strengths(touching, seen.pairs * others, seen.touching * others, strength)
     of_pairs = np.minimum.outer(of_ends, of_ends)
     return Statements(
         np.maximum(existence, LEAST_SHARE),
-        np.clip((of_rows * held + seen.holding) / (of_rows + seen.instances), LEAST, MOST),
+        np.clip(
+            (of_rows * held + of_usual * usual + seen.holding) / (of_rows + of_usual + seen.instances), LEAST, MOST
+        ),
         np.clip((of_pairs * touching + seen.touching) / (of_pairs + seen.pairs), LEAST, MOST),
     )
 

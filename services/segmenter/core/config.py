@@ -44,7 +44,7 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
     kernel: KernelConfig = msgspec.field(default_factory=KernelConfig)
     default_query_radius_m: float = 0.75  # r_Q until a prior is in force (paper)
     experts: dict[str, float] = msgspec.field(  # names, with their reliabilities lambda (paper)
-        default_factory=lambda: {"visual": 4.0, "geometric": 1.0, "object": 1.0, "environment": 0.1, "contents": 1.5}
+        default_factory=lambda: {"visual": 4.0, "geometric": 1.0, "object": 1.0, "environment": 0.1, "contents": 2.5}
     )
     geometry: GeometryConfig = msgspec.field(default_factory=GeometryConfig)
     objects: ObjectSettings = msgspec.field(default_factory=ObjectSettings)

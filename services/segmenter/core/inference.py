@@ -10,7 +10,6 @@ import msgspec
 import numpy as np
 from scipy.spatial import cKDTree
 
-from prior_sg.schemas.regions import NO_REGION
 from prior_sg.services.segmenter.core.appearance import adaptation, information, smoothing, unmixing
 from prior_sg.services.segmenter.core.appearance.label_bias import label_bias
 from prior_sg.services.segmenter.core.config import Config
@@ -23,7 +22,7 @@ from prior_sg.services.segmenter.core.experts.contents import words_of_contents
 from prior_sg.services.segmenter.core.experts.context import Context, ObjectView, standardised
 from prior_sg.services.segmenter.core.map import inclination
 from prior_sg.services.segmenter.core.map.received import with_neighbours
-from prior_sg.services.segmenter.core.regions.contents import held
+from prior_sg.services.segmenter.core.regions.contents import held_around
 from prior_sg.services.segmenter.core.state import State
 
 BIAS_SAMPLE = 4096  # places that stand for all when the map's bias is computed
@@ -218,14 +217,10 @@ def rebalance(state: State, idle: bool, cfg: Config) -> None:
 
 
 def weigh_contents(state: State) -> None:
-    """What the objects of each region, as the regions are, say of its label."""
-    places, prior = state.map.places, state.aim.aligned.prior
-    ids = np.unique(places.regions[places.regions != NO_REGION])
-    now = np.zeros_like(places.contents)
-    if len(ids) and state.objects.view.concepts.shape[1]:
-        found = held(state.objects.view, state.map.graph.positions_m, places.regions, ids)
-        inside = np.flatnonzero(places.regions != NO_REGION)
-        now[inside] = words_of_contents(prior, found)[np.searchsorted(ids, places.regions[inside])]
+    """What the objects of each region, as the regions are, say of the label of its places."""
+    places = state.map.places
+    found = held_around(state.objects.view, state.map.graph.positions_m, places.regions)
+    now = words_of_contents(state.aim.aligned.prior, found) if found.shape[1] else np.zeros_like(places.contents)
     moved = (np.abs(now - places.contents) > CORRECTION_TOLERANCE).any(axis=1)
     places.contents[moved] = now[moved]
     places.doubtful |= moved
