@@ -14,6 +14,7 @@ from prior_sg.schemas.names import LONGEST_NAME, fault_of_names, fault_of_text, 
 SUM_TOLERANCE = 1e-3
 # No prior that somebody means is larger; a message beyond is refused wherever it arrives.
 MOST_REGIONS, MOST_OBJECTS, MOST_PHRASES = 64, 512, 64
+MOST_PIECES = 256  # regions of one map that evidence tells of
 LONGEST_PHRASE = 240
 LARGEST_M, MOST_SPREAD = 1000.0, 2.0  # of an object's sides, and of their logarithm
 
@@ -90,6 +91,8 @@ class Provenance(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     made_ns: int = 0
     signer: str = ""  # name of the key; empty = not signed
     signature: str = ""  # Ed25519 over the prior's digest, in hexadecimal
+    root_digest: str = ""  # of a revised prior: what it was before any revision
+    contributors: list[str] = []  # robots whose maps revised it
 
 
 class Spread(Message, frozen=True, kw_only=True):
@@ -103,6 +106,16 @@ class Spread(Message, frozen=True, kw_only=True):
     def check(self) -> None:
         if min(array.min(initial=0) for array in (self.existence, self.containment, self.adjacency, self.support)) < 0:
             raise ValueError("spread is negative")
+
+
+class Tested(Message, frozen=True, kw_only=True):
+    """What a prior's containment was counted in."""
+
+    regions: Annotated[np.ndarray, Shape("float32", "region")]  # observed ones of each name, as far as they are that
+
+    def check(self) -> None:
+        if self.regions.min(initial=0) < 0:
+            raise ValueError("a count is negative")
 
 
 class Prior(Message, frozen=True, kw_only=True, omit_defaults=True):
@@ -121,6 +134,7 @@ class Prior(Message, frozen=True, kw_only=True, omit_defaults=True):
     provenance: Provenance
     spread: Spread | None = None
     levels: list[LevelPrior] = []  # above the regions, from below; where there are some, no region's `parent` counts
+    tested: Tested | None = None  # where robots have revised it
 
     def check(self) -> None:
         """Whoever sent it: a model, a file or another robot."""
@@ -163,6 +177,8 @@ class Prior(Message, frozen=True, kw_only=True, omit_defaults=True):
             raise ValueError("adjacency is not symmetric")
         if self.spread is not None and self.spread.containment.shape != self.containment.shape:
             raise ValueError("the spread does not fit the regions and objects")
+        if self.tested is not None and len(self.tested.regions) != len(self.regions):
+            raise ValueError("what was tested does not fit the regions")
 
     @property
     def levels_above(self) -> list[LevelPrior]:
@@ -248,6 +264,10 @@ class PriorClaim(Message, frozen=True, kw_only=True):
         key_part(self.question)
 
 
+_NO_PIECES, _NO_TABLE = np.zeros(0, np.float32), np.zeros((0, 0), np.float32)
+_NO_LINKS = np.zeros((0, 2), np.int32)
+
+
 class PriorEvidence(Message, frozen=True, kw_only=True):
     """What one map has shown of its prior so far: totals, not increments, so that only a map's newest one counts."""
 
@@ -265,6 +285,12 @@ class PriorEvidence(Message, frozen=True, kw_only=True):
     holding: Annotated[np.ndarray, Shape("float32", "region", "object")]  # of those, how many hold the object
     pairs: Annotated[np.ndarray, Shape("float32", "region", "region")]  # pairs of regions with these two names
     touching: Annotated[np.ndarray, Shape("float32", "region", "region")]  # of those, how many touch
+    # Region by region of the map, what was seen apart from the labels, in which the prior had a say; none from senders
+    # of an older version. The columns are those of `regions` and `objects`.
+    sizes: Annotated[np.ndarray, Shape("float32", "piece")] = _NO_PIECES  # places
+    looks: Annotated[np.ndarray, Shape("float32", "piece", "look")] = _NO_TABLE  # mean log P(region | its crops), <= 0
+    contents: Annotated[np.ndarray, Shape("float32", "piece", "content")] = _NO_TABLE  # P(it holds the object)
+    links: Annotated[np.ndarray, Shape("int32", "link", 2)] = _NO_LINKS  # pieces that touch
 
     def check(self) -> None:
         if len(self.regions) != len(self.places) or len(self.objects) != self.holding.shape[1]:
@@ -273,6 +299,20 @@ class PriorEvidence(Message, frozen=True, kw_only=True):
             raise ValueError("a count is negative")
         if (self.holding > self.instances[:, None] + 1e-4).any() or (self.touching > self.pairs + 1e-4).any():
             raise ValueError("more hits than trials")
+        if len(self.sizes):
+            self._check_pieces()
+
+    def _check_pieces(self) -> None:
+        if len(self.sizes) > MOST_PIECES:
+            raise ValueError(f"a map tells of at most {MOST_PIECES} regions")
+        if self.looks.shape[1] != len(self.regions) or self.contents.shape[1] != len(self.objects):
+            raise ValueError("pieces do not fit the names")
+        if self.sizes.min() <= 0 or self.looks.max(initial=0) > 0:
+            raise ValueError("a piece has no places, or a look is no logarithm of a probability")
+        if self.contents.min(initial=0) < 0 or self.contents.max(initial=0) > 1:
+            raise ValueError("contents are no probabilities")
+        if self.links.min(initial=0) < 0 or self.links.max(initial=-1) >= len(self.sizes):
+            raise ValueError("a link leads to no piece")
 
 
 class PriorRevision(Message, frozen=True, kw_only=True):

@@ -43,6 +43,7 @@ SIGHTS = {  # by the suffix of their figures; the main one gives about the F1_S 
     "_sure_objects": Sight(lookalike=1.1, detected=1.0, mistaken=0.0),
 }
 CFG = Config(evidence_ticks=0)
+MOST_TICKS = 8  # until a segmenter rests
 
 
 def learning_bench(worlds: int = WORLDS) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -119,8 +120,8 @@ class World:
             label(state, home, priors[-1])
             counted = prior_evidence.evidence(state, CFG)
             seen += [] if counted is None else [counted]
-            totals = learning.totals(self.prior, seen)
-            priors.append(learning.revised(self.prior, totals, strength, self.prior.provenance))
+            shown = learning.estimate(self.prior, seen, learning.LearningConfig(strength=strength))
+            priors.append(learning.revised(self.prior, shown.totals, strength, self.prior.provenance))
         return priors
 
     def errors(self, prior: Prior) -> dict[str, float]:
@@ -162,7 +163,10 @@ def label(state: State, home: Home, prior: Prior) -> None:
                 list(update.update(state, homes.text(output, prior), CFG))
     assert state.aim.in_force is not None and state.aim.in_force.digest == prior.digest()
     inference.see_objects(state, home.objects, CFG)
-    list(update.update(state, Tick(stamp_ns=1), CFG))
+    for stamp_ns in range(1, MOST_TICKS):
+        list(update.update(state, Tick(stamp_ns=stamp_ns), CFG))
+        if not state.labelling.dirty:
+            return
 
 
 def f1_s(truth: np.ndarray, state: State) -> float:

@@ -282,7 +282,10 @@ def describe(prior: Prior, cfg: Config, console: Terminal) -> None:
     console.print(f"made by {made.source} ({made.detail}){_when(made)}: {made.note}")
     console.print(f"origin: {verdict(prior, cfg, load())}")
     if made.parent_digest:
-        console.print(f"revises {made.parent_digest}")
+        first = f", which began with {made.root_digest}" if made.root_digest != made.parent_digest else ""
+        console.print(f"revises {made.parent_digest}{first if made.root_digest else ''}")
+    if made.contributors:
+        console.print(f"by what was seen by {', '.join(made.contributors)}")
 
 
 def _with_spread(value: float, spread: float | None) -> str:

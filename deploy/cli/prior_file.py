@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 
 from prior_sg.deploy.errors import UserError
-from prior_sg.schemas.priors import ObjectPrior, Prior, Provenance, RegionPrior, Spread
+from prior_sg.schemas.priors import ObjectPrior, Prior, Provenance, RegionPrior, Spread, Tested
 
 FORMAT = "prior-sg prior 1"
 Rows = Mapping[str, Mapping[str, float]]
@@ -31,6 +31,7 @@ class PriorFile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     adjacency: dict[str, dict[str, float]]
     provenance: Provenance
     spread: dict[str, Any] | None = None
+    tested: list[float] | None = None
 
 
 def write(prior: Prior, path: Path) -> None:
@@ -49,6 +50,7 @@ def write(prior: Prior, path: Path) -> None:
         adjacency=adjacency(prior),
         provenance=prior.provenance,
         spread=spread,
+        tested=None if prior.tested is None else prior.tested.regions.tolist(),
     )
     try:
         path.write_bytes(msgspec.json.format(msgspec.json.encode(file), indent=1) + b"\n")
@@ -76,6 +78,7 @@ def read(path: Path) -> Prior:
             adjacency=_matrix(file.adjacency, regions, regions),
             provenance=file.provenance,
             spread=spread,
+            tested=None if file.tested is None else Tested(regions=np.array(file.tested, np.float32)),
         )
     except (OSError, msgspec.MsgspecError, ValueError, TypeError, OverflowError, RecursionError) as error:
         raise PriorError(f"{path} is no usable prior: {error}") from error

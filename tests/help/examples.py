@@ -115,6 +115,8 @@ PRIOR = priors.Prior(
         made_ns=3,
         signer="s",
         signature="00ff",
+        root_digest="o",
+        contributors=["r", "s"],
     ),
     spread=priors.Spread(
         existence=f4(0.1, 0.2),
@@ -123,6 +125,7 @@ PRIOR = priors.Prior(
         support=f4(1.0, 0.5),
     ),
     levels=[LEVEL_PRIOR],
+    tested=priors.Tested(regions=f4(2.0, 0.5)),
 )
 EVIDENCE = priors.PriorEvidence(
     robot="r",
@@ -139,6 +142,10 @@ EVIDENCE = priors.PriorEvidence(
     holding=f4([1.0], [0.5]),
     pairs=f4([2.0, 1.0], [1.0, 2.0]),
     touching=f4([1.0, 0.5], [0.5, 1.0]),
+    sizes=f4(3.0, 2.0),
+    looks=f4([-0.5, -1.5], [-2.0, -0.25]),
+    contents=f4([1.0], [0.25]),
+    links=np.array([[0, 1]], np.int32),
 )
 REGION = regions.Region(
     id=4,
@@ -370,6 +377,7 @@ EXAMPLES: list[Message] = [
     priors.TaskInForce(robot="r", task=TASK),
     PRIOR.spread,
     LEVEL_PRIOR,
+    PRIOR.tested,
     PRIOR,
     priors.PriorRequest(digest="d", environment="home", task="tidy up", regions=["kitchen"]),
     priors.PriorList(priors=[PRIOR], reason="r", pending=True),

@@ -131,7 +131,18 @@ def test_what_was_asked_before_routes_could_begin_here_begins_elsewhere():
 
 def test_the_digest_of_a_prior_stays():
     prior = next(example for example in EXAMPLES if by_name(example) == "Prior")
-    assert msgspec.structs.replace(prior, levels=[]).digest() == "eab9114663fcaab470acb71942c653fc"
+    made = msgspec.structs.replace(prior.provenance, root_digest="", contributors=[])
+    before = msgspec.structs.replace(prior, tested=None, provenance=made, levels=[])
+    assert before.digest() == "eab9114663fcaab470acb71942c653fc"
+
+
+def test_what_was_written_before_maps_told_of_single_regions_tells_of_none():
+    message = next(example for example in EXAMPLES if by_name(example) == "PriorEvidence")
+    fields = msgpack.unpackb(encode(message), ext_hook=msgpack.ExtType)
+    for field in ("sizes", "looks", "contents", "links"):
+        del fields[field]
+    read = decode(type(message), msgpack.packb(fields))
+    assert (len(read.sizes), read.looks.shape, read.contents.shape, read.links.shape) == (0, (0, 0), (0, 0), (0, 2))
 
 
 @pytest.mark.parametrize("message", EXAMPLES, ids=by_name)

@@ -6,14 +6,28 @@ it is, one that many homes contradict gives way. Counting starts from the prior 
 totals of all maps, so that nothing counts twice.
 """
 
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass
 
 import msgspec
 import numpy as np
 
-from prior_sg.schemas.priors import Prior, PriorEvidence, Provenance
+from prior_sg.schemas.priors import Prior, PriorEvidence, Provenance, Tested
+from prior_sg.services.prior_gateway.core.estimation import (
+    Estimate,
+    EstimationConfig,
+    Totals,
+    estimated,
+    revised_statements,
+)
 from prior_sg.services.prior_gateway.core.turns import LEAST, MOST
+
+HELD, ALIEN = 0.5, 0.15  # P of an object that is there, and P(o | r) of one that does not belong to a region
+MOST_ALIEN = 2  # such objects, more than half of all, make a place strange
+LEAST_STRANGE = 3  # strange places of one name before a model hears of them
+MOST_STRANGE = 8  # things told of them
+LEAST_TRIALS = 0.5  # below which an entry was not tested
 
 
 class LearningConfig(msgspec.Struct, frozen=True, kw_only=True):
@@ -24,57 +38,29 @@ class LearningConfig(msgspec.Struct, frozen=True, kw_only=True):
     least_maps: int = 3  # maps that must have been observed before a prior is revised automatically
     least_change: float = 0.2  # and by how much an entry must change
     told: int = 24  # disagreements shown to the model
+    by_model: bool = False  # let automatic revisions ask the model, within the limits that follow
+    calls_per_day: int = 40  # of the model, for revisions of one environment; 0 = no limit
+    tokens_per_day: int = 60_000  # in and out, the same; 0 = no limit
     kept_maps: int = 256  # of each task; the oldest are forgotten
+    estimation: EstimationConfig = msgspec.field(default_factory=EstimationConfig)
 
     def __post_init__(self) -> None:
         if not (self.strength > 0 and self.least_maps >= 1 and 0 < self.least_change < 1 and self.told >= 1):
             raise ValueError("strength, least_maps, least_change or told is out of range")
+        if min(self.calls_per_day, self.tokens_per_day) < 0:
+            raise ValueError("calls_per_day and tokens_per_day must not be negative")
 
 
-@dataclass(frozen=True)
-class Totals:
-    """Counts over all maps, in the order of a prior's regions and objects."""
-
-    maps: int
-    shares: np.ndarray  # (region,) sum over maps of the region's share of the places
-    instances: np.ndarray  # (region,) regions of that name in maps where objects were looked for
-    holding: np.ndarray  # (region, object)
-    pairs: np.ndarray  # (region, region)
-    touching: np.ndarray  # (region, region)
-
-
-def totals(prior: Prior, evidence: Iterable[PriorEvidence]) -> Totals:
-    """Counts that belong to the prior's names; names that it does not know are left out."""
-    rows = {region.name: i for i, region in enumerate(prior.regions)}
-    columns = {item.name: i for i, item in enumerate(prior.objects)}
-    regions, objects = len(rows), len(columns)
-    shares, instances = np.zeros(regions), np.zeros((regions, objects))
-    holding, pairs, touching = np.zeros((regions, objects)), np.zeros((regions, regions)), np.zeros((regions, regions))
-    maps = 0
-    for seen in evidence:
-        own = [i for i, name in enumerate(seen.regions) if name in rows]
-        places = seen.places[own].astype(float)
-        if not places.sum():
-            continue
-        maps += 1
-        here = [rows[seen.regions[i]] for i in own]
-        np.add.at(shares, here, places / places.sum())
-        pairs[np.ix_(here, here)] += seen.pairs[np.ix_(own, own)]
-        touching[np.ix_(here, here)] += seen.touching[np.ix_(own, own)]
-        known = [i for i, name in enumerate(seen.objects) if name in columns]
-        there = [columns[seen.objects[i]] for i in known]
-        instances[np.ix_(here, there)] += seen.instances[own][:, None]
-        holding[np.ix_(here, there)] += seen.holding[np.ix_(own, known)]
-    return Totals(maps, shares, instances, holding, pairs, touching)
+def estimate(prior: Prior, evidence: Iterable[PriorEvidence], cfg: LearningConfig) -> Estimate:
+    """What all maps show of a prior, as it was before any revision."""
+    return estimated(prior, list(evidence), cfg.strength, cfg.estimation)
 
 
 def revised(prior: Prior, seen: Totals, strength: float, made: Provenance) -> Prior:
     """The posterior mean. A region that no map has shown keeps its rows; its share falls as in any Dirichlet."""
-    existence = np.array([region.existence for region in prior.regions])
-    existence = (strength * existence + seen.shares) / (strength + seen.maps)
-    held = (strength * prior.containment + seen.holding) / (strength + seen.instances)
-    touching = (strength * prior.adjacency + seen.touching) / (strength + seen.pairs)
-    return _with(prior, existence, held, touching, made)
+    says = revised_statements(prior, seen, strength)
+    tested = Tested(regions=seen.instances.max(axis=1, initial=0).astype(np.float32))
+    return msgspec.structs.replace(_with(prior, says.existence, says.containment, says.adjacency, made), tested=tested)
 
 
 def corrected(prior: Prior, answer: dict[str, dict[str, dict[str, float]]], made: Provenance) -> Prior:
@@ -123,7 +109,7 @@ class Disagreement:
 
 
 def disagreements(prior: Prior, seen: Totals, most: int) -> list[Disagreement]:
-    """The most surprising entries first; only those that at least one trial has tested."""
+    """The most surprising entries first; only those that have been tested."""
     names, things = [region.name for region in prior.regions], [item.name for item in prior.objects]
     upper = np.triu(seen.pairs, 1)  # a pair is one entry
     found = [
@@ -135,14 +121,14 @@ def disagreements(prior: Prior, seen: Totals, most: int) -> list[Disagreement]:
             float(trials),
         )
         for (i, j), trials in np.ndenumerate(seen.instances)
-        if trials > 0
+        if trials >= LEAST_TRIALS
     ]
     found += [
         _disagreement(
             "adjacency", (names[i], names[j]), float(prior.adjacency[i, j]), float(seen.touching[i, j]), float(trials)
         )
         for (i, j), trials in np.ndenumerate(upper)
-        if trials > 0
+        if trials >= LEAST_TRIALS
     ]
     found.sort(key=lambda entry: -entry.surprise)
     return [entry for entry in found if entry.surprise > 1][:most]
@@ -168,6 +154,29 @@ def told(entries: Iterable[Disagreement]) -> tuple[str, dict[str, dict[str, dict
             100 * entry.observed,
         )
     return "\n".join(lines), form
+
+
+def unexplained(prior: Prior, seen: Estimate) -> tuple[str, list[str]]:
+    """Regions of maps that hold little of what a region of their name holds, as lines; and what they hold instead."""
+    names, things = [region.name for region in prior.regions], [item.name for item in prior.objects]
+    strange: dict[int, Counter[str]] = {}
+    taken, met = Counter[int](), Counter[int]()
+    for one, belief in zip(seen.maps, seen.beliefs, strict=True):
+        for label, contents in zip(belief.argmax(axis=1).tolist(), one.contents, strict=True):
+            there = np.flatnonzero(contents >= HELD)
+            alien = there[prior.containment[label, there] < ALIEN]
+            taken[label] += 1
+            if len(alien) >= MOST_ALIEN and 2 * len(alien) > len(there):
+                met[label] += 1
+                strange.setdefault(label, Counter()).update(things[i] for i in alien.tolist())
+    lines, objects = [], Counter[str]()
+    for label, number in met.most_common():
+        if number < LEAST_STRANGE:
+            break
+        told = ", ".join(f"{name} ({times})" for name, times in strange[label].most_common(MOST_STRANGE))
+        lines.append(f"- {number} of {taken[label]} places taken for {names[label]} hold other things: {told}")
+        objects.update(strange[label])
+    return "\n".join(lines), [name for name, _ in objects.most_common(MOST_STRANGE)]
 
 
 def largest_change(before: Prior, after: Prior) -> float:

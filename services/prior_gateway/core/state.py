@@ -47,6 +47,15 @@ class Making:
 
 
 @dataclass
+class Spent:
+    """What revisions by the model have cost for one environment on one day."""
+
+    day: int = -1
+    calls: int = 0
+    tokens: int = 0
+
+
+@dataclass
 class State:
     """What is known, what is being made, and what the others say."""
 
@@ -60,6 +69,8 @@ class State:
     claims: Claims = field(default_factory=Claims)
     evidence: dict[Asked, dict[tuple[str, int], PriorEvidence]] = field(default_factory=dict)
     roots: dict[Asked, Prior] = field(default_factory=dict)  # what revised priors were before any revision
+    spent: dict[str, Spent] = field(default_factory=dict)  # by environment
+    day: int = 0  # since 1970, of the newest tick
     begun: int = 0  # rounds of conversations so far, for their names
 
 
@@ -117,6 +128,25 @@ def prior_in_force(state: State, making: Making, cfg: Config) -> tuple[Prior, Pr
         current = state.library.answer(making.task, cfg)
     root = state.roots.setdefault(asked, copied(current))
     return root, current
+
+
+def spent_today(state: State, environment: str, cfg: Config) -> Spent:
+    """The account of an environment for today."""
+    account = state.spent.get(environment)
+    if account is None or account.day != state.day:
+        account = Spent(state.day)
+        put(state.spent, environment, account, cfg.remembered_priors)
+    return account
+
+
+def too_dear(state: State, environment: str, cfg: Config) -> str:
+    """Why the model is not asked any more today to revise priors of an environment; empty = it may be."""
+    account, limits = spent_today(state, environment, cfg), cfg.learning
+    if limits.calls_per_day and account.calls >= limits.calls_per_day:
+        return f"all {limits.calls_per_day} calls of today for {environment!r} are spent"
+    if limits.tokens_per_day and account.tokens >= limits.tokens_per_day:
+        return f"all {limits.tokens_per_day} tokens of today for {environment!r} are spent"
+    return ""
 
 
 def remember(state: State, prior: Prior, cfg: Config) -> None:

@@ -16,7 +16,7 @@ import msgspec
 import numpy as np
 
 from prior_sg.schemas.names import normal
-from prior_sg.schemas.priors import MOST_REGIONS, Prior, Task
+from prior_sg.schemas.priors import MOST_REGIONS, Task
 from prior_sg.services.prior_gateway.core.answers import CUT_OFF, parse
 from prior_sg.services.prior_gateway.core.faults import (
     LARGEST_CM,
@@ -30,7 +30,6 @@ from prior_sg.services.prior_gateway.core.faults import (
     faults_of_percentages,
     faults_of_places,
     faults_of_size,
-    faults_of_spans,
     unknown,
 )
 
@@ -43,6 +42,8 @@ PROMPT_FIELDS: dict[str, set[str]] = {
     "containment": {"environment", "task", "regions", "objects", "batch"},
     "adjacency": {"environment", "task", "regions"},
     "revise": {"environment", "task", "regions", "disagreements"},
+    "revise_regions": {"environment", "task", "regions", "strange", "most"},
+    "neighbours": {"environment", "regions", "batch"},
     "reason": set(),
     "answer": {"schema"},
     "faults": {"faults"},
@@ -200,7 +201,7 @@ def synthesise(task: Task, prompts: Prompts, cfg: SynthesisConfig) -> Dialogue[D
         query_radius_m=np.array([entry.scale_cm / 100 for entry in one_by_one]),
         objects=objects,
         sizes_m=np.array([msgspec.structs.astuple(sized[name]) for name in objects]) / 100,
-        containment=_probability([[held[region][name] for name in objects] for region in regions]),
+        containment=probability([[held[region][name] for name in objects] for region in regions]),
         adjacency=touching,
     )
 
@@ -212,8 +213,8 @@ def batches(names: list[str], size: int) -> list[list[str]]:
 
 def choose_regions(talk: Talk) -> Dialogue[tuple[list[str], dict[str, Placed]]]:
     """The regions into which the task divides the environment."""
-    item = _object({"name": TEXT, "parent": TEXT, "share": talk.cfg.percent})
-    schema = _object({"regions": {"type": "array", "items": item, "minItems": 3, "maxItems": talk.cfg.most_regions}})
+    item = form_of({"name": TEXT, "parent": TEXT, "share": talk.cfg.percent})
+    schema = form_of({"regions": {"type": "array", "items": item, "minItems": 3, "maxItems": talk.cfg.most_regions}})
 
     def read(text: str) -> tuple[dict[str, Placed], list[str]]:
         answer, faults = parse(text, NamedList, ["regions"])
@@ -235,7 +236,7 @@ def choose_regions(talk: Talk) -> Dialogue[tuple[list[str], dict[str, Placed]]]:
 
 def place_regions(talk: Talk, regions: list[str]) -> Dialogue[dict[str, Placed]]:
     """Zone and share of regions that the task has fixed."""
-    schema = _object(dict.fromkeys(regions, _object({"parent": TEXT, "share": talk.cfg.percent})))
+    schema = form_of(dict.fromkeys(regions, form_of({"parent": TEXT, "share": talk.cfg.percent})))
 
     def read(text: str) -> tuple[dict[str, Placed], list[str]]:
         found, faults = parse(text, dict[str, Placed], regions)
@@ -248,7 +249,7 @@ def place_regions(talk: Talk, regions: list[str]) -> Dialogue[dict[str, Placed]]
 
 def describe(talk: Talk, batch: list[str]) -> Dialogue[dict[str, Described]]:
     """Appearance, objects and geometry of some regions."""
-    form = _object(
+    form = form_of(
         {
             "phrases": {"type": "array", "items": TEXT, "minItems": 2, "maxItems": 5},
             "objects": {"type": "array", "items": TEXT, "minItems": 2, "maxItems": OBJECTS_PER_REGION},
@@ -269,13 +270,13 @@ def describe(talk: Talk, batch: list[str]) -> Dialogue[dict[str, Described]]:
             entry.objects = _tidy(name.lower() for name in entry.objects)
         return found, [fault for name, entry in found.items() for fault in faults_of_description(name, entry)]
 
-    return (yield from talk.ask("describe", _object(dict.fromkeys(batch, form)), read, batch=", ".join(batch)))
+    return (yield from talk.ask("describe", form_of(dict.fromkeys(batch, form)), read, batch=", ".join(batch)))
 
 
 def sizes(talk: Talk, batch: list[str]) -> Dialogue[dict[str, Sized]]:
     """Size of some objects, and how high above the floor they begin."""
     side, lower = talk.cfg.length, talk.cfg.number(0, 250)
-    form = _object({"longest_cm": side, "shortest_cm": side, "height_cm": side, "bottom_cm": lower})
+    form = form_of({"longest_cm": side, "shortest_cm": side, "height_cm": side, "bottom_cm": lower})
 
     def read(text: str) -> tuple[dict[str, Sized], list[str]]:
         found, faults = parse(text, dict[str, Sized], batch)
@@ -288,12 +289,12 @@ def sizes(talk: Talk, batch: list[str]) -> Dialogue[dict[str, Sized]]:
             faults.append("the lengths look like metres; give centimetres")
         return found, faults
 
-    return (yield from talk.ask("sizes", _object(dict.fromkeys(batch, form)), read, batch=", ".join(batch)))
+    return (yield from talk.ask("sizes", form_of(dict.fromkeys(batch, form)), read, batch=", ".join(batch)))
 
 
 def containment(talk: Talk, batch: list[str], objects: list[str]) -> Dialogue[dict[str, dict[str, float]]]:
     """P(o | r) of some regions, in percent, for all objects."""
-    schema = _object(dict.fromkeys(batch, _object(dict.fromkeys(objects, talk.cfg.percent))))
+    schema = form_of(dict.fromkeys(batch, form_of(dict.fromkeys(objects, talk.cfg.percent))))
 
     def read(text: str) -> tuple[dict[str, dict[str, float]], list[str]]:
         return read_matrix(text, {region: objects for region in batch}, ("region", "object"))
@@ -305,7 +306,7 @@ def adjacency(talk: Talk, regions: list[str]) -> Dialogue[np.ndarray]:
     """P(ri <-> rj), (region, region), symmetric with diagonal 1. Each pair is asked for once; a model that gives it in
     both directions must say about the same twice."""
     form = {region: regions[i + 1 :] for i, region in enumerate(regions[:-1])}
-    schema = _object({region: _object(dict.fromkeys(others, talk.cfg.percent)) for region, others in form.items()})
+    schema = form_of({region: form_of(dict.fromkeys(others, talk.cfg.percent)) for region, others in form.items()})
 
     def read(text: str) -> tuple[np.ndarray, list[str]]:
         found, faults = parse(text, dict[str, dict[str, float]], regions, regions)
@@ -345,46 +346,14 @@ def read_adjacency(found: dict[str, dict[str, float]], regions: list[str]) -> tu
             elif max(said) - min(said) > ASYMMETRY:
                 faults.append(f"{other!r} and {one!r}: {min(said):g} one way, {max(said):g} the other; it is one pair")
             else:
-                matrix[i, j] = matrix[j, i] = float(_probability(sum(said) / len(said)))
+                matrix[i, j] = matrix[j, i] = float(probability(sum(said) / len(said)))
     return matrix, list(dict.fromkeys(faults))
-
-
-def revise(prior: Prior, told: str, form: dict[str, dict[str, dict[str, tuple[float, float]]]], talk: Talk) -> Dialogue:
-    """New percentages for the entries in which expectation and observation disagree.
-
-    `form` is {matrix: {row: {column: (expected, observed)}}} in percent. An answer must not leave the span between the
-    two: evidence may be weighed, not contradicted.
-    """
-    schema = _object(
-        {
-            kind: _object({r: _object(dict.fromkeys(row, talk.cfg.percent)) for r, row in rows.items()})
-            for kind, rows in form.items()
-        }
-    )
-    talk.fields |= {"environment": prior.environment, "task": prior.task}
-    talk.fields["regions"] = ", ".join(region.name for region in prior.regions)
-    names = [*(region.name for region in prior.regions), *(item.name for item in prior.objects)]
-
-    def read(text: str) -> tuple[dict[str, dict[str, dict[str, float]]], list[str]]:
-        found, faults = parse(text, dict[str, dict[str, dict[str, float]]], list(form), names, names)
-        if found is None:
-            return {}, faults
-        faults = faults_of_keys("matrix", found, list(form))
-        for kind, rows in form.items():
-            faults += faults_of_keys("region", found.get(kind, {}), list(rows), f" of {kind}")
-            for row, columns in rows.items():
-                given = found.get(kind, {}).get(row, {})
-                faults += faults_of_keys("entry", given, list(columns), f" of {row!r}")
-                faults += faults_of_spans(row, given, columns)
-        return found, faults
-
-    return (yield from talk.ask("revise", schema, read, disagreements=told))
 
 
 TEXT: Schema = {"type": "string"}
 
 
-def _object(properties: dict[str, Schema]) -> Schema:
+def form_of(properties: dict[str, Schema]) -> Schema:
     """Every property required and no other allowed, so that a server that constrains its sampling cannot omit one."""
     return {
         "type": "object",
@@ -394,7 +363,8 @@ def _object(properties: dict[str, Schema]) -> Schema:
     }
 
 
-def _probability(percent: Any) -> np.ndarray:
+def probability(percent: Any) -> np.ndarray:
+    """Percentages as probabilities that are never certain."""
     return np.clip(np.asarray(percent, dtype=float) / 100, LEAST, MOST)
 
 

@@ -28,8 +28,9 @@ from prior_sg.schemas.priors import (
     fault_of_task,
 )
 from prior_sg.schemas.status import Tick
-from prior_sg.services.prior_gateway.core import compose, ensemble, learning, turns
+from prior_sg.services.prior_gateway.core import compose, ensemble, learning, revising, turns
 from prior_sg.services.prior_gateway.core.config import Config
+from prior_sg.services.prior_gateway.core.estimation import Estimate
 from prior_sg.services.prior_gateway.core.matching import match_environment, same_region
 from prior_sg.services.prior_gateway.core.state import (
     Conversation,
@@ -41,11 +42,14 @@ from prior_sg.services.prior_gateway.core.state import (
     prior_of_question,
     put,
     remember,
+    spent_today,
     task_of,
+    too_dear,
 )
 from prior_sg.services.refusals import InputRefused
 
 TICK_S = 0.5  # between two ticks
+DAY_NS = 24 * 60 * 60 * 10**9
 
 Told = Prior | PriorClaim | Keep | ModelRequest | Recall  # to the fleet, or for somebody outside to do
 
@@ -66,6 +70,7 @@ def update(state: State, message: Message, cfg: Config) -> Iterator[Told]:
         case PriorClaim():
             yield from _hear(state, message)
         case Tick():
+            state.day = message.stamp_ns // DAY_NS
             yield from _tick(state, cfg)
         case ModelReply():
             yield from _replied(state, message, cfg)
@@ -205,10 +210,15 @@ def _replied(state: State, reply: ModelReply, cfg: Config) -> Iterator[Told]:
     if making is None or making.talks[reply.conversation].turn != reply.turn:
         return
     talk = making.talks[reply.conversation]
+    if making.revision is not None:
+        account = spent_today(state, making.task.environment, cfg)
+        account.calls, account.tokens = account.calls + 1, account.tokens + reply.tokens_in + reply.tokens_out
     try:
         if reply.failure:
             raise turns.Unusable(reply.reason)
         turn = talk.dialogue.send(reply.text)
+        if making.revision is not None and (dear := too_dear(state, making.task.environment, cfg)):
+            turn = talk.dialogue.throw(turns.Unusable(dear))  # ends with what there is, or raises it
         talk.turn += 1
         yield _say(reply.conversation, talk, turn, cfg)
         return
@@ -228,16 +238,40 @@ def _conclude(state: State, making: Making, cfg: Config) -> Iterator[Told]:
         yield from _give_up(state, making, making.failures[0], cfg)
         return
     if making.revision is not None:
-        _, prior = prior_in_force(state, making, cfg)
-        made = _provenance(
-            state, making, cfg, parent_digest=prior.digest(), note="revised by the model from what was observed"
-        )
-        yield _keep(making, learning.corrected(prior, drafts[0], made), state)
+        yield from _conclude_revision(state, making, drafts[0], cfg)
         return
     try:
         yield _keep(making, _combined(state, making, drafts, cfg), state)
     except ValueError as error:  # the mean of valid generations can be too large to be a prior
         yield from _give_up(state, making, f"its prior cannot be used: {error}", cfg)
+
+
+def _conclude_revision(state: State, making: Making, found: revising.Revision, cfg: Config) -> Iterator[Told]:
+    """What the model has revised; regions that it added belong to the prior before any revision, too, so that maps
+    revise them from now on."""
+    root, current = prior_in_force(state, making, cfg)
+    note = "revised by the model from what was observed"
+    if found.additions:
+        note += ", with " + " and ".join(
+            f"{one.name} as a part of {one.splits}" if one.splits else f"{one.name} as a new region"
+            for one in found.additions
+        )
+
+    def with_name(name: str) -> list[str]:
+        return compose.phrases_of(name, cfg)
+
+    made = _provenance(state, making, cfg, **_parents(state, making, root, current))
+    made = msgspec.structs.replace(made, note="; ".join(filter(None, (note, found.remark))))
+    for addition in found.additions:
+        root = revising.extended(root, addition, with_name)
+    state.roots[asked_for(making.task)] = root
+    yield _keep(making, revising.applied(current, found, with_name, made), state)
+
+
+def _parents(state: State, making: Making, root: Prior, current: Prior) -> dict[str, Any]:
+    """Where a revised prior comes from, for its provenance."""
+    robots = {seen.robot for seen in state.evidence.get(asked_for(making.task), {}).values()}
+    return {"parent_digest": current.digest(), "root_digest": root.digest(), "contributors": sorted(robots)}
 
 
 def _combined(state: State, making: Making, drafts: list[turns.Draft], cfg: Config) -> Prior:
@@ -318,11 +352,15 @@ def _learn(state: State, seen: PriorEvidence, cfg: Config) -> Iterator[Told]:
     if not cfg.learning.automatic or digest is None or len(known) < cfg.learning.least_maps:
         return
     current = state.priors[digest]
-    root = state.roots.get(asked, current)
-    after = learning.revised(root, learning.totals(root, known.values()), cfg.learning.strength, current.provenance)
-    if learning.largest_change(current, after) >= cfg.learning.least_change:
+    root, limits = state.roots.get(asked, current), cfg.learning
+    seen_so_far = learning.estimate(root, known.values(), limits).totals
+    after = learning.revised(root, seen_so_far, limits.strength, current.provenance)
+    if learning.largest_change(current, after) >= limits.least_change:
         environment, task, regions = asked
-        yield from _begin_revision(state, PriorRevision(environment=environment, task=task, regions=list(regions)))
+        by_model = limits.by_model and cfg.provider != "library" and not too_dear(state, environment, cfg)
+        yield from _begin_revision(
+            state, PriorRevision(environment=environment, task=task, regions=list(regions), by_model=by_model)
+        )
 
 
 def _revise(state: State, making: Making, cfg: Config) -> Iterator[Told]:
@@ -333,23 +371,43 @@ def _revise(state: State, making: Making, cfg: Config) -> Iterator[Told]:
     except compose.NoPrior:
         yield from _give_up(state, making, "there is no prior to revise", cfg)
         return
-    seen = learning.totals(root, state.evidence.get(asked_for(making.task), {}).values())
-    if not seen.maps:
+    known = state.evidence.get(asked_for(making.task), {})
+    seen = learning.estimate(root, known.values(), cfg.learning)
+    if not seen.totals.maps:
         yield from _give_up(state, making, "nothing has been observed", cfg)
         return
-    if not making.revision.by_model:
-        note = (
-            f"revised by counting in {seen.maps} map{'s' if seen.maps != 1 else ''}, strength {cfg.learning.strength:g}"
-        )
-        before = root.provenance
-        made = _provenance(
-            state, making, cfg, note=note, parent_digest=current.digest(), source=before.source, detail=before.detail
-        )
-        yield _keep(making, learning.revised(root, seen, cfg.learning.strength, made), state)
+    if making.revision.by_model:
+        yield from _ask_about(state, making, current, seen, cfg)
         return
-    lines, form = learning.told(learning.disagreements(current, seen, cfg.learning.told))
-    if cfg.provider == "library" or not form:
+    robots = len({one.robot for one in known.values()})
+    note = f"revised by counting in {counted(len(known), 'map')} of {counted(robots, 'robot')}"
+    before = root.provenance
+    made = _provenance(
+        state,
+        making,
+        cfg,
+        note=f"{note}, strength {cfg.learning.strength:g}",
+        source=before.source,
+        detail=before.detail,
+        **_parents(state, making, root, current),
+    )
+    yield _keep(making, learning.revised(root, seen.totals, cfg.learning.strength, made), state)
+
+
+def _ask_about(state: State, making: Making, current: Prior, seen: Estimate, cfg: Config) -> Iterator[Told]:
+    """Show the model what was expected and what was observed, if it may still be asked today."""
+    lines, form = learning.told(learning.disagreements(current, seen.totals, cfg.learning.told))
+    strange = ("", []) if making.task.regions else learning.unexplained(current, seen)
+    if cfg.provider == "library" or not (form or strange[0]):
         yield from _give_up(state, making, "there is no model, or nothing to disagree about", cfg)
         return
+    if dear := too_dear(state, making.task.environment, cfg):
+        yield from _give_up(state, making, dear, cfg)
+        return
     talk = turns.Talk(state.prompts, cfg.synthesis)
-    yield from _start(state, making, turns.revise(current, lines, form, talk), 0, cfg)
+    yield from _start(state, making, revising.revision(current, lines, form, strange, talk), 0, cfg)
+
+
+def counted(number: int, what: str) -> str:
+    """Such as "1 map" or "3 maps"."""
+    return f"{number} {what}{'s' if number != 1 else ''}"

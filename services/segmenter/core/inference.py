@@ -18,9 +18,11 @@ from prior_sg.services.segmenter.core.energy.mrf import Field
 from prior_sg.services.segmenter.core.energy.region_cost import consolidated
 from prior_sg.services.segmenter.core.evidence.kernel import Frame
 from prior_sg.services.segmenter.core.experts import REGISTRY, Vote
+from prior_sg.services.segmenter.core.experts.contents import words_of_contents
 from prior_sg.services.segmenter.core.experts.context import Context, ObjectView, standardised
 from prior_sg.services.segmenter.core.map import inclination
 from prior_sg.services.segmenter.core.map.received import with_neighbours
+from prior_sg.services.segmenter.core.regions.contents import held_around
 from prior_sg.services.segmenter.core.state import State
 
 BIAS_SAMPLE = 4096  # places that stand for all when the map's bias is computed
@@ -51,8 +53,16 @@ class Crops(NamedTuple):
 
 def votes(state: State, rows: np.ndarray, cfg: Config) -> dict[str, Vote]:
     """Each configured expert's vote on the places in `rows`; probabilities are floored."""
+    context = context_of(state, rows, cfg)
+    floor = np.log(cfg.probability_floor)
+    answers = {name: REGISTRY[name](context) for name in cfg.experts}
+    return {name: (np.maximum(log_probabilities, floor), sure) for name, (log_probabilities, sure) in answers.items()}
+
+
+def context_of(state: State, rows: np.ndarray, cfg: Config) -> Context:
+    """What experts may look at to judge the places in `rows`."""
     aligned = state.aim.aligned
-    context = Context(
+    return Context(
         prior=aligned.prior,
         text=aligned.text,
         similarity=state.map.places.looks[rows],
@@ -64,11 +74,9 @@ def votes(state: State, rows: np.ndarray, cfg: Config) -> dict[str, Vote]:
         support=state.map.places.support[rows],
         anisotropy=state.map.places.anisotropy[rows],
         objects=state.objects.view,
+        contents=state.map.places.contents[rows],
         object_settings=cfg.objects,
     )
-    floor = np.log(cfg.probability_floor)
-    answers = {name: REGISTRY[name](context) for name in cfg.experts}
-    return {name: (np.maximum(log_probabilities, floor), sure) for name, (log_probabilities, sure) in answers.items()}
 
 
 def survey_due(state: State, idle: bool, cfg: Config) -> bool:
@@ -193,6 +201,7 @@ def see_objects(state: State, view: ObjectView, cfg: Config) -> None:
         state.map.places.doubtful |= near
         state.regions.disturb(state.map.places.regions[near])
         state.labelling.dirty = True
+    state.labelling.look_into_regions()
 
 
 def rebalance(state: State, idle: bool, cfg: Config) -> None:
@@ -205,6 +214,17 @@ def rebalance(state: State, idle: bool, cfg: Config) -> None:
     if np.abs(bias - labelling.bias).max(initial=0.0) > cfg.balance.tolerance:
         labelling.bias = bias
         places.doubtful[seen] = True
+
+
+def weigh_contents(state: State) -> None:
+    """What the objects of each region, as the regions are, say of the label of its places."""
+    places = state.map.places
+    found = held_around(state.objects.view, state.map.graph.positions_m, places.regions)
+    now = words_of_contents(state.aim.aligned.prior, found) if found.shape[1] else np.zeros_like(places.contents)
+    moved = (np.abs(now - places.contents) > CORRECTION_TOLERANCE).any(axis=1)
+    places.contents[moved] = now[moved]
+    places.doubtful |= moved
+    state.labelling.looked_into_regions(bool(moved.any()))
 
 
 def evaluate_experts(state: State, idle: bool, cfg: Config) -> None:
@@ -220,6 +240,8 @@ def evaluate_experts(state: State, idle: bool, cfg: Config) -> None:
     if surveyed:
         tell_apart(state, crops, cfg)
     rebalance(state, idle, cfg)
+    if idle and state.labelling.looks_left:
+        weigh_contents(state)
     places, rows = state.map.places, np.flatnonzero(state.map.places.doubtful)
     answers = votes(state, rows, cfg)
     unary = np.zeros((len(rows), places.unary.shape[1]))

@@ -24,6 +24,7 @@ from prior_sg.services.segmenter.core.aim import object_concepts, region_concept
 from prior_sg.services.segmenter.core.config import Config
 from prior_sg.services.segmenter.core.evidence import handover
 from prior_sg.services.segmenter.core.evidence.kernel import Targets
+from prior_sg.services.segmenter.core.experts.contents import has_say
 from prior_sg.services.segmenter.core.objects.names import named
 from prior_sg.services.segmenter.core.state import State
 from prior_sg.services.segmenter.core.succession import SAME_MAP
@@ -162,7 +163,9 @@ def align(state: State, cfg: Config) -> bool:
         state.seen.query_radius_m = now.query_radius_m
         _integrate_afresh(state, np.arange(len(state.map.graph.ids)), cfg)
     state.map.relabel(len(now.labels))
-    state.labelling.start_afresh(len(now.labels), len(state.map.graph.ids))
+    state.labelling.start_afresh(
+        len(now.labels), len(state.map.graph.ids), "contents" in cfg.experts and has_say(now.prior)
+    )
     state.objects.start_afresh(now.prior, switched=former is not None)
     return True
 

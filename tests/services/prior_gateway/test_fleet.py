@@ -8,13 +8,14 @@ import threading
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from prior_sg.deploy.inspecting.replay import compare, open_log
 from prior_sg.deploy.running.recorder import Recorder
 from prior_sg.schemas.codec import decode
-from prior_sg.schemas.priors import Prior, PriorRequest, Task
-from prior_sg.schemas.topics import PRIOR, PRIORS, TASK
+from prior_sg.schemas.priors import Prior, PriorEvidence, PriorRequest, PriorRevision, Task
+from prior_sg.schemas.topics import PRIOR, PRIOR_EVIDENCE, PRIOR_REVISION, PRIORS, TASK
 from prior_sg.services.runtime.client import BusClient
 from prior_sg.services.runtime.zenoh_bus import ZenohBus
 from tests.help.model import good, serving, slow, status
@@ -152,6 +153,62 @@ def test_when_the_one_at_work_dies_the_next_goes_on(endpoint, client, tmp_path):
         finally:
             for name in list(fleet.processes):
                 fleet.end(name)
+
+
+def explored(prior: Prior, robot: str, kitchens: int) -> PriorEvidence:
+    """A map of kitchens, plain to see, each with a toilet in it."""
+    regions, objects = len(prior.regions), [item.name for item in prior.objects]
+    kitchen = [region.name for region in prior.regions].index("kitchen")
+    nothing, count = np.zeros((regions, regions), np.float32), np.zeros(regions, np.float32)
+    count[kitchen] = kitchens
+    contents = np.zeros((kitchens, len(objects)), np.float32)
+    contents[:, [objects.index("toilet"), objects.index("stove")]] = 1.0
+    looks = np.where(np.arange(regions) == kitchen, -0.1, -5.0)
+    return PriorEvidence(
+        robot=robot, epoch=1, stamp_ns=1, prior_digest=prior.digest(), environment=prior.environment, task=prior.task,
+        regions=[region.name for region in prior.regions], objects=objects, places=16 * count, instances=count,
+        holding=np.zeros((regions, len(objects)), np.float32), pairs=nothing, touching=nothing,
+        sizes=np.full(kitchens, 16, np.float32), looks=np.tile(looks, (kitchens, 1)).astype(np.float32),
+        contents=contents, links=np.zeros((0, 2), np.int32),
+    )  # fmt: skip
+
+
+def test_what_some_robots_saw_revises_the_prior_that_a_new_robot_starts_with(endpoint, client, tmp_path):
+    fleet, library = Fleet(endpoint, "http://127.0.0.1:1/v1", tmp_path), ("provider=library", "model=", "key_env=")
+    question = PriorRequest(environment="residential home", task="clean")
+    try:
+        fleet.start("a", *library)
+        wait_for(lambda: alive(client, "a"), "the gateway alive")
+        found = priors_of(client)
+        client.publish(TASK, task("r1", "clean"))
+        wait_for(lambda: found, "the library's prior")
+        first = found[0]
+        for robot in ("r1", "r2", "r3"):
+            client.publish(PRIOR_EVIDENCE, explored(first, robot, 4))
+        wait_for(lambda: len(list((tmp_path / "a").glob("*/*.evidence"))) == 3, "what was seen is kept")
+        client.publish(PRIOR_REVISION, PriorRevision(environment="residential home", task="clean"))
+        wait_for(lambda: found[-1].provenance.parent_digest, "a revised prior")
+        revised = found[-1]
+        assert revised.provenance.parent_digest == revised.provenance.root_digest == first.digest()
+        assert revised.provenance.contributors == ["r1", "r2", "r3"]
+        row = [region.name for region in revised.regions].index("kitchen")
+        toilet = [item.name for item in revised.objects].index("toilet")
+        assert first.containment[row, toilet] < 0.1 and revised.containment[row, toilet] > 0.5
+        found.clear()
+        client.publish(TASK, task("r4", "clean"))
+        wait_for(lambda: found, "the prior of a new robot")
+        assert found[0].digest() == revised.digest()
+        fleet.end("a")
+        fleet.start("b", *library, f"archive={tmp_path / 'a'}")
+        wait_for(lambda: alive(client, "b"), "its successor alive")
+        found.clear()
+        client.publish(TASK, task("r5", "clean"))
+        wait_for(lambda: found, "the prior of a robot of another day")
+        assert found[0].digest() == revised.digest()
+        assert client.ask(PRIORS, question).priors[0].digest() == revised.digest()
+    finally:
+        for name in list(fleet.processes):
+            fleet.end(name)
 
 
 def test_a_missing_key_ends_the_start_with_one_sentence(endpoint, tmp_path):

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from prior_sg.schemas.priors import PriorClaim, PriorEvidence, Provenance, Task
-from prior_sg.services.prior_gateway.core import compose, ensemble, learning
+from prior_sg.services.prior_gateway.core import compose, ensemble, estimation, learning, revising
 from prior_sg.services.prior_gateway.core import turns as synthesis
 from prior_sg.services.prior_gateway.core.claims import Claims
 from prior_sg.services.prior_gateway.core.config import Config
@@ -388,6 +388,10 @@ def evidence(prior, epoch, **counts):
     )  # fmt: skip
 
 
+def counted(prior, seen):
+    return learning.estimate(prior, seen, learning.LearningConfig()).totals
+
+
 def test_counts_are_added_as_pseudo_counts():
     prior = library_prior()
     toilet = [item.name for item in prior.objects].index("toilet")
@@ -403,11 +407,15 @@ def test_counts_are_added_as_pseudo_counts():
         )
         for epoch in (1, 2)
     ]
-    after = learning.revised(prior, learning.totals(prior, seen), 4.0, Provenance(source="s"))
+    totals = counted(prior, seen)
+    after = learning.revised(prior, totals, 4.0, Provenance(source="s"))
     before = float(prior.containment[1, toilet])
-    assert after.containment[1, toilet] == pytest.approx((4 * before + 2) / (4 + 4))
+    rows = estimation.strengths(prior.containment, totals.instances, totals.holding, 4.0)
+    assert after.containment[1, toilet] == pytest.approx((rows[1] * before + 2) / (rows[1] + 4))
     assert after.containment[2] == pytest.approx(prior.containment[2].clip(0.01, 0.99)), "never seen, never changed"
-    assert after.adjacency[0, 1] == pytest.approx((4 * float(prior.adjacency[0, 1]) + 4) / (4 + 4))
+    ends = estimation.strengths(prior.adjacency, totals.pairs, totals.touching, 4.0)
+    worth = min(ends[0], ends[1])
+    assert after.adjacency[0, 1] == pytest.approx((worth * float(prior.adjacency[0, 1]) + 4) / (worth + 4))
     share = (4 * prior.regions[0].existence + 2 * 0.75) / (4 + 2)
     assert after.regions[0].existence == pytest.approx(share, abs=1e-4)
     after.check()
@@ -418,7 +426,7 @@ def test_evidence_of_other_names_is_left_out():
     other = evidence(
         library_prior(("garage", "bedroom", "hallway")), 1, places={0: 9, 2: 1}, pairs={(0, 2): 1, (2, 0): 1}
     )
-    seen = learning.totals(prior, [other])
+    seen = counted(prior, [other])
     assert seen.maps == 1
     assert seen.shares.tolist() == [0, 0, 1]
     assert seen.pairs.sum() == 0
@@ -430,7 +438,7 @@ def test_disagreements_come_with_the_most_surprising_first():
     stove, toilet = names.index("stove"), names.index("toilet")
     held = {(i, j): round(8 * float(p)) for (i, j), p in np.ndenumerate(prior.containment) if i < 2}
     held |= {(0, stove): 6, (1, toilet): 0}
-    seen = learning.totals(prior, [evidence(prior, 1, places={0: 1}, instances={0: 8, 1: 8}, holding=held)])
+    seen = counted(prior, [evidence(prior, 1, places={0: 1}, instances={0: 8, 1: 8}, holding=held)])
     first = learning.disagreements(prior, seen, 5)[0]
     assert (first.matrix, first.row, first.column, first.observed, first.trials) == (
         "containment",
@@ -447,7 +455,7 @@ def test_disagreements_come_with_the_most_surprising_first():
 @pytest.mark.parametrize(("given", "says"), [(40, ""), (95, "outside 0 to 90"), (None, "is missing")])
 def test_a_model_may_weigh_evidence_but_not_contradict_it(given, says):
     prior, form = library_prior(), {"containment": {"bathroom": {"toilet": (90.0, 0.0)}}}
-    dialogue = synthesis.revise(prior, "- ...", form, synthesis.Talk(PROMPTS, msgspec.structs.replace(CFG, repairs=0)))
+    dialogue = revising.revise(prior, "- ...", form, synthesis.Talk(PROMPTS, msgspec.structs.replace(CFG, repairs=0)))
     next(dialogue)
     said = json.dumps({"containment": {"bathroom": {"toilet": given} if given is not None else {}}})
     if says:

@@ -3,15 +3,16 @@
 import numpy as np
 
 from prior_sg.schemas.codec import decode, encode
-from prior_sg.schemas.priors import PriorEvidence
+from prior_sg.schemas.priors import PriorEvidence, Tested
 from prior_sg.schemas.status import Tick
 from prior_sg.schemas.topics import PRIOR_EVIDENCE, TEXT
 from prior_sg.services.prior_gateway.core import learning
 from prior_sg.services.runtime.runner import Runner
 from prior_sg.services.runtime.service import Identity
-from prior_sg.services.segmenter.core import prior_evidence
+from prior_sg.services.segmenter.core import inference, prior_evidence
 from prior_sg.services.segmenter.core.config import Config
 from prior_sg.services.segmenter.core.experts.context import ObjectView
+from prior_sg.services.segmenter.core.regions.contents import held, held_around
 from prior_sg.services.segmenter.service import SERVICE
 from tests.help.world import ROBOT, place_delta, place_grid, prior, task, text, walk
 
@@ -19,11 +20,14 @@ ROOMS = ["kitchen", "hall", "bedroom"]
 TICK = Tick(stamp_ns=10**18)
 
 
-def segmenter(cfg: Config) -> Runner:
-    """A segmenter whose text requests are answered like rooms' basis vectors."""
+ALIKE = np.array([[1.0, 0.0, 0.95], [0.0, 1.0, 0.0], [0.95, 0.0, 1.0]])  # kitchens look nearly like bedrooms
+
+
+def segmenter(cfg: Config, concepts=np.eye(3)) -> Runner:
+    """A segmenter whose text requests are answered with these rows over the rooms' basis vectors."""
 
     def reply(request):
-        return text(np.eye(3)[: len(request.concepts)])
+        return text(concepts[: len(request.concepts)])
 
     return Runner(SERVICE, cfg, Identity(ROBOT, "i", 1), {TEXT: reply}, wire=True)
 
@@ -64,7 +68,9 @@ def test_it_can_be_switched_off():
 def test_the_gateway_learns_from_it():
     [seen] = told(Config(evidence_ticks=4), 20)
     before = prior(ROOMS)
-    after = learning.revised(before, learning.totals(before, [seen]), 4.0, before.provenance)
+    after = learning.revised(
+        before, learning.estimate(before, [seen], learning.LearningConfig()).totals, 4.0, before.provenance
+    )
     expected = (4 * 0.3 + np.array([[0, 1, 0], [1, 0, 1], [0, 1, 0]])) / 5  # P = (strength P + k) / (strength + n)
     off = ~np.eye(3, dtype=bool)
     np.testing.assert_allclose(after.adjacency[off], expected[off], rtol=1e-6)
@@ -79,10 +85,8 @@ def test_objects_count_for_the_region_of_their_nearest_place_by_their_best_candi
         concepts=np.array([[0.9, 0.1], [0.4, 0.6], [0.2, 0.8], [1.0, 0.0], [1.0, 0.0]]),
         weights=np.array([1.0, 1.0, 0.5, 1.0, 1.0]),
     )
-    held = prior_evidence._held(
-        view, positions_m, regions, np.array([7, 9])
-    )  # 8 is too small, the object at 12 too far
-    np.testing.assert_allclose(held, [[0.9, 0.6], [0.1, 0.4]])
+    found = held(view, positions_m, regions, np.array([7, 9]))  # 8 is too small, the object at 12 too far
+    np.testing.assert_allclose(found, [[0.9, 0.6], [0.1, 0.4]])
 
 
 def seen_with(weight: float) -> PriorEvidence:
@@ -102,12 +106,55 @@ def test_what_a_region_holds_revises_containment():
     seen, before = seen_with(1.0), prior(ROOMS)
     assert seen.objects == ["oven", "bed"]
     np.testing.assert_allclose(seen.holding, [[0.9, 0.1], [0, 0], [0, 0]], rtol=1e-6)
-    after = learning.revised(before, learning.totals(before, [seen]), 4.0, before.provenance)
+    after = learning.revised(
+        before, learning.estimate(before, [seen], learning.LearningConfig()).totals, 4.0, before.provenance
+    )
     np.testing.assert_allclose(after.containment, (4 * 0.5 + np.array([[0.9, 0.1], [0, 0], [0, 0]])) / 5, rtol=1e-6)
 
 
 def test_objects_without_a_say_are_no_sign_that_one_has_looked():
     seen, before = seen_with(0.0), prior(ROOMS)
     assert seen.objects == [] and seen.holding.shape == (3, 0)
-    after = learning.revised(before, learning.totals(before, [seen]), 4.0, before.provenance)
+    after = learning.revised(
+        before, learning.estimate(before, [seen], learning.LearningConfig()).totals, 4.0, before.provenance
+    )
     np.testing.assert_array_equal(after.containment, before.containment)
+
+
+def test_each_region_is_told_of_apart_from_its_label():
+    seen = seen_with(1.0)
+    assert seen.sizes.sum() == 50 and seen.links.tolist() == [[0, 1], [1, 2]]
+    assert seen.looks.argmax(axis=1).tolist() == [0, 1, 2], "in the order of the rooms"
+    assert (seen.looks <= 0).all()
+    np.testing.assert_allclose(seen.contents, [[0.9, 0.1], [0, 0], [0, 0]], rtol=1e-6)
+
+
+def rooms_under(counted: float, stove_in: str, ticks: int = 6) -> list[str]:
+    """Labels of three rooms, the first of which holds an oven, under a prior in whose regions `counted` were tested."""
+    positions, edges = place_grid(3)
+    held = np.full((3, 2), 0.02, np.float32)
+    held[ROOMS.index(stove_in), 0] = 0.98
+    tested = Tested(regions=np.full(3, counted, np.float32)) if counted else None
+    runner = segmenter(Config(evidence_ticks=0), ALIKE)
+    runner.feed(place_delta(positions, edges), task(), prior(ROOMS, containment=held, tested=tested), *walk(3), TICK)
+    view = ObjectView(np.array([1]), np.array([[2.0, 2.0, 0.5]]), np.array([[1.0, 0.0]]))
+    inference.see_objects(runner.state, view, runner.cfg)
+    runner.feed(*[TICK] * ticks)
+    assert not runner.state.labelling.dirty, "it rests"
+    places = runner.state.map.places
+    order = np.argsort(runner.state.map.graph.positions_m[:, 0], kind="stable")
+    return [ROOMS[places.labels[row]] for row in (order[0], order[len(order) // 2], order[-1])]
+
+
+def test_what_a_whole_region_holds_has_a_say_once_the_prior_was_tested():
+    assert rooms_under(0, "bedroom") == ROOMS
+    assert rooms_under(50, "bedroom") == ["bedroom", "hall", "bedroom"]
+    assert rooms_under(50, "kitchen") == ROOMS
+
+
+def test_each_place_hears_what_its_region_holds_and_the_nearest_most():
+    """Two places of one region 0 and 2 m from an oven that counts half, one of another region at 1 m; decay 2 m."""
+    view = ObjectView(np.array([1]), np.array([[0.0, 0, 0]]), np.array([[0.8, 0.2]]), np.array([0.5]))
+    found = held_around(view, np.array([[0.0, 0, 0], [2, 0, 0], [0, 1, 0]]), np.array([3, 3, 4]))
+    np.testing.assert_allclose(found, [[0.4, 0.1], [0.4 * np.exp(-1), 0.1 * np.exp(-1)], [0, 0]])
+    assert held_around(ObjectView(), np.zeros((2, 3)), np.array([3, 3])).shape == (2, 0)

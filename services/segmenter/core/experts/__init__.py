@@ -8,6 +8,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from prior_sg.services.segmenter.core.experts.contents import contents
 from prior_sg.services.segmenter.core.experts.context import Context
 from prior_sg.services.segmenter.core.experts.environment import environment
 from prior_sg.services.segmenter.core.experts.geometric import geometric
@@ -22,4 +23,5 @@ REGISTRY: dict[str, Expert] = {
     "geometric": geometric,
     "object": objects,
     "environment": environment,
+    "contents": contents,
 }

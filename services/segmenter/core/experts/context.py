@@ -70,6 +70,7 @@ class Context:
     support: np.ndarray  # (place,) in [0, 1): how many places form that surface
     anisotropy: np.ndarray  # (place,) in [0, 1]: how flat or straight it is
     objects: ObjectView = field(default_factory=ObjectView)  # of the whole map
+    contents: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))  # (place, label), see experts/contents.py
     object_settings: ObjectSettings = field(default_factory=ObjectSettings)
 
 

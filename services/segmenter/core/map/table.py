@@ -18,6 +18,7 @@ _FILLS: dict[str, tuple[float | bool, str]] = {  # what a new place gets, and th
     "own_similarity": (0.0, "float64"),
     "similarity": (0.0, "float64"),
     "correction": (0.0, "float64"),
+    "contents": (0.0, "float64"),
     "unary": (0.0, "float64"),
     "posteriors": (0.0, "float32"),
     "sight": (0.0, "float64"),
@@ -31,7 +32,7 @@ _FILLS: dict[str, tuple[float | bool, str]] = {  # what a new place gets, and th
     "unsettled": (True, "bool"),
     "unbelieved": (True, "bool"),
 }
-_PER_LABEL = ("own_similarity", "similarity", "correction", "unary", "posteriors")
+_PER_LABEL = ("own_similarity", "similarity", "correction", "contents", "unary", "posteriors")
 _AFTER_A_SWITCH = ("stale", "unshared", "doubtful", "unsettled", "unbelieved")
 
 
@@ -47,6 +48,7 @@ class Places:
     own_similarity: np.ndarray  # (place, label) standardised
     similarity: np.ndarray  # (place, label) its average over the neighbours
     correction: np.ndarray  # (place, label) to be added: what all crops together say, as of the last look over the map
+    contents: np.ndarray  # (place, label) what the objects of its region say, as of the last look over the regions
     unary: np.ndarray  # (place, label)
     posteriors: np.ndarray  # (place, label)
     sight: np.ndarray  # confidence of the visual expert
