@@ -1,4 +1,4 @@
-"""What readers know of a graph that comes as a whole, again and again, and the delta that brings them up to date (pure).
+"""What readers know of a graph that comes as a whole each time, and the delta that brings them up to date (pure).
 
 A value is told again when it differs by more than a tolerance from what was told, so that slow drift adds up.
 """

@@ -18,7 +18,8 @@ from prior_sg.deploy.evaluation.datasets import Dataset, WorldName, of_world
 from prior_sg.deploy.evaluation.methods import Case, Variant
 from prior_sg.deploy.evaluation.perception import Cache, Perceiver, Perception, seen_by
 from prior_sg.deploy.evaluation.simulated import SimulatedEncoder
-from prior_sg.deploy.truth import TrueObject
+from prior_sg.deploy.evaluation.worlds import world_of
+from prior_sg.deploy.truth import GroundTruth, TrueObject
 from prior_sg.schemas.codec import decode, encode
 from prior_sg.schemas.frames import Keyframe
 from prior_sg.schemas.objects import SceneObject
@@ -43,7 +44,7 @@ CODE = "1"  # changes with what is kept on disk
 
 
 class Part(NamedTuple):
-    """A share of a walk: from and to, as shares of its keyframes, and which random numbers move it."""
+    """A share of a walk: from and to, as shares of its keyframes, and which random numbers move it; 0 = none do."""
 
     start: float
     stop: float
@@ -87,6 +88,10 @@ class Walks:
         pose = np.array(kept.own_from_world).reshape(4, 4)
         return PartialMap(decode(Scene, kept.scene), pose, decode(VoxelMap, kept.voxels))
 
+    def truth(self, seed: int) -> GroundTruth:
+        """The true regions of a home."""
+        return world_of(self.kind, seed).truth
+
     def home(self, seed: int) -> tuple[Dataset, Perception, list[Keyframe]]:
         """A home as a simulated encoder sees the whole walk, and its keyframes."""
         if self._home is None or self._home[0] != seed:
@@ -101,8 +106,10 @@ class Walks:
         dataset, perception, frames = self.home(seed)
         rng = np.random.default_rng([seed, part.seed])
         chosen = frames[round(part.start * len(frames)) : max(round(part.stop * len(frames)), 1)]
-        own_from_world = moved(rng)
-        poses = drifting([own_from_world @ np.array(frame.world_from_camera) for frame in chosen], rng)
+        poses, own_from_world = [np.array(frame.world_from_camera) for frame in chosen], np.eye(4)
+        if part.seed:
+            own_from_world = moved(rng)
+            poses = drifting([own_from_world @ pose for pose in poses], rng)
         by_frame = {frame.frame_id: pose for frame, pose in zip(chosen, poses, strict=True)}
         places = BY_NAME["place_graph"]
         runner = Runner(places, places.config(), Identity(ROBOT, "place_graph", 1))
