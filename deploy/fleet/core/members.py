@@ -46,6 +46,11 @@ class Member:
             self._map = map_of(scenes.scene(self.graph))
         return self._map
 
+    def frame_ids(self) -> list[int]:
+        """Of the map's trajectory."""
+        graph = self.graph
+        return [frame for frame, seen in sorted(graph.sightings.items()) if seen.epoch == graph.place_cursor.epoch]
+
     def touch(self) -> None:
         """Something of the map has changed."""
         self.changed, self._map = True, None

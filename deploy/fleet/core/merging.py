@@ -30,6 +30,7 @@ class Source(NamedTuple):
     name: Name
     scene: Scene
     fleet_from_own: np.ndarray  # (4, 4)
+    frame_ids: Sequence[int] | None = None  # of the scene's trajectory; None = they count from 0
 
 
 @dataclass
@@ -48,20 +49,21 @@ class Merged:
     scene: Scene
     regions: dict[int, list[tuple[Name, int]]]
     objects: dict[int, list[tuple[Name, int]]]
+    frame_ids: np.ndarray  # (frame,) of the scene's trajectory
 
 
 def merged(robot: str, sources: Sequence[Source], memory: Memory) -> Merged:
     """The scene of all maps under one name. `memory` is brought up to date. Raises ValueError without any map."""
     maps = [
         Placed(name, scene, pose, memory.ids.of("place", name, scene.place_ids.tolist()))
-        for name, scene, pose in sources
+        for name, scene, pose, _ in sources
     ]
     found = fused(maps)
     beliefs = believed(maps, found)
     regions = _regions_of(found, beliefs, memory)
     objects, members = _objects(maps, memory)
     nodes, directions, areas = openings(maps, found)
-    trajectory = [transform(one.fleet_from_own, one.scene.trajectory.astype(float)) for one in maps]
+    frame_ids, cameras_m = _cameras(sources, memory)
     newest = max((one.scene for one in maps), key=lambda scene: scene.stamp_ns)
     scene = Scene(
         robot=robot,
@@ -81,7 +83,7 @@ def merged(robot: str, sources: Sequence[Source], memory: Memory) -> Merged:
         unknown=beliefs.unknown.astype(np.float16),
         edges=found.ids[found.edges].reshape(-1, 2),
         clearances_m=found.clearances_m.astype(np.float32),
-        trajectory=np.concatenate(trajectory).astype(np.float32),
+        trajectory=cameras_m.astype(np.float32),
         predicted_ids=found.ids[beliefs.predicted],
         objects=objects,
         frontier_ids=found.ids[nodes],
@@ -89,7 +91,19 @@ def merged(robot: str, sources: Sequence[Source], memory: Memory) -> Merged:
         frontier_areas_m2=areas.astype(np.float32),
         origin_m=maps[0].scene.origin_m,
     )
-    return Merged(scene, _members(maps, found, regions), members)
+    return Merged(scene, _members(maps, found, regions), members, frame_ids)
+
+
+def _cameras(sources: Sequence[Source], memory: Memory) -> tuple[np.ndarray, np.ndarray]:
+    """The fleet's numbers (frame,) of all keyframes, ascending, and where they were taken (frame, 3)."""
+    numbers, cameras_m = [], []
+    for name, scene, pose, frame_ids in sources:
+        own = range(len(scene.trajectory)) if frame_ids is None else frame_ids
+        numbers.append(memory.ids.of("frame", name, own))
+        cameras_m.append(transform(pose, scene.trajectory.astype(float)))
+    every, where_m = np.concatenate(numbers), np.concatenate(cameras_m)
+    order = np.argsort(every)
+    return every[order], where_m[order]
 
 
 def _regions_of(found: Fused, beliefs: Believed, memory: Memory) -> np.ndarray:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 import msgspec
 import numpy as np
 
+from prior_sg.deploy.fleet.core.merging import Merged
 from prior_sg.deploy.told import ToldGraph, ToldObjects
 from prior_sg.schemas.codec import Message
 from prior_sg.schemas.objects import ObjectDelta
@@ -28,16 +29,17 @@ class Teller:
     graph: ToldGraph = field(default_factory=ToldGraph)
     objects: ToldObjects = field(default_factory=ToldObjects)
     regions: Ledger = field(default_factory=Ledger)
-    cameras_m: np.ndarray = field(default_factory=lambda: np.zeros((0, 3), np.float32))  # by number of their order
+    cameras_m: dict[int, np.ndarray] = field(default_factory=dict)  # (3,) by frame id
     place_revision: int = -1
     object_revision: int = -1
     scene: Scene | None = None  # as last told
 
-    def tell(self, scene: Scene, event: str, min_change_m: float, posterior_change: float) -> Iterator[Message]:
+    def tell(self, merged: Merged, event: str, min_change_m: float, posterior_change: float) -> Iterator[Message]:
         """The deltas from what was told to this scene."""
+        scene = merged.scene
         before, self.scene = self.scene, scene
         told = self.graph.follow(scene, min_change_m)
-        fresh = self._cameras(scene)
+        fresh = self._cameras(merged.frame_ids, scene.trajectory)
         if told is not None or len(fresh.past_frame_ids) or event:
             self.place_revision += 1
             columns = told if told is not None else ToldGraph().snapshot()
@@ -52,7 +54,7 @@ class Teller:
 
     def places_snapshot(self) -> PlaceDelta:
         """Everything that was told of places."""
-        cameras = CameraColumns(np.arange(len(self.cameras_m)), self.cameras_m)
+        cameras = _columns(dict(sorted(self.cameras_m.items())))
         return place_delta(self._heading("")._replace(snapshot=True), *self.graph.snapshot(), cameras)
 
     def regions_snapshot(self) -> RegionDelta:
@@ -67,15 +69,16 @@ class Teller:
         stamp_ns, origin_m = (0, (0.0, 0.0, 0.0)) if self.scene is None else (self.scene.stamp_ns, self.scene.origin_m)
         return Heading(self.robot, self.epoch, self.place_revision, stamp_ns, NO_FRAME, event=event, origin_m=origin_m)
 
-    def _cameras(self, scene: Scene) -> CameraColumns:
-        """Cameras that are new or have moved, numbered as they stand in the scene."""
-        known, now = len(self.cameras_m), scene.trajectory
-        shared = min(known, len(now))
-        moved = np.linalg.norm(now[:shared] - self.cameras_m[:shared], axis=1) > CAMERA_M
-        rows = np.append(np.flatnonzero(moved), np.arange(shared, len(now)))
-        if len(rows):
-            self.cameras_m = now.copy()
-        return CameraColumns(rows.astype(np.int64), now[rows].astype(np.float32).reshape(-1, 3))
+    def _cameras(self, frame_ids: np.ndarray, cameras_m: np.ndarray) -> CameraColumns:
+        """Cameras that are new or have moved."""
+        far = np.full(3, np.inf)
+        news = {
+            frame: camera_m
+            for frame, camera_m in zip(frame_ids.tolist(), cameras_m, strict=True)
+            if not np.linalg.norm(camera_m - self.cameras_m.get(frame, far)) <= CAMERA_M
+        }
+        self.cameras_m |= news
+        return _columns(news)
 
     def _regions(self, scene: Scene, before: Scene | None, posterior_change: float) -> RegionDelta | None:
         everything = before is None or before.labels != scene.labels
@@ -116,3 +119,8 @@ class Teller:
             objects=[],
             removed_ids=np.zeros(0, np.int64),
         )
+
+
+def _columns(cameras_m: dict[int, np.ndarray]) -> CameraColumns:
+    frames = np.array(list(cameras_m), np.int64)
+    return CameraColumns(frames, np.array(list(cameras_m.values()), np.float32).reshape(-1, 3))

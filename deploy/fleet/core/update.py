@@ -140,7 +140,8 @@ def _tick(state: State, cfg: Config) -> Iterator[Message]:
     if cfg.memory and (count := sum(state.memory.ids.following.values())) != state.kept_ids:
         state.kept_ids = count
         yield KeepNumbers(robot=state.robot, content=_numbers(state.memory))
-    yield from state.teller.tell(state.merged.scene, "; ".join(events), cfg.min_change_m, cfg.posterior_change)
+    tolerances = cfg.min_change_m, cfg.posterior_change
+    yield from state.teller.tell(state.merged, "; ".join(events), *tolerances)
 
 
 def _numbers(memory: Memory) -> bytes:
@@ -164,7 +165,8 @@ def merged_of(robot: str, members: list[Member], memory: Memory) -> tuple[Merged
         else:
             scene, found = remembered(scene, pose, present)
             changes += [(one.name, change) for change in found]
-        sources.append(Source(one.name, scene, pose))
+        frame_ids = None if one.former and not one.graph.sightings else one.frame_ids()
+        sources.append(Source(one.name, scene, pose, frame_ids))
     return merged(robot, sources, memory), changes
 
 
