@@ -172,7 +172,7 @@ def detected(
     points_m = transform(inverse(own_from_world), (voxels.occupied + 0.5) * voxels.voxel_m)
     labels = sorted({item.label for item in objects})
     found = []
-    for item in objects:
+    for number, item in enumerate(objects):
         inside = ((points_m >= item.min_m - 0.05) & (points_m <= item.max_m + 0.05)).all(axis=1).sum()
         missed, mistaken, other = rng.random() < MISSED, rng.random() < MISTAKEN, labels[rng.integers(len(labels))]
         stray_m, grown = rng.normal(0, OFF_M, 3), 1 + rng.normal(0, MISMEASURED, 3)
@@ -186,7 +186,7 @@ def detected(
         low, high = (middle_m - half_m).tolist(), (middle_m + half_m).tolist()
         found.append(
             SceneObject(
-                id=len(found),
+                id=number,
                 label=other if mistaken else item.label,
                 probability=0.8,
                 known=0.9,
