@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from prior_sg.deploy.benches.partial_walks import Part, PartialMap, Walks
 from prior_sg.deploy.evaluation.metrics import evaluate
+from prior_sg.deploy.evaluation.partial_walks import Part, PartialMap, Walks
 from prior_sg.deploy.fleet.core.config import MatchConfig
 from prior_sg.deploy.fleet.core.frames import apart
 from prior_sg.deploy.fleet.core.ids import Name

@@ -1,4 +1,4 @@
-"""Two robots in one generated home: scenes of parts of its walk, each in a frame of its own, for `bench merge`.
+"""Two robots in one generated home: scenes of parts of its walk, each in a frame of its own.
 
 Each part is mapped anew, from keyframes whose poses are moved by a rigid transform (any heading, up to a degree of
 tilt, tens of metres) and drift by centimetres, so that nothing of one map's grid lies as in the other's. Regions are
@@ -17,10 +17,12 @@ import numpy as np
 from prior_sg.deploy.evaluation.datasets import Dataset, WorldName, of_world
 from prior_sg.deploy.evaluation.methods import Case, Variant
 from prior_sg.deploy.evaluation.perception import Cache, Perceiver, Perception, seen_by
+from prior_sg.deploy.evaluation.robots import WalkingRobot
 from prior_sg.deploy.evaluation.simulated import SimulatedEncoder
 from prior_sg.deploy.evaluation.worlds import world_of
 from prior_sg.deploy.truth import GroundTruth, TrueObject
 from prior_sg.schemas.codec import decode, encode
+from prior_sg.schemas.features import Pyramid
 from prior_sg.schemas.frames import Keyframe
 from prior_sg.schemas.objects import SceneObject
 from prior_sg.schemas.places import MapRequest, SnapshotRequest, VoxelMap
@@ -102,32 +104,51 @@ class Walks:
             self._home = seed, dataset, perception, keyframes(dataset)
         return self._home[1:]
 
-    def _make(self, seed: int, part: Part) -> PartialMap:
+    def robot(self, seed: int, part: Part, name: str) -> WalkingRobot:
+        """A robot that walks a part, with what it sees at each keyframe."""
         dataset, perception, frames = self.home(seed)
         rng = np.random.default_rng([seed, part.seed])
+        chosen, own_from_world, pyramids = self._chosen(part, perception, frames, rng)
+
+        def detect(voxels: VoxelMap) -> list[SceneObject]:
+            return detected(dataset.objects, voxels, own_from_world, np.random.default_rng([seed, part.seed, 1]))
+
+        return WalkingRobot(name, chosen, pyramids, prior=dataset.prior, text=perception.text, detect=detect)
+
+    def _chosen(
+        self, part: Part, perception: Perception, frames: list[Keyframe], rng: np.random.Generator
+    ) -> tuple[list[Keyframe], np.ndarray, tuple[Pyramid, ...]]:
+        """The keyframes of a part as they are told, how they lie, and what is seen in them."""
         chosen = frames[round(part.start * len(frames)) : max(round(part.stop * len(frames)), 1)]
         poses, own_from_world = [np.array(frame.world_from_camera) for frame in chosen], np.eye(4)
         if part.seed:
             own_from_world = moved(rng)
             poses = drifting([own_from_world @ pose for pose in poses], rng)
-        by_frame = {frame.frame_id: pose for frame, pose in zip(chosen, poses, strict=True)}
+        told = [
+            msgspec.structs.replace(frame, robot=ROBOT, world_from_camera=pose)
+            for frame, pose in zip(chosen, poses, strict=True)
+        ]
+        by_frame = {frame.frame_id: frame.world_from_camera for frame in told}
+        pyramids = tuple(
+            msgspec.structs.replace(one, robot=ROBOT, world_from_camera=by_frame[one.frame_id])
+            for one in perception.pyramids
+            if one.frame_id in by_frame
+        )
+        return told, own_from_world, pyramids
+
+    def _make(self, seed: int, part: Part) -> PartialMap:
+        dataset, perception, frames = self.home(seed)
+        rng = np.random.default_rng([seed, part.seed])
+        chosen, own_from_world, pyramids = self._chosen(part, perception, frames, rng)
         places = BY_NAME["place_graph"]
         runner = Runner(places, places.config(), Identity(ROBOT, "place_graph", 1))
-        for frame, pose in zip(chosen, poses, strict=True):
-            runner.feed(msgspec.structs.replace(frame, robot=ROBOT, world_from_camera=pose))
+        for frame in chosen:
+            runner.feed(frame)
         voxels: VoxelMap = runner.answer(VOXEL_MAP, MapRequest(robot=ROBOT))
-        seen = replace(
-            perception,
-            places=runner.answer(PLACE_SNAPSHOT, SnapshotRequest(robot=ROBOT)),
-            voxels=voxels,
-            pyramids=tuple(
-                msgspec.structs.replace(one, robot=ROBOT, world_from_camera=by_frame[one.frame_id])
-                for one in perception.pyramids
-                if one.frame_id in by_frame
-            ),
-        )
+        snapshot = runner.answer(PLACE_SNAPSHOT, SnapshotRequest(robot=ROBOT))
+        seen = replace(perception, places=snapshot, voxels=voxels, pyramids=pyramids)
         scene = Variant(self.config).run(Case(seen, dataset.prior, dataset.truth))
-        objects = detected(dataset.objects, voxels, own_from_world, rng)
+        objects = detected(dataset.objects, voxels, own_from_world, np.random.default_rng([seed, part.seed, 1]))
         return PartialMap(msgspec.structs.replace(scene, objects=objects), own_from_world, voxels)
 
 
