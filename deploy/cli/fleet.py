@@ -5,8 +5,9 @@ import asyncio
 import math
 import time
 import uuid
+from pathlib import Path
 
-from prior_sg.deploy.cli.shared import Commands, add_bus, console, tell_logs, until_interrupted
+from prior_sg.deploy.cli.shared import Commands, add_bus, console, tell_logs, until_interrupted, wait
 from prior_sg.deploy.errors import UserError
 
 Lying = tuple[float, float, float, float]  # x, y, z in metres, heading in radians
@@ -87,3 +88,25 @@ def cmd_fleet(arguments: argparse.Namespace) -> int:
     with until_interrupted():
         asyncio.run(stay(SERVICE, cfg, identity, arguments.connect))
     return 0
+
+
+def show_fleet(out: Path) -> int:
+    """Two robots in a generated house; the page stays until Ctrl-C."""
+    from prior_sg.deploy.running.fleet_demo import NAME, FleetDemo, summary
+    from prior_sg.deploy.viewing.live import Live
+    from prior_sg.deploy.viewing.page import Options, Page
+
+    tell_logs()
+    demo = FleetDemo(out, console.print)
+    page = Page(Live(demo.bus(), NAME, "two robots, one map"), Options())
+    console.print(f"look at it: {page.address}; Ctrl-C stops")
+    try:
+        with until_interrupted():
+            demo.walk()
+            scene = demo.scene()
+            console.print("the robots have arrived: " + (summary(scene) if scene else "nothing was merged"))
+            wait()
+        return 0
+    finally:
+        page.close()
+        demo.close()
