@@ -125,14 +125,19 @@ class Walks:
             own_from_world = moved(rng)
             poses = drifting([own_from_world @ pose for pose in poses], rng)
         told = [
-            msgspec.structs.replace(frame, robot=ROBOT, world_from_camera=pose)
-            for frame, pose in zip(chosen, poses, strict=True)
+            msgspec.structs.replace(frame, robot=ROBOT, frame_id=number, world_from_camera=pose)
+            for number, (frame, pose) in enumerate(zip(chosen, poses, strict=True))
         ]
-        by_frame = {frame.frame_id: frame.world_from_camera for frame in told}
+        as_told = {frame.frame_id: one for frame, one in zip(chosen, told, strict=True)}
         pyramids = tuple(
-            msgspec.structs.replace(one, robot=ROBOT, world_from_camera=by_frame[one.frame_id])
+            msgspec.structs.replace(
+                one,
+                robot=ROBOT,
+                frame_id=as_told[one.frame_id].frame_id,
+                world_from_camera=as_told[one.frame_id].world_from_camera,
+            )
             for one in perception.pyramids
-            if one.frame_id in by_frame
+            if one.frame_id in as_told
         )
         return told, own_from_world, pyramids
 
