@@ -12,14 +12,15 @@ class MatchConfig(msgspec.Struct, frozen=True, kw_only=True):
     tolerance_share: float = 0.02  # of that distance, beside
     height_m: float = 0.4  # by which a difference of heights may differ
     window_rad: float = 0.3  # headings are tried in windows of twice this
-    hypotheses: int = 8  # that are refined and verified
+    hypotheses: int = 8  # that are looked at
+    refined: int = 3  # of them, that are fitted to the other map and verified
     distinct_m: float = 1.0  # hypotheses closer than this in metres
     distinct_rad: float = 0.2  # and in heading are one
 
     least_places: int = 12  # in each map
     overlap_least_m2: float = 8.0  # of floor that both have seen
-    explained_least: float = 0.6  # of the places in the overlap, by places of the other map alike
-    conflicts_most: float = 0.1  # share of the places in the overlap that stand in the other's obstacles
-    landmarks_least: int = 5  # objects that agree
+    walls_least: int = 150  # points of walls that both have
+    fitting_least: float = 0.55  # share of the walls that both can tell of and both have
+    landmarks_least: int = 3  # objects that agree
     evidence_least: float = 8.0  # log-likelihood ratio of all that was found, against chance
-    rival_most: float = 0.7  # of the best one's evidence that a second hypothesis may have
+    rival_most: float = 0.6  # of the best one's evidence that a second hypothesis may have

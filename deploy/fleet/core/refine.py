@@ -12,11 +12,11 @@ from prior_sg.deploy.fleet.core.shape import Shape
 from prior_sg.services.geometry import transform
 
 Surface = tuple[np.ndarray, np.ndarray]  # points (n, 3), directions (n, 3) out of it
-ROUNDS = 12
+ROUNDS = 10
 REACH_M = (0.6, 0.3)  # in the first rounds, in the last
 FACING = 0.8  # least cosine between two directions that are of one wall
 LEAST_POINTS = 30
-MOST_POINTS = 1500
+MOST_POINTS = 800
 STILL_M, STILL_RAD = 1e-3, 1e-4
 
 

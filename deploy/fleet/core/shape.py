@@ -1,8 +1,7 @@
 """A map's free space as its places tell it: balls that touch obstacles (pure).
 
-A place's radius is its distance to the nearest obstacle. So nothing stands inside a ball, and something stands on its
-surface; and since distance to obstacles changes no faster than one moves, two places of one world p, q with radii r, s
-have |r - s| <= |p - q|. Where places of two maps break that, one's ball covers what the other's ball touches.
+A place's radius is its distance to the nearest obstacle: nothing stands inside a ball, and something stands on its
+surface. Where the balls of a map end sideways there is a wall, or furniture, or nothing has been seen yet.
 """
 
 from dataclasses import dataclass
@@ -15,6 +14,7 @@ from prior_sg.schemas.scene import Scene
 
 NEIGHBOURS = 24  # balls looked at around a point
 SURFACE_POINTS = 42  # on each ball
+UPRIGHT = 0.35  # sine of the angle between a wall's direction and the level
 INSIDE_M = 0.06  # a surface point that deep in another ball is none of the union's
 
 
@@ -54,6 +54,18 @@ class Shape:
     def surface_tree(self) -> cKDTree:
         """Of the surface's points."""
         return cKDTree(self.surface[0])
+
+    @cached_property
+    def walls(self) -> tuple[np.ndarray, np.ndarray]:
+        """The upright parts of the surface: floors and ceilings lie together in any two maps."""
+        points_m, normals = self.surface
+        upright = np.abs(normals[:, 2]) < UPRIGHT
+        return points_m[upright], normals[upright]
+
+    @cached_property
+    def wall_tree(self) -> cKDTree:
+        """Of the walls' points."""
+        return cKDTree(self.walls[0])
 
 
 def shape_of(scene: Scene) -> Shape:

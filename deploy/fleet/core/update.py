@@ -30,7 +30,7 @@ from prior_sg.services.losses import Losses
 from prior_sg.services.scene_store.core import graph as scenes
 
 GROWN = 1.1  # times as many places as when it was looked at last: a map is looked at again
-DOUBT = 1.5  # times the conflicts that suffice for a refusal: a relation that has more is given up
+DOUBT = 0.8  # of what is asked for when maps are first related: a relation that has less is given up
 
 
 class Config(msgspec.Struct, frozen=True, kw_only=True):
@@ -226,7 +226,9 @@ def _correct(state: State, one: Member, members: list[Member], cfg: Config) -> N
     other = map_of(others)
     pose = refined(one.relation.fleet_from_own, one.map().shape, other.shape)
     evidence = tested(pose, one.map(), other).evidence
-    lenient = msgspec.structs.replace(cfg.match, conflicts_most=DOUBT * cfg.match.conflicts_most, landmarks_least=0)
+    lenient = msgspec.structs.replace(
+        cfg.match, fitting_least=DOUBT * cfg.match.fitting_least, landmarks_least=0, evidence_least=0.0
+    )
     if not fault_of(evidence, lenient):
         gap_m, gap_rad = apart(pose, one.relation.fleet_from_own, one.map().shape.centers_m.mean(axis=0))
         moves = gap_m > cfg.min_change_m or gap_rad > cfg.min_change_m

@@ -7,56 +7,55 @@ import numpy as np
 from prior_sg.deploy.fleet.core.shape import Shape
 from prior_sg.schemas.objects import SceneObject
 from prior_sg.schemas.scene import Scene
-from prior_sg.services.geometry import transform
+from prior_sg.services.geometry import inverse, transform
 
 SEEN_M = -0.1  # a place whose centre is at most that far outside the other's free space lies in the overlap
-FIT_M = 0.25  # difference of radii of a place and of the other's balls at its centre that is none
-CLASH_M = 0.3  # by which a ball covers what another touches, beyond noise
+WALL_M, FACING = 0.2, 0.7  # walls are one within that distance, when the cosine between their directions is above
+THROUGH_M = 0.25  # a wall that deep in the other's free space is none there
 NEAR_OBJECT_M = 0.7  # between one object in two maps
 CLEAR_M = 0.3  # an object that deep in the other's free space is not there
 CELL_M = 0.25  # in which the overlap's floor is counted
 LEAST_SHARE = 1e-3
+WALL_WORTH, THROUGH_WORTH = 0.1, 0.12  # of a point of a wall that both have, and that only one has
+ROOM_M2 = 20.0  # labels of more floor than that count as of that much: neighbours say the same
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """Of one motion. Shares are of the places in the overlap, of both maps."""
+    """Of one motion, from both maps."""
 
-    overlap_m2: float  # floor under the places that lie in the other's free space
-    places: int  # of those
-    explained: float  # share that fits the other's balls
-    conflicts: float  # share that cannot be of one world with the other's balls
-    labels: float  # mean log-likelihood ratio of their labels' agreement, against chance
-    objects_same: int  # objects of both maps that lie together and have names alike
+    overlap_m2: float  # floor under the places of one that lie in the other's free space
+    walls_same: int  # points of walls that both have
+    walls_through: int  # points of walls that stand in the other's free space
+    labels: float  # mean log-likelihood ratio of the labels' agreement in the overlap, against chance
+    objects_same: int  # objects of both maps that lie together and have one name
     objects_other: int  # that lie together and have others
     objects_gone: int  # that stand in the other's free space
     names: float  # log-likelihood ratio of the names of objects that lie together
 
     @property
+    def fitting(self) -> float:
+        """Share of the walls that both maps can tell of and both have."""
+        return self.walls_same / max(self.walls_same + self.walls_through, 1)
+
+    @property
     def total(self) -> float:
-        """Log-likelihood ratio of all of it, roughly; for comparing hypotheses of one pair of maps."""
-        room = min(self.overlap_m2, 40.0)
-        geometry = room * (self.explained - 0.5 - 2.0 * self.conflicts)
-        return geometry + self.names + min(self.overlap_m2, 20.0) * self.labels - 0.5 * self.objects_gone
+        """Log-likelihood ratio of all of it, roughly; for comparing motions between two maps."""
+        walls = WALL_WORTH * self.walls_same - THROUGH_WORTH * self.walls_through
+        return walls + self.names + min(self.overlap_m2, ROOM_M2) * self.labels - 0.5 * self.objects_gone
 
 
 def evidence_of(b_from_a: np.ndarray, a: tuple[Scene, Shape], b: tuple[Scene, Shape]) -> Evidence:
     """The evidence for one motion."""
     (scene_a, shape_a), (scene_b, shape_b) = a, b
     a_in_b = Shape(transform(b_from_a, shape_a.centers_m), shape_a.radii_m)
-    in_b, in_a = shape_b.depth_m(a_in_b.centers_m), a_in_b.depth_m(shape_b.centers_m)
-    over_a, over_b = in_b > SEEN_M, in_a > SEEN_M
-    count = int(over_a.sum() + over_b.sum())
-    if not count:
-        return Evidence(0.0, 0, 0.0, 1.0, 0.0, 0, 0, 0, 0.0)
-    fit = np.concatenate((shape_a.radii_m[over_a] - in_b[over_a], shape_b.radii_m[over_b] - in_a[over_b]))
-    clash = np.concatenate((_clashes(a_in_b, shape_b)[over_a], _clashes(shape_b, a_in_b)[over_b]))
+    over_a = shape_b.depth_m(a_in_b.centers_m) > SEEN_M
+    walls = [walls_of(b_from_a, shape_a, shape_b), walls_of(inverse(b_from_a), shape_b, shape_a)]
     same, other, gone, names = _objects(b_from_a, scene_a.objects, scene_b.objects, a_in_b, shape_b)
     return Evidence(
         overlap_m2=_floor_m2(a_in_b.centers_m[over_a], a_in_b.radii_m[over_a], shape_b),
-        places=count,
-        explained=float((np.abs(fit) < FIT_M).mean()),
-        conflicts=float(clash.mean()),
+        walls_same=walls[0][0] + walls[1][0],
+        walls_through=walls[0][1] + walls[1][1],
         labels=_labels(a_in_b.centers_m[over_a], np.flatnonzero(over_a), scene_a, scene_b, shape_b),
         objects_same=same,
         objects_other=other,
@@ -65,11 +64,20 @@ def evidence_of(b_from_a: np.ndarray, a: tuple[Scene, Shape], b: tuple[Scene, Sh
     )
 
 
-def _clashes(one: Shape, other: Shape) -> np.ndarray:
-    """Whether each place (n,) of one cannot stand in one world with some place of the other."""
-    distances_m, rows = other.near(one.centers_m)
-    gaps_m = np.abs(one.radii_m[:, None] - other.radii_m[rows]) - distances_m
-    return np.asarray((gaps_m > CLASH_M).any(axis=1))
+def walls_of(b_from_a: np.ndarray, a: Shape, b: Shape, step: int = 1) -> tuple[int, int]:
+    """How many points of a's walls, every `step`-th of them, are walls in b, too, and how many stand in b's free
+    space."""
+    points_a, out_a = (part[::step] for part in a.walls)
+    _, out_b = b.walls
+    if not (len(points_a) and len(out_b)):
+        return 0, 0
+    points_b = transform(b_from_a, points_a)
+    distances_m, rows = b.wall_tree.query(points_b, distance_upper_bound=WALL_M)
+    near = np.flatnonzero(np.isfinite(distances_m))
+    facing = ((out_a[near] @ b_from_a[:3, :3].T) * out_b[rows[near]]).sum(axis=1) > FACING
+    far = np.flatnonzero(~np.isfinite(distances_m))
+    through = int((b.depth_m(points_b[far]) > THROUGH_M).sum()) if len(far) else 0
+    return int(facing.sum()), through
 
 
 def _floor_m2(centers_m: np.ndarray, radii_m: np.ndarray, other: Shape) -> float:

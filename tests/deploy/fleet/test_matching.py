@@ -68,12 +68,12 @@ def test_fitting_brings_a_wrong_start_nearer():
     assert after[0] < 0.3 * before[0] and after[1] < 0.3 * before[1]
 
 
-def test_what_covers_anothers_obstacles_is_a_conflict():
+def test_walls_in_anothers_free_space_speak_against_it():
     one, other = map_of(houses.scene()), map_of(houses.scene("r2"))
     right = tested(np.eye(4), one, other).evidence
     wrong = tested(level(0.0, np.array((1.5, 0.7, 0.0))), one, other).evidence
-    assert right.conflicts == 0.0 and right.explained > 0.9 and right.objects_same == len(houses.THINGS)
-    assert wrong.conflicts > 0.1 and wrong.explained < 0.6 and wrong.total < 0.3 * right.total
+    assert right.fitting == 1.0 and right.objects_same == len(houses.THINGS) and not right.objects_gone
+    assert wrong.fitting < 0.6 and wrong.objects_same <= 2 and wrong.total < 0.2 * right.total
 
 
 def test_another_house_is_refused():
