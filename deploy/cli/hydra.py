@@ -2,11 +2,10 @@
 
 import argparse
 import asyncio
-import logging
 import time
 import uuid
 
-from prior_sg.deploy.cli.shared import Commands, add_bus, console, until_interrupted
+from prior_sg.deploy.cli.shared import Commands, add_bus, console, tell_logs, until_interrupted
 from prior_sg.deploy.errors import UserError
 
 
@@ -54,25 +53,10 @@ def cmd_hydra(arguments: argparse.Namespace) -> int:
         )
     except ValueError as error:
         raise UserError(str(error)) from error
-    _tell_logs()
+    tell_logs()
     back = f"; names of rooms to {cfg.labels_to}" if cfg.labels_to else ""
     console.print(f"scene graphs of Hydra from {cfg.graph_from}{back}; Ctrl-C stops")
     identity = Identity(arguments.robot, f"{SERVICE.name}-{uuid.uuid4().hex[:8]}", time.time_ns())
     with until_interrupted():
         asyncio.run(stay(SERVICE, cfg, identity, arguments.connect))
     return 0
-
-
-class _Sentences(logging.Handler):
-    """What the bridge has to say, on the terminal."""
-
-    def emit(self, record: logging.LogRecord) -> None:
-        """One line, with what is known of the reason."""
-        why = getattr(record, "why", "")
-        console.print(f"{record.getMessage()}{f': {why}' if why else ''}")
-
-
-def _tell_logs() -> None:
-    root = logging.getLogger()
-    root.handlers[:] = [_Sentences(logging.WARNING)]
-    root.setLevel(logging.WARNING)

@@ -31,6 +31,12 @@ def add_commands(commands: Commands) -> None:
         help="let the prior name the regions; by default the demo fixes the ground truth's names, as the paper's "
         "benchmarks do, so that labels can be scored",
     )
+    demo.add_argument(
+        "--fleet",
+        action="store_true",
+        help="instead of the sample: two robots in one generated house of several storeys, their maps merged live, on "
+        "the page",
+    )
     add_run_options(demo)
     add_log_mb(demo)
 
@@ -97,9 +103,13 @@ def encoder_settings(choice: str) -> list[str]:
 
 
 def cmd_demo(arguments: argparse.Namespace) -> int:
-    """The main job on the embedded sample."""
+    """The main job on the embedded sample, or two robots' maps merged."""
     from prior_sg.deploy.truth import truth_of
 
+    if arguments.fleet:
+        from prior_sg.deploy.cli.fleet import show_fleet
+
+        return show_fleet(arguments.out)
     arguments.source, arguments.environment = str(SAMPLE), DEMO_ENVIRONMENT
     if SAMPLE == COARSE:
         console.print("sample: the coarse one of the package; a checkout has the full one, which scores higher")

@@ -19,7 +19,7 @@ from prior_sg.deploy.cli.shared import (
 from prior_sg.deploy.errors import UserError
 from prior_sg.services.folders import user_settings
 
-ROLES = ("robot", "edge", "viewer", "operator")
+ROLES = ("robot", "edge", "fleet", "viewer", "operator")
 
 
 def add_commands(commands: Commands) -> None:
@@ -39,7 +39,7 @@ def add_commands(commands: Commands) -> None:
         "add",
         _add,
         "make a bundle of keys: robot writes what is its own, edge runs services for all and lets others join, "
-        "viewer reads, operator also gives tasks",
+        "fleet merges maps under its own name, viewer reads, operator also gives tasks",
         "add robot robot7",
     )
     add.add_argument("role", choices=ROLES)

@@ -2,6 +2,7 @@
 
 import argparse
 import contextlib
+import logging
 import math
 import re
 import time
@@ -122,6 +123,22 @@ def open_client(connect: str) -> "BusClient":
     from prior_sg.services.runtime.zenoh_bus import ZenohBus
 
     return BusClient(ZenohBus(connect, ROUTER_WAIT_S))
+
+
+class _Sentences(logging.Handler):
+    """What a service has to say, on the terminal."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """One line, with what is known of the reason."""
+        why = getattr(record, "why", "")
+        console.print(f"{record.getMessage()}{f': {why}' if why else ''}")
+
+
+def tell_logs() -> None:
+    """What a service that runs in this process warns of goes to the terminal."""
+    root = logging.getLogger()
+    root.handlers[:] = [_Sentences(logging.WARNING)]
+    root.setLevel(logging.WARNING)
 
 
 @contextlib.contextmanager

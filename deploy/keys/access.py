@@ -8,6 +8,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from prior_sg.deploy.fleet.bridge import SERVICE as MERGES
 from prior_sg.schemas.topics import (
     FLEET,
     JOURNAL,
@@ -56,12 +57,15 @@ class Grants:
 
 
 def services_of(role: Role) -> tuple[Service, ...]:
-    """A robot runs what serves one robot; an edge all but what reads the cameras; the others run none."""
+    """A robot runs what serves one robot; an edge all but what reads the cameras; a fleet what merges maps under a name
+    of its own; the others run none."""
     match role:
         case "robot":
             return tuple(service for service in SERVICES if service.scope == "robot")
         case "edge":
             return tuple(service for service in SERVICES if service.drive is None)
+        case "fleet":
+            return (MERGES,)
         case _:
             return ()
 
@@ -69,8 +73,9 @@ def services_of(role: Role) -> tuple[Service, ...]:
 def grants_of(role: Role, name: str) -> Grants:
     """What a participant of this role and name may do."""
     services = services_of(role)
-    robot = name if role == "robot" else ANYBODY
-    given = () if role == "viewer" else OPERATOR_WRITES
+    robot = name if role in ("robot", "fleet") else ANYBODY
+    heard = name if role == "robot" else ANYBODY
+    given = () if role in ("viewer", "fleet") else OPERATOR_WRITES
     written = {*given, *(OF_ANY_SERVICE if services else ()), *(t for s in services for t in s.writes)}
     jobs = [topic for topic in JOBS if topic in written]
     worked = [service.job for service in services if service.job is not None]
@@ -89,14 +94,14 @@ def grants_of(role: Role, name: str) -> Grants:
             *(worker_keys(job, "*", "**")[1] for job in worked),
         ),
         reads=(
-            *(t.pattern(robot) for t in TOPICS if t not in JOBS),
+            *(t.pattern(heard) for t in TOPICS if t not in JOBS),
             alive_key("*", "*"),
             roll_key("*", "*", "*"),
             lease_key(robot, "*", "*", "*"),
             *(worker_keys(job, "*", "**")[1] for job in jobs),
         ),
         asks=(
-            *(_asked_on(query, robot) for query in QUERIES),
+            *(_asked_on(query, heard) for query in QUERIES),
             status_key("*", "*"),
             *(yield_key(_served(service, robot), service.name, "*") for service in services),
             *(job_key(job, "*", robot) for job in jobs),
@@ -111,7 +116,7 @@ def _served(service: Service, robot: str) -> str:
 
 def _may_write(role: Role, topic: Topic) -> bool:
     """What concerns the whole fleet is not a single robot's to say."""
-    return role != "robot" or "{robot}" in topic.key
+    return role not in ("robot", "fleet") or "{robot}" in topic.key
 
 
 def _asked_on(query: Query, robot: str) -> str:

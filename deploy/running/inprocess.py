@@ -7,13 +7,14 @@ import time
 from concurrent.futures import Future
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from prior_sg.deploy.running.supervisor import ChildFailed
 from prior_sg.deploy.settings import resolved_config
 from prior_sg.services.registry import BY_NAME
 from prior_sg.services.runtime.bus import Hub, LocalBus
 from prior_sg.services.runtime.host.host import Host
-from prior_sg.services.runtime.service import Identity
+from prior_sg.services.runtime.service import Identity, Service
 
 STOP_TIMEOUT_S = 10.0
 
@@ -37,14 +38,16 @@ class InProcess:
 
     def start(self, service: str, copies: int = 1) -> None:
         """Start one service, or several workers of it."""
+        known = BY_NAME[service]
         for number in range(copies):
-            instance = f"{service}-{number + 1}"
-            host = asyncio.run_coroutine_threadsafe(self._host(service, instance), self._loop).result()
-            self._running[instance] = host, asyncio.run_coroutine_threadsafe(host.run(), self._loop)
+            self.host(known, resolved_config(known, self.config, self.settings), f"{service}-{number + 1}")
 
-    async def _host(self, name: str, instance: str) -> Host:
-        service = BY_NAME[name]
-        cfg = resolved_config(service, self.config, self.settings)
+    def host(self, service: Service, cfg: Any, instance: str) -> None:
+        """Start a service that is none of the registry's, or one with settings of its own."""
+        host = asyncio.run_coroutine_threadsafe(self._host(service, cfg, instance), self._loop).result()
+        self._running[instance] = host, asyncio.run_coroutine_threadsafe(host.run(), self._loop)
+
+    async def _host(self, service: Service, cfg: Any, instance: str) -> Host:
         robot = self.robot if service.scope == "robot" else "*"
         return Host(service, LocalBus(self.hub), cfg, Identity(robot, instance, time.time_ns()))
 

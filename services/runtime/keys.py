@@ -15,7 +15,7 @@ from prior_sg.services.folders import expanded
 from prior_sg.services.runtime.bus import BusError
 
 VARIABLE = "PSG_KEYS"
-Role = Literal["robot", "edge", "viewer", "operator"]
+Role = Literal["robot", "edge", "fleet", "viewer", "operator"]
 CA_FILE, CERTIFICATE_FILE, KEY_FILE, ABOUT_FILE = "ca.pem", "cert.pem", "key.pem", "bundle.json"
 
 

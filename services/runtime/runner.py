@@ -86,7 +86,8 @@ class Runner:
 
     def reads(self, topic: Topic, message: Message) -> bool:
         """Whether a host of this service would receive this message."""
-        return topic in self.service.reads and key_matches(topic.pattern(self.identity.robot), topic.key_of(message))
+        patterns = self.service.read_keys(topic, self.identity.robot, self.cfg)
+        return topic in self.service.reads and any(key_matches(one, topic.key_of(message)) for one in patterns)
 
     def _step(self, message: Message) -> tuple[list[Published], list[Ask]]:
         """The outputs of one whole step: no reply comes before its end."""

@@ -1,6 +1,6 @@
 """What a service is: a declaration around a pure step function."""
 
-from collections.abc import Awaitable, Callable, Iterator, Mapping
+from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Generic, Literal, TypeVar
 
@@ -86,6 +86,7 @@ class Service(Generic[State, Config]):
     `step(state, message, cfg)` takes one input and yields outputs; it may change `state` and does nothing else.
     Inputs are messages of `reads`, of `job`, replies to its questions and errands, and `Tick` every `tick_s` seconds.
     `answers` maps a query to `f(state, request, cfg) -> reply`, which must not change the state.
+    `reads_of`, where it is given, names the robots whose messages of `reads` come in, instead of its own.
     `drive`, for sources only, is a coroutine that feeds inputs from outside (see host/port.py).
     """
 
@@ -105,6 +106,7 @@ class Service(Generic[State, Config]):
     prepare: Callable[[State, list[Message], Config], None] | None = None  # told of jobs that wait; must not block
     job_limit: Callable[[Config], int] = lambda cfg: 0  # jobs written that may wait before the oldest is skipped
     tick_s: float | None = None
+    reads_of: Callable[[Config], Sequence[str]] | None = None
     drive: Callable[[Any, Config], Awaitable[None]] | None = None
     key_fields: Callable[[Config], dict[str, str]] = lambda cfg: {}  # config values that appear in keys of `answers`
     losses: Callable[[State], list[Loss]] = lambda state: []  # what could not be used; also read during a step
@@ -124,6 +126,10 @@ class Service(Generic[State, Config]):
         """Raise UndeclaredError unless the service declares this question or errand."""
         if ask.query not in (*self.asks, *self.errands):
             raise UndeclaredError(f"{self.name} asked {ask.query.name}, which it does not declare")
+
+    def read_keys(self, topic: Topic, robot: str, cfg: Config) -> list[str]:
+        """The key expressions on which a process of this service reads a topic."""
+        return [topic.pattern(one) for one in ((robot,) if self.reads_of is None else self.reads_of(cfg))]
 
     def answer_key(self, query: Query, robot: str, cfg: Config) -> str:
         """The key expression on which a process of this service answers a question."""

@@ -13,7 +13,7 @@ import numpy as np
 from prior_sg.deploy.hydra.core.graph import GraphLost, HydraGraph, Origin, in_our_world
 from prior_sg.deploy.hydra.core.poses import Poses
 from prior_sg.deploy.hydra.core.rooms import room_names
-from prior_sg.deploy.hydra.core.told import ToldGraph, ToldObjects
+from prior_sg.deploy.told import ToldGraph, ToldObjects
 from prior_sg.schemas.codec import Message
 from prior_sg.schemas.frames import Keyframe, PoseUpdate
 from prior_sg.schemas.objects import ObjectDelta

@@ -220,7 +220,8 @@ class Host:
                 ended = self._job_ended(topic)
                 self._pools[topic] = JobPool(self.bus, topic, robot, time.monotonic, ended, limit=limit)
         for topic in service.reads:
-            self.bus.subscribe(topic, topic.pattern(robot), self.inbox.offer, self._missed)
+            for pattern in service.read_keys(topic, robot, self.cfg):
+                self.bus.subscribe(topic, pattern, self.inbox.offer, self._missed)
         if service.drive is not None:
             readers = Readers(self.inbox, self._door, self._progress, self._loop, writer=self._outbox.writer)
             readers.follow(self.bus, robot)

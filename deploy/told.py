@@ -1,14 +1,14 @@
-"""What readers know of Hydra's graph, and the delta that brings them up to date (pure).
+"""What readers know of a graph that comes as a whole each time, and the delta that brings them up to date (pure).
 
 A value is told again when it differs by more than a tolerance from what was told, so that slow drift adds up.
 """
 
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import msgspec
 import numpy as np
 
-from prior_sg.deploy.hydra.core.graph import HydraGraph
 from prior_sg.schemas.objects import SceneObject
 from prior_sg.services.place_graph.core.columns import (
     EdgeColumns,
@@ -21,6 +21,62 @@ from prior_sg.services.place_graph.core.columns import (
 )
 
 Key = tuple[int, ...]
+
+
+class Whole(Protocol):
+    """A place graph as columns: `Scene` is one, and so is what Hydra tells."""
+
+    @property
+    def place_ids(self) -> np.ndarray:
+        """(place,)."""
+
+    @property
+    def positions_m(self) -> np.ndarray:
+        """(place, 3)."""
+
+    @property
+    def radii_m(self) -> np.ndarray:
+        """(place,)."""
+
+    @property
+    def basis_points(self) -> np.ndarray:
+        """(place,)."""
+
+    @property
+    def edges(self) -> np.ndarray:
+        """(edge, 2) place ids, smaller first."""
+
+    @property
+    def clearances_m(self) -> np.ndarray:
+        """(edge,)."""
+
+    @property
+    def frontier_ids(self) -> np.ndarray:
+        """(frontier,)."""
+
+    @property
+    def frontier_directions(self) -> np.ndarray:
+        """(frontier, 3)."""
+
+    @property
+    def frontier_areas_m2(self) -> np.ndarray:
+        """(frontier,)."""
+
+    @property
+    def surface_ids(self) -> np.ndarray:
+        """(surface,)."""
+
+    @property
+    def ellipses(self) -> np.ndarray:
+        """(surface, 3)."""
+
+    @property
+    def hull_counts(self) -> np.ndarray:
+        """(surface,)."""
+
+    @property
+    def hulls_m(self) -> np.ndarray:
+        """(hull, 2)."""
 
 
 class Rows:
@@ -56,16 +112,14 @@ class Rows:
 
 @dataclass
 class ToldGraph:
-    """Places, edges, openings and ground of Hydra as readers know them."""
+    """Places, edges, openings and ground as readers know them."""
 
     places: Rows = field(default_factory=Rows)  # id: position, radius, basis points
     edges: Rows = field(default_factory=Rows)  # ids: clearance
     openings: Rows = field(default_factory=Rows)  # id: direction, area
     ground: dict[int, bytes] = field(default_factory=dict)  # id: ellipse and hull, float32
 
-    def follow(
-        self, graph: HydraGraph, min_change_m: float
-    ) -> tuple[GraphColumns, OpeningColumns, GroundColumns] | None:
+    def follow(self, graph: Whole, min_change_m: float) -> tuple[GraphColumns, OpeningColumns, GroundColumns] | None:
         """What readers must hear of a graph; None when it is what they know."""
         values = np.column_stack((graph.positions_m, graph.radii_m, graph.basis_points))
         rows, gone = self.places.follow(graph.place_ids[:, None], values, min_change_m)
@@ -83,7 +137,7 @@ class ToldGraph:
         )
         return columns, opened, ground
 
-    def _openings(self, graph: HydraGraph, min_change_m: float, lost: set[int]) -> OpeningColumns:
+    def _openings(self, graph: Whole, min_change_m: float, lost: set[int]) -> OpeningColumns:
         """Those that are new or differ; of those that have closed, the area is 0."""
         values = np.column_stack((graph.frontier_directions, graph.frontier_areas_m2))
         rows, gone = self.openings.follow(graph.frontier_ids[:, None], values, min_change_m)
@@ -91,7 +145,7 @@ class ToldGraph:
         shut = np.column_stack((np.tile((1.0, 0.0, 0.0), (len(closed), 1)), np.zeros(len(closed))))
         return _openings(np.append(graph.frontier_ids[rows], closed).astype(np.int64), np.vstack((values[rows], shut)))
 
-    def _ground(self, graph: HydraGraph) -> GroundColumns:
+    def _ground(self, graph: Whole) -> GroundColumns:
         now = dict(zip(graph.surface_ids.tolist(), _shapes(graph), strict=True))
         news = {place: shape for place, shape in now.items() if self.ground.get(place) != shape}
         self.ground = now
@@ -108,7 +162,7 @@ class ToldGraph:
 
 @dataclass
 class ToldObjects:
-    """Hydra's objects as readers know them, by id."""
+    """Objects as readers know them, by id."""
 
     items: dict[int, SceneObject] = field(default_factory=dict)
 
@@ -135,7 +189,7 @@ def _differs(known: SceneObject | None, now: SceneObject, min_change_m: float) -
     return there != now or bool((moved > min_change_m).any())
 
 
-def _shapes(graph: HydraGraph) -> list[bytes]:
+def _shapes(graph: Whole) -> list[bytes]:
     hulls = np.split(graph.hulls_m, np.cumsum(graph.hull_counts)[:-1]) if len(graph.hull_counts) else []
     return [
         np.concatenate((ellipse, hull.ravel())).astype(np.float32).tobytes()

@@ -1,0 +1,148 @@
+"""`prior-sg bench merge`: do two robots' maps of one home find together, and never those of two homes?
+
+Each home is walked in two parts that share some of the way, each in a frame of its own (see `partial_walks`). The
+matcher's answer is right when it is within RIGHT_M at the middle of the first map and RIGHT_RAD in heading. Every first
+part is then matched with second parts of other homes: any answer but a refusal is a false accept. Where maps have found
+together, the merged scene is judged as one walk through the whole home is.
+"""
+
+import itertools
+import statistics
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from prior_sg.deploy.evaluation.metrics import evaluate
+from prior_sg.deploy.evaluation.partial_walks import Part, PartialMap, Walks
+from prior_sg.deploy.fleet.core.config import MatchConfig
+from prior_sg.deploy.fleet.core.frames import apart
+from prior_sg.deploy.fleet.core.ids import Name
+from prior_sg.deploy.fleet.core.matching import Map, map_of, match, tested
+from prior_sg.deploy.fleet.core.merging import Memory, Source, merged
+from prior_sg.deploy.fleet.core.verify import Evidence
+from prior_sg.services.geometry import inverse
+
+SCORED = range(60, 100)
+RIGHT_M, RIGHT_RAD = 0.5, np.radians(5)
+SHARED = (0.05, 0.7)  # share of the walk that both parts hold, drawn anew for each home
+DIFFERENT = 1000  # pairs of different homes
+OVERLAPS_M2 = (0.0, 10.0, 20.0, 40.0, np.inf)
+FOLDER = Path("out/bench/merge")
+CFG = MatchConfig()
+
+
+class Two(NamedTuple):
+    """Both parts of one home."""
+
+    seed: int
+    maps: tuple[Map, Map]
+    parts: tuple[PartialMap, PartialMap]
+
+    @property
+    def second_from_first(self) -> np.ndarray:
+        """The truth (4, 4)."""
+        return np.asarray(self.parts[1].own_from_world @ inverse(self.parts[0].own_from_world))
+
+
+class Outcome(NamedTuple):
+    """Of one home."""
+
+    two: Two
+    true: Evidence  # of the true transform
+    found: np.ndarray | None  # second_from_first (4, 4), None = refused
+    why: str
+    gap_m: float
+    gap_rad: float
+
+    @property
+    def right(self) -> bool:
+        """Whether an answer was given, and a right one."""
+        return self.found is not None and self.gap_m < RIGHT_M and self.gap_rad < RIGHT_RAD
+
+
+def merge_bench(seeds: Sequence[int] = SCORED, folder: Path = FOLDER) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Success, errors, false accepts, and what merged scenes are worth."""
+    walks = Walks(folder)
+    homes = [two_of(walks, seed) for seed in seeds]
+    outcomes = [outcome_of(two) for two in homes]
+    metrics = figures(outcomes)
+    tried, accepted = false_accepts(homes, DIFFERENT)
+    metrics |= {"different_pairs": tried, "false_accepts": len(accepted)}
+    metrics |= worth(walks, outcomes)
+    return metrics, {"homes": len(homes), "seeds": f"{min(seeds)}-{max(seeds)}", "right_m": RIGHT_M}
+
+
+def parts_of(seed: int) -> tuple[Part, Part]:
+    """Which parts of a home's walk the two robots make."""
+    shared = np.random.default_rng([seed, 77]).uniform(*SHARED)
+    return Part(0.0, 0.5 + shared / 2, 1), Part(0.5 - shared / 2, 1.0, 2)
+
+
+def two_of(walks: Walks, seed: int) -> Two:
+    """Both parts of a home."""
+    first, second = (walks.part(seed, part) for part in parts_of(seed))
+    return Two(seed, (map_of(first.scene), map_of(second.scene)), (first, second))
+
+
+def outcome_of(two: Two, cfg: MatchConfig = CFG) -> Outcome:
+    """What the matcher says of two parts of one home."""
+    first, second = two.maps
+    truth = two.second_from_first
+    answer = match(first, second, cfg)
+    gap_m, gap_rad = np.inf, np.inf
+    if answer.b_from_a is not None:
+        gap_m, gap_rad = apart(answer.b_from_a, truth, first.shape.centers_m.mean(axis=0))
+    return Outcome(two, tested(truth, first, second).evidence, answer.b_from_a, answer.why, gap_m, gap_rad)
+
+
+def figures(outcomes: list[Outcome]) -> dict[str, float]:
+    """Of all homes, and by how much floor the parts share."""
+    right = [one for one in outcomes if one.right]
+    wrong = [one for one in outcomes if one.found is not None and not one.right]
+    found: dict[str, float] = {"success": len(right) / len(outcomes), "wrong_transforms": len(wrong)}
+    if right:
+        found |= {
+            "error_m_p50": statistics.median(one.gap_m for one in right),
+            "error_m_max": max(one.gap_m for one in right),
+            "error_deg_p50": float(np.degrees(statistics.median(one.gap_rad for one in right))),
+        }
+    for low, high in itertools.pairwise(OVERLAPS_M2):
+        some = [one for one in outcomes if low <= one.true.overlap_m2 < high]
+        found[f"homes_overlap_{low:g}_{high:g}_m2"] = len(some)
+        found[f"success_overlap_{low:g}_{high:g}_m2"] = sum(one.right for one in some) / max(len(some), 1)
+    return found
+
+
+def false_accepts(homes: Sequence[Two], most: int, cfg: MatchConfig = CFG) -> tuple[int, list[tuple[int, int]]]:
+    """How many pairs of different homes were tried, and those that were taken for one."""
+    pairs = [(one, other) for one in range(len(homes)) for other in range(len(homes)) if one != other]
+    order = np.random.default_rng(0).permutation(len(pairs))[:most]
+    accepted = []
+    for one, other in (pairs[at] for at in order.tolist()):
+        if match(homes[one].maps[0], homes[other].maps[1], cfg).b_from_a is not None:
+            accepted.append((homes[one].seed, homes[other].seed))
+    return len(order), accepted
+
+
+def worth(walks: Walks, outcomes: list[Outcome]) -> dict[str, float]:
+    """F1_S of merged scenes against that of one full walk, and of the better of the two parts."""
+    scores: dict[str, list[float]] = {"f1_s_merged": [], "f1_s_full": [], "f1_s_better_part": []}
+    for one in outcomes:
+        if not one.right or one.found is None:
+            continue
+        whole, truth = walks.part(one.two.seed, Part(0.0, 1.0, 0)), walks.truth(one.two.seed)
+        first, second = one.two.parts
+        world_from_first = inverse(first.own_from_world)
+        poses = world_from_first, world_from_first @ inverse(one.found)
+        sources = [
+            Source(Name(f"robot{k}", 0), part.scene, pose)
+            for k, (part, pose) in enumerate(zip((first, second), poses, strict=True))
+        ]
+        both = merged("home", sources, Memory()).scene
+        alone = [merged("home", [source], Memory()).scene for source in sources]
+        scores["f1_s_merged"].append(evaluate(both, whole.voxels, truth)["f1_s"])
+        scores["f1_s_full"].append(evaluate(whole.scene, whole.voxels, truth)["f1_s"])
+        scores["f1_s_better_part"].append(max(evaluate(scene, whole.voxels, truth)["f1_s"] for scene in alone))
+    return {name: statistics.mean(values) if values else float("nan") for name, values in scores.items()}

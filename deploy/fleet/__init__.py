@@ -1,0 +1,1 @@
+"""Several robots' maps as one, under a name of its own."""

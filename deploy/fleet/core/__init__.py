@@ -1,0 +1,1 @@
+"""Where maps fit together, and what they make when they do; pure."""

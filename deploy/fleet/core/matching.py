@@ -1,0 +1,100 @@
+"""Do two maps show the same place, and how do they lie to each other? Refused when unsure (pure)."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from prior_sg.deploy.fleet.core.config import MatchConfig
+from prior_sg.deploy.fleet.core.consistency import Hypothesis, hypotheses
+from prior_sg.deploy.fleet.core.frames import apart
+from prior_sg.deploy.fleet.core.landmarks import landmarks_of, names_in
+from prior_sg.deploy.fleet.core.refine import refined
+from prior_sg.deploy.fleet.core.shape import Shape, shape_of
+from prior_sg.deploy.fleet.core.verify import THROUGH_WORTH, WALL_WORTH, Evidence, evidence_of, walls_of
+from prior_sg.schemas.scene import Scene
+
+PROMISE_STEP = 4  # one of so many points of a wall is looked at before a motion is fitted
+
+
+@dataclass(frozen=True)
+class Found:
+    """One way in which two maps might lie together, after fitting."""
+
+    b_from_a: np.ndarray  # (4, 4)
+    evidence: Evidence
+
+
+@dataclass(frozen=True)
+class Match:
+    """The answer. Without `b_from_a` the maps are not known to show the same place, for the reason `why`."""
+
+    b_from_a: np.ndarray | None
+    why: str
+    found: list[Found]  # all that was looked at, the best first
+
+
+@dataclass(frozen=True)
+class Map:
+    """A scene, with what is computed of it once."""
+
+    scene: Scene
+    shape: Shape
+
+
+def map_of(scene: Scene) -> Map:
+    """A scene as it is matched."""
+    return Map(scene, shape_of(scene))
+
+
+def match(a: Map, b: Map, cfg: MatchConfig) -> Match:
+    """How b lies to a."""
+    for scene in (a.scene, b.scene):
+        if len(scene.place_ids) < cfg.least_places:
+            return Match(None, f"{scene.robot} has only {len(scene.place_ids)} places yet", [])
+    names = names_in(a.scene, b.scene)
+    tried = hypotheses(landmarks_of(a.scene, names), landmarks_of(b.scene, names), cfg)
+    tried.sort(key=lambda one: -_promise(one, a.shape, b.shape))
+    found = [tested(refined(one.b_from_a, a.shape, b.shape), a, b) for one in tried[: cfg.refined]]
+    found.sort(key=lambda one: -one.evidence.total)
+    if not found:
+        return Match(None, "no landmarks of both agree", [])
+    best = found[0]
+    why = fault_of(best.evidence, cfg) or _rivalled(best, found[1:], a, cfg)
+    return Match(None if why else best.b_from_a, why, found)
+
+
+def _promise(one: Hypothesis, a: Shape, b: Shape) -> float:
+    """What a motion may be worth, by its landmarks and a part of the walls."""
+    same, through = walls_of(one.b_from_a, a, b, PROMISE_STEP)
+    return one.weight + PROMISE_STEP * (WALL_WORTH * same - THROUGH_WORTH * through)
+
+
+def tested(b_from_a: np.ndarray, a: Map, b: Map) -> Found:
+    """A motion with what speaks for it."""
+    return Found(b_from_a, evidence_of(b_from_a, (a.scene, a.shape), (b.scene, b.shape)))
+
+
+def fault_of(evidence: Evidence, cfg: MatchConfig) -> str:
+    """Why this evidence does not suffice, as a sentence; empty when it does."""
+    if evidence.overlap_m2 < cfg.overlap_least_m2:
+        return f"they share only {evidence.overlap_m2:.0f} m2 of floor, {cfg.overlap_least_m2:g} are needed"
+    if evidence.fitting < cfg.fitting_least:
+        return f"{1 - evidence.fitting:.0%} of the walls would stand in what the other map knows as free"
+    if evidence.walls_same < cfg.walls_least:
+        return f"only {evidence.walls_same} points of walls are the same, {cfg.walls_least} are needed"
+    if evidence.objects_same < cfg.landmarks_least:
+        return f"only {evidence.objects_same} objects agree, {cfg.landmarks_least} are needed"
+    if evidence.total < cfg.evidence_least:
+        return f"the evidence, {evidence.total:.1f}, is below {cfg.evidence_least:g}"
+    return ""
+
+
+def _rivalled(best: Found, others: list[Found], a: Map, cfg: MatchConfig) -> str:
+    """Another way to lie together that is nearly as good."""
+    middle_m = a.shape.centers_m.mean(axis=0)
+    for other in others:
+        gap_m, gap_rad = apart(best.b_from_a, other.b_from_a, middle_m)
+        differs = gap_m > cfg.distinct_m or gap_rad > cfg.distinct_rad
+        if differs and other.evidence.total > cfg.rival_most * best.evidence.total:
+            return f"another way to lie together, {gap_m:.0f} m away, is nearly as likely"
+    return ""

@@ -1,0 +1,153 @@
+"""The maps of a fleet's robots, as followed, and how each lies in the fleet's frame (pure)."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from prior_sg.deploy.fleet.core.ids import Name
+from prior_sg.deploy.fleet.core.matching import Map, map_of
+from prior_sg.schemas.codec import Message
+from prior_sg.schemas.objects import ObjectDelta
+from prior_sg.schemas.places import PlaceDelta
+from prior_sg.schemas.regions import RegionDelta
+from prior_sg.schemas.scene import Scene
+from prior_sg.services.deltas import Follower
+from prior_sg.services.scene_store.core import graph as scenes
+
+Delta = PlaceDelta | RegionDelta | ObjectDelta
+KEPT_SHARE, KEPT_M = 0.5, 1.0  # of the places that a new writer still knows under the same ids and nearby: it goes on
+
+
+@dataclass
+class Relation:
+    """How a map lies in the fleet's frame."""
+
+    fleet_from_own: np.ndarray  # (4, 4)
+    given: bool  # by whoever started the bridge, not found
+    places: int = 0  # of the map when this was last looked at
+
+
+@dataclass
+class Member:
+    """One robot's map of one session. `graph` is as the robot tells it; of a former session, as it told it last."""
+
+    name: Name
+    graph: scenes.Graph
+    former: bool = False
+    relation: Relation | None = None
+    why: str = "it has not been looked at yet"  # there is no relation
+    tried_places: int = 0  # of the map when a relation was last sought
+    changed: bool = True  # since the merged scene was last made
+    _map: Map | None = None
+
+    def map(self) -> Map:
+        """The map as it stands."""
+        if self._map is None:
+            self._map = map_of(scenes.scene(self.graph))
+        return self._map
+
+    def frame_ids(self) -> list[int]:
+        """Of the map's trajectory."""
+        graph = self.graph
+        return [frame for frame, seen in sorted(graph.sightings.items()) if seen.epoch == graph.place_cursor.epoch]
+
+    def touch(self) -> None:
+        """Something of the map has changed."""
+        self.changed, self._map = True, None
+
+
+@dataclass
+class Followed:
+    """The streams of one robot."""
+
+    member: Member
+    places: Follower[PlaceDelta] = field(default_factory=Follower)
+    regions: Follower[RegionDelta] = field(default_factory=Follower)
+    objects: Follower[ObjectDelta] = field(default_factory=Follower)
+
+    def take(self, delta: Delta) -> Member | None:
+        """Apply what is due of a delta. Returns the member of the session before, where a new one has begun.
+
+        Raises InputRefused.
+        """
+        graph = self.member.graph
+        match delta:
+            case PlaceDelta():
+                ended = None
+                for ready in self.places.take(delta):
+                    ended = self._begun(ready) or ended
+                    scenes.apply_places(self.member.graph, ready)
+                    self.member.touch()
+                scenes.note_cameras(self.member.graph, delta)
+                return ended
+            case RegionDelta():
+                for ready_regions in self.regions.take(delta):
+                    scenes.apply_regions(graph, ready_regions)
+                    self.member.touch()
+            case ObjectDelta():
+                for ready_objects in self.objects.take(delta):
+                    scenes.apply_objects(graph, ready_objects)
+                    self.member.touch()
+        return None
+
+    def lacking(self, delta: Message) -> bool:
+        """Whether the stream of this delta has a gap."""
+        of = {PlaceDelta: self.places, RegionDelta: self.regions, ObjectDelta: self.objects}
+        return of[type(delta)].needs_snapshot  # type: ignore[index]
+
+    def _begun(self, delta: PlaceDelta) -> Member | None:
+        """A new writer that knows nothing of the former places begins a session: the former map stays as it is."""
+        former, graph = self.member, self.member.graph
+        anew = graph.place_cursor.epoch not in (-1, delta.epoch) and len(graph.places) > 0
+        if not anew or _goes_on(graph, delta):
+            return None
+        name = Name(former.name.robot, former.name.session + 1)
+        fresh = scenes.Graph(former.name.robot, place_cursor=graph.place_cursor)
+        self.member = Member(name, fresh)
+        former.former = True
+        return former
+
+
+def _goes_on(graph: scenes.Graph, delta: PlaceDelta) -> bool:
+    """Whether the places of a new writer are the former ones: most ids are where they were."""
+    known = [
+        np.linalg.norm(np.subtract(graph.places[place].position_m, position_m)) < KEPT_M
+        for place, position_m in zip(delta.place_ids.tolist(), delta.positions_m, strict=True)
+        if place in graph.places
+    ]
+    return sum(known) >= KEPT_SHARE * len(graph.places)
+
+
+def member_of_scene(scene: Scene, session: int = 0) -> Member:
+    """The map of a stored scene, which nobody tells any more."""
+    graph = scenes.Graph(scene.robot)
+    columns = zip(
+        scene.place_ids.tolist(),
+        scene.positions_m.tolist(),
+        scene.radii_m.tolist(),
+        scene.basis_points.tolist(),
+        strict=True,
+    )
+    for place, position_m, radius_m, basis in columns:
+        graph.places[place] = scenes.Place(tuple(position_m), radius_m, basis)
+    for (one, other), clearance_m in zip(scene.edges.tolist(), scene.clearances_m.tolist(), strict=True):
+        scenes.link(graph, (one, other), clearance_m)
+    openings = np.concatenate((scene.frontier_directions, scene.frontier_areas_m2[:, None]), axis=1)
+    graph.frontiers = dict(zip(scene.frontier_ids.tolist(), openings, strict=True))
+    predicted = set(scene.predicted_ids.tolist())
+    beliefs = zip(
+        scene.place_ids.tolist(), scene.place_regions.tolist(), scene.posteriors, scene.unknown.tolist(), strict=True
+    )
+    graph.beliefs = {
+        place: scenes.Belief(region, posterior, unknown, place in predicted)
+        for place, region, posterior, unknown in beliefs
+    }
+    graph.regions = {region.id: region for region in scene.regions}
+    graph.objects = {item.id: item for item in scene.objects}
+    graph.alignment = scenes.Alignment(
+        scene.prior_digest, scene.environment, scene.task, scene.space, tuple(scene.labels)
+    )
+    graph.origin_m = scene.origin_m
+    graph.place_cursor = scenes.Cursor(0, 0, scene.stamp_ns)
+    graph.region_cursor = scenes.Cursor(0, 0, scene.stamp_ns)
+    return Member(Name(scene.robot, session), graph, former=True)

@@ -1,0 +1,194 @@
+"""One scene of several maps, with numbers that never change (pure)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+
+from prior_sg.deploy.fleet.core.believing import Believed, believed
+from prior_sg.deploy.fleet.core.fusing import Fused, Placed, fused, openings
+from prior_sg.deploy.fleet.core.ids import Ids, Name
+from prior_sg.deploy.fleet.core.things import joined, things_of
+from prior_sg.schemas.objects import SceneObject
+from prior_sg.schemas.regions import NO_REGION, Region
+from prior_sg.schemas.scene import Scene
+from prior_sg.services.geometry import transform
+from prior_sg.services.segmenter.core.experts.context import ObjectView
+from prior_sg.services.segmenter.core.map.received import ReceivedGraph
+from prior_sg.services.segmenter.core.regions import components
+
+DOOR_CLEARANCE_M = 0.6  # widest of a door's ways
+FOOTPRINT_CELL_M = 0.1
+LEAST_MEMBER = 3  # places of a robot's region in a merged one, from which it is a member
+
+
+class Source(NamedTuple):
+    """One map, and how it lies in the fleet's frame."""
+
+    name: Name
+    scene: Scene
+    fleet_from_own: np.ndarray  # (4, 4)
+    frame_ids: Sequence[int] | None = None  # of the scene's trajectory; None = they count from 0
+
+
+@dataclass
+class Memory:
+    """What the merged scene keeps from one state to the next."""
+
+    ids: Ids = field(default_factory=Ids)
+    region_of: dict[int, int] = field(default_factory=dict)  # by place, also of places that are gone for now
+    next_region: int = 0
+
+
+@dataclass(frozen=True)
+class Merged:
+    """The scene, and which regions and objects of whose map are in each of its own."""
+
+    scene: Scene
+    regions: dict[int, list[tuple[Name, int]]]
+    objects: dict[int, list[tuple[Name, int]]]
+    frame_ids: np.ndarray  # (frame,) of the scene's trajectory
+
+
+def merged(robot: str, sources: Sequence[Source], memory: Memory) -> Merged:
+    """The scene of all maps under one name. `memory` is brought up to date. Raises ValueError without any map."""
+    maps = [
+        Placed(name, scene, pose, memory.ids.of("place", name, scene.place_ids.tolist()))
+        for name, scene, pose, _ in sources
+    ]
+    found = fused(maps)
+    beliefs = believed(maps, found)
+    regions = _regions_of(found, beliefs, memory)
+    objects, members = _objects(maps, memory)
+    nodes, directions, areas = openings(maps, found)
+    frame_ids, cameras_m = _cameras(sources, memory)
+    newest = max((one.scene for one in maps), key=lambda scene: scene.stamp_ns)
+    scene = Scene(
+        robot=robot,
+        stamp_ns=newest.stamp_ns,
+        environment=newest.environment,
+        task=newest.task,
+        prior_digest=newest.prior_digest,
+        space=newest.space,
+        labels=beliefs.names,
+        regions=_described(found, beliefs, regions, objects, _parents(maps)),
+        place_ids=found.ids,
+        positions_m=found.positions_m.astype(np.float32),
+        radii_m=found.radii_m.astype(np.float32),
+        basis_points=found.basis_points.astype(np.int16),
+        place_regions=regions,
+        posteriors=beliefs.posteriors.astype(np.float16),
+        unknown=beliefs.unknown.astype(np.float16),
+        edges=found.ids[found.edges].reshape(-1, 2),
+        clearances_m=found.clearances_m.astype(np.float32),
+        trajectory=cameras_m.astype(np.float32),
+        predicted_ids=found.ids[beliefs.predicted],
+        objects=objects,
+        frontier_ids=found.ids[nodes],
+        frontier_directions=directions.astype(np.float32),
+        frontier_areas_m2=areas.astype(np.float32),
+        origin_m=maps[0].scene.origin_m,
+    )
+    return Merged(scene, _members(maps, found, regions), members, frame_ids)
+
+
+def _cameras(sources: Sequence[Source], memory: Memory) -> tuple[np.ndarray, np.ndarray]:
+    """The fleet's numbers (frame,) of all keyframes, ascending, and where they were taken (frame, 3)."""
+    numbers, cameras_m = [], []
+    for name, scene, pose, frame_ids in sources:
+        own = range(len(scene.trajectory)) if frame_ids is None else frame_ids
+        numbers.append(memory.ids.of("frame", name, own))
+        cameras_m.append(transform(pose, scene.trajectory.astype(float)))
+    every, where_m = np.concatenate(numbers), np.concatenate(cameras_m)
+    order = np.argsort(every)
+    return every[order], where_m[order]
+
+
+def _regions_of(found: Fused, beliefs: Believed, memory: Memory) -> np.ndarray:
+    """Region (node,) of each node: connected nodes of one label, under the id that most of them had."""
+    labelled = np.flatnonzero(beliefs.labels >= 0)
+    rank = np.full(len(found.ids), -1)
+    rank[labelled] = np.arange(len(labelled))
+    edges = rank[found.edges]
+    edges = edges[(edges >= 0).all(axis=1)]
+    component = components.numbered(beliefs.labels[labelled], edges)
+    previous = np.array([memory.region_of.get(int(i), NO_REGION) for i in found.ids[labelled]], np.int64)
+    regions = np.full(len(found.ids), NO_REGION, np.int64)
+    if len(labelled):
+        regions[labelled], memory.next_region = components.track(component, previous, memory.next_region)
+    memory.region_of.update(zip(found.ids[labelled].tolist(), regions[labelled].tolist(), strict=True))
+    return regions
+
+
+def _described(
+    found: Fused, beliefs: Believed, regions: np.ndarray, objects: list[SceneObject], parents: dict[str, str]
+) -> list[Region]:
+    graph = ReceivedGraph(found.ids, found.positions_m, found.radii_m, found.edges, found.clearances_m)
+    ids = [region for region in np.unique(regions).tolist() if region != NO_REGION]
+    labelled = regions != NO_REGION
+    whole = np.where(labelled, regions, max(ids, default=0) + 1)  # places without a region are one of their own
+    border = components.border(graph, whole, set(ids), DOOR_CLEARANCE_M)
+    spots_m = np.array([item.position_m for item in objects]).reshape(-1, 3)
+    view = ObjectView(np.array([item.id for item in objects], np.int64), spots_m, np.zeros((len(objects), 0)))
+    standing = components.members(view, found.positions_m, whole, np.flatnonzero(labelled))
+    described = []
+    for number in ids:
+        rows = np.flatnonzero(regions == number)
+        label = int(beliefs.labels[rows[0]])
+        x, y, z = found.positions_m[rows].mean(axis=0).tolist()
+        known = set(ids)
+        described.append(
+            Region(
+                id=number,
+                label=beliefs.names[label],
+                place_count=len(rows),
+                probability=round(float(beliefs.posteriors[rows, label].mean()), 2),
+                position_m=(round(x, 2), round(y, 2), round(z, 2)),
+                area_m2=round(
+                    components.footprint_m2(found.positions_m[rows], found.radii_m[rows], FOOTPRINT_CELL_M), 2
+                ),
+                unknown=round(float(beliefs.unknown[rows].mean()), 2),
+                predicted=bool(beliefs.predicted[rows].mean() > 0.5),
+                hull_m=components.hull_m(found.positions_m[rows], found.radii_m[rows]),
+                neighbour_ids=[other for other in border.neighbours.get(number, []) if other in known],
+                transitions=[way for way in border.transitions.get(number, []) if way.region in known],
+                object_ids=standing.get(number, []),
+                parent=parents.get(beliefs.names[label], ""),
+            )
+        )
+    return described
+
+
+def _parents(maps: Sequence[Placed]) -> dict[str, str]:
+    """The zone above each label, as the robots' priors name it."""
+    return {region.label: region.parent for one in reversed(maps) for region in one.scene.regions if region.parent}
+
+
+def _objects(maps: Sequence[Placed], memory: Memory) -> tuple[list[SceneObject], dict[int, list[tuple[Name, int]]]]:
+    ids = [memory.ids.of("object", one.name, [item.id for item in one.scene.objects]) for one in maps]
+    items, members = [], {}
+    for things in things_of(maps, ids):
+        item = joined(things)
+        items.append(item)
+        members[item.id] = [(maps[thing.map].name, thing.number) for thing in things]
+    return sorted(items, key=lambda item: item.id), members
+
+
+def _members(maps: Sequence[Placed], found: Fused, regions: np.ndarray) -> dict[int, list[tuple[Name, int]]]:
+    """The robots' regions in each merged one."""
+    members: dict[int, list[tuple[Name, int]]] = {}
+    for one, nodes in zip(maps, found.node_of, strict=True):
+        pairs, counts = np.unique(
+            np.column_stack((regions[nodes], one.scene.place_regions)), axis=0, return_counts=True
+        )
+        for (region, own), count in zip(pairs.tolist(), counts.tolist(), strict=True):
+            if NO_REGION not in (region, own) and count >= LEAST_MEMBER:
+                members.setdefault(region, []).append((one.name, own))
+    return members
+
+
+def renamed(scene: Scene, robot: str) -> Scene:
+    """The same scene under another robot's name."""
+    return msgspec.structs.replace(scene, robot=robot)

@@ -1,0 +1,247 @@
+"""What each input of the bridge changes, and what follows from it (pure).
+
+Deltas of robots only mark their map; once a second, at a tick, maps that are not related yet are matched, relations are
+fitted again to what has been seen since, and what has changed of the merged scene is told.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+
+import msgspec
+import numpy as np
+
+from prior_sg.deploy.fleet.core.config import MatchConfig
+from prior_sg.deploy.fleet.core.frames import apart, level
+from prior_sg.deploy.fleet.core.ids import Name
+from prior_sg.deploy.fleet.core.matching import fault_of, map_of, match, tested
+from prior_sg.deploy.fleet.core.members import Delta, Followed, Member, Relation
+from prior_sg.deploy.fleet.core.merging import Memory, Merged, Source, merged
+from prior_sg.deploy.fleet.core.refine import refined
+from prior_sg.deploy.fleet.core.sessions import Change, Present, remembered, said
+from prior_sg.deploy.fleet.core.telling import Teller
+from prior_sg.schemas.codec import Message
+from prior_sg.schemas.names import fault_of_robot
+from prior_sg.schemas.objects import ObjectDelta
+from prior_sg.schemas.places import PlaceDelta
+from prior_sg.schemas.regions import RegionDelta
+from prior_sg.schemas.scene import Scene
+from prior_sg.schemas.status import Tick
+from prior_sg.services.losses import Losses
+from prior_sg.services.scene_store.core import graph as scenes
+
+GROWN = 1.1  # times as many places as when it was looked at last: a map is looked at again
+DOUBT = 0.8  # of what is asked for when maps are first related: a relation that has less is given up
+
+
+class Config(msgspec.Struct, frozen=True, kw_only=True):
+    """Whose maps become one, and how."""
+
+    robots: tuple[str, ...] = ()
+    transforms: dict[str, tuple[float, float, float, float]] = {}  # of robots whose frame is given: x, y, z, yaw in rad
+    stored: tuple[str, ...] = ()  # scenes of former sessions, each as ROBOT=PATH
+    memory: str = ""  # file that keeps the fleet's numbers; empty = they begin anew with every start
+    min_change_m: float = 0.01  # smaller changes of places, edges and objects are not told
+    posterior_change: float = 0.02  # nor are smaller ones of a belief
+    match: MatchConfig = MatchConfig()
+
+    def __post_init__(self) -> None:
+        for robot in (*self.robots, *self.transforms):
+            if fault := fault_of_robot(robot):
+                raise ValueError(fault)
+        if len({*self.robots}) < len(self.robots):
+            raise ValueError("a robot is named twice")
+        if unknown := sorted(self.transforms.keys() - {*self.robots}):
+            raise ValueError(f"a transform is given for {unknown[0]}, whose map is not to be merged: name it, too")
+
+
+@dataclass
+class State:
+    """What the bridge of one fleet knows."""
+
+    robot: str  # the fleet's own name
+    followed: dict[str, Followed]
+    teller: Teller
+    former: list[Member] = field(default_factory=list)
+    memory: Memory = field(default_factory=Memory)
+    merged: Merged | None = None
+    events: list[str] = field(default_factory=list)  # to be told with the next delta
+    noted: set[tuple[Name, int]] = field(default_factory=set)  # objects of former sessions whose change was told
+    kept_ids: int = 0  # numbers that are kept on disk
+    losses: Losses = field(default_factory=Losses)
+
+    def members(self) -> list[Member]:
+        """All, the present ones first; among them the order of the command."""
+        return [*(one.member for one in self.followed.values()), *reversed(self.former)]
+
+
+def update(state: State, message: Message, cfg: Config) -> Iterator[Message]:
+    """Take one input; yields deltas, and what is missing as the robot and the kind of delta."""
+    match_for = {PlaceDelta, RegionDelta, ObjectDelta}
+    if type(message) in match_for and message.robot in state.followed:  # type: ignore[attr-defined]
+        yield from _follow(state, message)  # type: ignore[arg-type]
+    elif isinstance(message, Tick):
+        yield from _tick(state, cfg)
+
+
+class Lacking(Message, frozen=True, kw_only=True):
+    """A stream has a gap: its writer is to be asked for all of it."""
+
+    robot: str
+    kind: str  # name of the delta's type
+
+
+class Numbers(msgspec.Struct, frozen=True, kw_only=True):
+    """The fleet's numbers as they are kept."""
+
+    given: list[tuple[str, str, int, int, int]]  # kind, robot, session, the robot's number, the fleet's
+    region_of: list[tuple[int, int]]  # place, region
+    next_region: int
+
+
+class KeepNumbers(Message, frozen=True, kw_only=True):
+    """New numbers have been given out: keep all of them."""
+
+    robot: str
+    content: bytes  # Numbers as MessagePack
+
+
+class NumbersKept(Message, frozen=True, kw_only=True):
+    """They are."""
+
+    robot: str
+
+
+def _follow(state: State, delta: Delta) -> Iterator[Message]:
+    followed = state.followed[delta.robot]
+    ended = followed.take(delta)
+    if ended is not None:
+        state.former.append(ended)
+        state.events.append(f"{delta.robot} has begun a new session")
+    if followed.lacking(delta):
+        yield Lacking(robot=delta.robot, kind=type(delta).__name__)
+
+
+def _tick(state: State, cfg: Config) -> Iterator[Message]:
+    members = state.members()
+    if not any(one.changed for one in members):
+        return
+    relate(state, cfg)
+    related = [one for one in members if one.relation is not None and one.graph.places]
+    if not related:
+        return
+    state.merged, changes = merged_of(state.robot, related, state.memory)
+    for name, change in changes:
+        if (name, change.number) not in state.noted:
+            state.noted.add((name, change.number))
+            state.events.append(said(change, state.merged.scene))
+    for one in members:
+        one.changed = False
+    events, state.events = state.events, []
+    if cfg.memory and (count := sum(state.memory.ids.following.values())) != state.kept_ids:
+        state.kept_ids = count
+        yield KeepNumbers(robot=state.robot, content=_numbers(state.memory))
+    tolerances = cfg.min_change_m, cfg.posterior_change
+    yield from state.teller.tell(state.merged, "; ".join(events), *tolerances)
+
+
+def _numbers(memory: Memory) -> bytes:
+    given = [
+        (kind, name.robot, name.session, number, fleet)
+        for kind, known in memory.ids.given.items()
+        for (name, number), fleet in known.items()
+    ]
+    kept = Numbers(given=given, region_of=sorted(memory.region_of.items()), next_region=memory.next_region)
+    return msgspec.msgpack.encode(kept)
+
+
+def merged_of(robot: str, members: list[Member], memory: Memory) -> tuple[Merged, list[tuple[Name, Change]]]:
+    """The merged scene of related members; those of former sessions tell only what no present one sees otherwise."""
+    present, sources, changes = [], [], []
+    for one in members:
+        assert one.relation is not None
+        scene, pose = one.map().scene, one.relation.fleet_from_own
+        if not one.former:
+            present.append(Present(scene, pose))
+        else:
+            scene, found = remembered(scene, pose, present)
+            changes += [(one.name, change) for change in found]
+        frame_ids = None if one.former and not one.graph.sightings else one.frame_ids()
+        sources.append(Source(one.name, scene, pose, frame_ids))
+    return merged(robot, sources, memory), changes
+
+
+def relate(state: State, cfg: Config) -> None:
+    """Find out how maps lie in the fleet's frame, and fit what is known to what has been seen since."""
+    members = [one for one in state.members() if len(one.graph.places) >= cfg.match.least_places]
+    _given(members, cfg.transforms)
+    if members and not any(one.relation for one in state.members()):
+        first = next((one for one in members if one.former), members[0])
+        first.relation, first.why = Relation(np.eye(4), given=True, places=len(first.graph.places)), ""
+        state.events.append(f"the frame of {first.name.robot} is that of {state.robot}")
+    for one in members:
+        if one.relation is None and len(one.graph.places) >= GROWN * one.tried_places:
+            _seek(state, one, members, cfg)
+        elif one.relation is not None and not one.relation.given and _grown(one):
+            _correct(state, one, members, cfg)
+
+
+def _given(members: list[Member], transforms: Mapping[str, tuple[float, float, float, float]]) -> None:
+    for one in members:
+        if one.relation is None and not one.former and one.name.robot in transforms:
+            x, y, z, yaw = transforms[one.name.robot]
+            one.relation, one.why = Relation(level(yaw, np.array((x, y, z))), given=True), ""
+
+
+def _grown(one: Member) -> bool:
+    assert one.relation is not None
+    return len(one.graph.places) >= GROWN * one.relation.places or (one.changed and one.graph.places != {})
+
+
+def _others(state: State, one: Member, members: list[Member]) -> Scene | None:
+    """What all related members but one know together, in numbers that nobody keeps."""
+    others = [other for other in members if other is not one and other.relation is not None]
+    return merged_of(state.robot, others, Memory())[0].scene if others else None
+
+
+def _seek(state: State, one: Member, members: list[Member], cfg: Config) -> None:
+    """Match an unrelated map with all that are related."""
+    others = _others(state, one, members)
+    one.tried_places = len(one.graph.places)
+    if others is None:
+        return
+    found = match(one.map(), map_of(others), cfg.match)
+    one.why = found.why
+    if found.b_from_a is not None:
+        one.relation = Relation(found.b_from_a, given=False, places=len(one.graph.places))
+        one.touch()
+        state.events.append(f"{one.name.robot} has been found in the map of {state.robot}")
+
+
+def _correct(state: State, one: Member, members: list[Member], cfg: Config) -> None:
+    """Fit a relation again. Where the maps have come to contradict each other, seek it anew, else give it up."""
+    assert one.relation is not None
+    others = _others(state, one, members)
+    if others is None:
+        return
+    other = map_of(others)
+    pose = refined(one.relation.fleet_from_own, one.map().shape, other.shape)
+    evidence = tested(pose, one.map(), other).evidence
+    lenient = msgspec.structs.replace(
+        cfg.match, fitting_least=DOUBT * cfg.match.fitting_least, landmarks_least=0, evidence_least=0.0
+    )
+    if not fault_of(evidence, lenient):
+        gap_m, gap_rad = apart(pose, one.relation.fleet_from_own, one.map().shape.centers_m.mean(axis=0))
+        moves = gap_m > cfg.min_change_m or gap_rad > cfg.min_change_m
+        kept = pose if moves else one.relation.fleet_from_own
+        one.relation = Relation(kept, given=False, places=len(one.graph.places))
+        return
+    one.relation = None
+    _seek(state, one, members, cfg)
+    if one.relation is None:
+        state.events.append(f"{one.name.robot} fits no longer: {fault_of(evidence, lenient)}")
+        one.touch()
+
+
+def scene_of(state: State) -> Scene:
+    """The merged scene as last made; empty before."""
+    return scenes.scene(scenes.Graph(state.robot)) if state.merged is None else state.merged.scene

@@ -1,0 +1,64 @@
+"""What a fleet's bridge keeps on disk: its numbers; and what it reads there: scenes of former sessions."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import msgspec
+
+from prior_sg.deploy.errors import UserError
+from prior_sg.deploy.fleet.core.ids import KINDS, Ids, Kind, Name
+from prior_sg.deploy.fleet.core.members import Member, member_of_scene
+from prior_sg.deploy.fleet.core.merging import Memory
+from prior_sg.deploy.fleet.core.update import Numbers
+from prior_sg.services.runtime.service import ServiceError
+
+
+def kept_memory(path: str) -> Memory:
+    """The numbers in a file; none where there is no file yet. Raises ServiceError."""
+    file = Path(path)
+    if not path or not file.exists():
+        return Memory()
+    try:
+        numbers = msgspec.msgpack.decode(file.read_bytes(), type=Numbers)
+    except (OSError, msgspec.DecodeError) as error:
+        raise ServiceError(f"{path} holds no numbers of a fleet: name another file, or move it away") from error
+    ids = Ids()
+    for kind, robot, session, number, given in numbers.given:
+        ids.adopt(_kind(kind, path), Name(robot, session), number, given)
+    return Memory(ids, dict(numbers.region_of), numbers.next_region)
+
+
+def _kind(text: str, path: str) -> Kind:
+    for kind in KINDS:
+        if kind == text:
+            return kind
+    raise ServiceError(f"{path} numbers {text!r}, which this version does not know")
+
+
+def keep(path: str, content: bytes) -> None:
+    """Write the numbers; a half-written file never counts. Raises OSError."""
+    file = Path(path)
+    file.parent.mkdir(parents=True, exist_ok=True)
+    partial = file.with_suffix(".partial")
+    partial.write_bytes(content)
+    partial.replace(file)
+
+
+def stored_members(named: Sequence[str]) -> list[Member]:
+    """The maps of former sessions, each given as ROBOT=PATH, the oldest first. Raises ServiceError."""
+    from prior_sg.deploy.showing.reading import read_material
+
+    sessions: dict[str, int] = {}
+    found = []
+    for text in named:
+        robot, _, path = text.partition("=")
+        if not path:
+            raise ServiceError(f"{text!r} names no stored scene: write ROBOT=PATH")
+        try:
+            scene = read_material(path, robot).scene
+        except UserError as error:
+            raise ServiceError(str(error)) from error
+        session = sessions.get(robot, 0)
+        sessions[robot] = session + 1
+        found.append(member_of_scene(msgspec.structs.replace(scene, robot=robot), session))
+    return found

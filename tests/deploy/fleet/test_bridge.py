@@ -1,0 +1,223 @@
+"""The bridge beside the store: several robots' deltas become those of one map, which the store keeps as any robot's."""
+
+import msgspec
+import numpy as np
+import pytest
+
+from prior_sg.deploy.cli.fleet import transforms_of
+from prior_sg.deploy.errors import UserError
+from prior_sg.deploy.fleet.bridge import KEEP_NUMBERS, SERVICE
+from prior_sg.deploy.fleet.core.frames import level
+from prior_sg.deploy.fleet.core.update import Config, NumbersKept
+from prior_sg.deploy.fleet.keeping import keep
+from prior_sg.schemas.places import PlaceDelta, SnapshotRequest
+from prior_sg.schemas.scene import SceneRequest
+from prior_sg.schemas.status import Tick
+from prior_sg.schemas.topics import (
+    OBJECT_SNAPSHOT,
+    PLACE_SNAPSHOT,
+    REGION_SNAPSHOT,
+    SCENE,
+    topic_of,
+)
+from prior_sg.services.registry import BY_NAME
+from prior_sg.services.runtime.runner import Pipeline, Runner
+from prior_sg.services.runtime.service import Identity, ServiceError
+from prior_sg.services.scene_store.core.graph import Config as StoreConfig
+from tests.help import houses
+
+MOVED = level(2.3, np.array((12.0, -7.0, 0.4)))
+CFG = Config(robots=("r1", "r2"))
+TICK = Tick(stamp_ns=10**18)
+
+
+class Fleet:
+    """A bridge and a store, joined as on a bus."""
+
+    def __init__(self, cfg=CFG, epoch=5):
+        self.kept = []
+        answers = {KEEP_NUMBERS: self.keep}
+        self.bridge = Runner(SERVICE, cfg, Identity("home", "fleet", epoch), answers, wire=True)
+        self.store = Runner(BY_NAME["scene_store"], StoreConfig(path=":memory:"), Identity("*", "store", 1), wire=True)
+        self.pipeline = Pipeline((self.bridge, self.store))
+
+    def keep(self, request):
+        self.kept.append(request.content)
+        return NumbersKept(robot=request.robot)
+
+    def tell(self, scene, epoch=1):
+        for delta in houses.deltas(scene, epoch):
+            self.pipeline.publish(topic_of(type(delta)), delta)
+
+    def tick(self):
+        return [message for _, message in self.pipeline.feed(self.bridge, TICK)]
+
+    def scene(self, robot="home"):
+        return self.store.answer(SCENE, SceneRequest(robot=robot))
+
+
+def first(**changes):
+    return houses.scene(rooms=houses.ROOMS[:4], **changes)
+
+
+def second(**changes):
+    return houses.scene("r2", MOVED, rooms=houses.ROOMS[1:], **changes)
+
+
+def test_two_robots_make_one_map():
+    fleet = Fleet()
+    fleet.tell(first())
+    fleet.tick()
+    assert sorted(region.label for region in fleet.scene().regions) == sorted(room[0] for room in houses.ROOMS[:4])
+    before = {region.label: region.id for region in fleet.scene().regions}
+    fleet.tell(second())
+    told = fleet.tick()
+    assert "r2 has been found in the map of home" in next(m for m in told if isinstance(m, PlaceDelta)).event
+    scene = fleet.scene()
+    assert sorted(region.label for region in scene.regions) == houses.LABELS
+    after = {region.label: region.id for region in scene.regions}
+    assert {label: after[label] for label in before} == before
+    assert len(scene.objects) == len(houses.THINGS) and len(scene.trajectory) == 2
+    assert fleet.tick() == []
+
+
+def test_the_store_holds_what_snapshots_say():
+    fleet = Fleet()
+    fleet.tell(first())
+    fleet.tell(second())
+    fleet.tick()
+    late = Runner(BY_NAME["scene_store"], StoreConfig(path=":memory:"), Identity("*", "late", 1), wire=True)
+    request = SnapshotRequest(robot="home")
+    late.feed(*(fleet.bridge.answer(q, request) for q in (PLACE_SNAPSHOT, REGION_SNAPSHOT, OBJECT_SNAPSHOT)))
+    told = late.answer(SCENE, SceneRequest(robot="home"))
+    assert told.unnumbered() == fleet.scene().unnumbered()
+
+
+def test_robots_are_not_found_where_they_are_not():
+    fleet = Fleet()
+    fleet.tell(first())
+    fleet.tick()
+    alone = fleet.scene()
+    rooms = [("kitchen", 0, 0, 4.2, 3), ("hallway", 4.2, 0, 5.6, 6), ("bedroom", 0, 3, 4.2, 6)]
+    fleet.tell(houses.scene("r2", MOVED, rooms=rooms, things=[("bed", 1.0, 5.2), ("stove", 3.0, 1.0)]))
+    fleet.tick()
+    assert fleet.scene().place_ids.tolist() == alone.place_ids.tolist()
+    assert SERVICE.figures(fleet.bridge.state) == {"maps": 2, "maps_related": 1}
+
+
+def test_frames_that_are_given_need_nothing_in_common():
+    x, y, z = (-(MOVED[:3, :3].T @ MOVED[:3, 3])).tolist()
+    cfg = msgspec.structs.replace(CFG, transforms={"r1": (0.0, 0.0, 0.0, 0.0), "r2": (x, y, z, -2.3)})
+    fleet = Fleet(cfg)
+    fleet.tell(houses.scene(rooms=houses.ROOMS[:2], things=[]))
+    fleet.tell(houses.scene("r2", MOVED, rooms=houses.ROOMS[3:], things=[]))
+    fleet.tick()
+    scene = fleet.scene()
+    assert sorted(region.label for region in scene.regions) == ["bathroom", "bedroom", "kitchen", "living room"]
+    bedroom = next(region for region in scene.regions if region.label == "bedroom")
+    assert bedroom.position_m[:2] == pytest.approx((2.2, 7.2), abs=0.3)
+
+
+def test_a_late_loop_closure_is_followed():
+    fleet = Fleet()
+    fleet.tell(first())
+    fleet.tell(second())
+    fleet.tick()
+    ids = fleet.scene().place_ids.tolist()
+    shift = level(0.15, np.array((0.6, 0.3, 0.0)))
+    moved = houses.scene("r2", shift @ MOVED, rooms=houses.ROOMS[1:])
+    for delta in houses.deltas(moved):
+        later = msgspec.structs.replace(delta, revision=1, snapshot=False)
+        fleet.pipeline.publish(topic_of(type(delta)), later)
+    before = fleet.scene()
+    fleet.tick()
+    after = fleet.scene()
+    assert after.place_ids.tolist() == ids
+    assert np.abs(after.positions_m - before.positions_m).max() < 0.1  # in the frame of home nothing has moved
+
+
+def test_a_map_that_comes_to_contradict_is_taken_out():
+    fleet = Fleet()
+    fleet.tell(first())
+    fleet.tell(second())
+    fleet.tick()
+    alone = Fleet()
+    alone.tell(first())
+    alone.tick()
+    rooms = [("kitchen", 0, 0, 4.2, 3), ("hallway", 4.2, 0, 5.6, 6), ("bedroom", 0, 3, 4.2, 6)]
+    other = houses.scene("r2", MOVED, rooms=rooms, things=[("bed", 1.0, 5.2), ("stove", 3.0, 1.0)])
+    for delta in houses.deltas(other):
+        fleet.pipeline.publish(topic_of(type(delta)), msgspec.structs.replace(delta, revision=1))
+    told = fleet.tick()
+    assert any("r2 fits no longer" in m.event for m in told if isinstance(m, PlaceDelta))
+    assert fleet.scene().place_ids.tolist() == alone.scene().place_ids.tolist()
+
+
+def test_a_gap_is_asked_for():
+    fleet = Fleet()
+    (places, *_) = houses.deltas(first())
+    fleet.bridge.feed(msgspec.structs.replace(places, revision=3, snapshot=False))
+    assert [ask.query for ask in fleet.bridge.asks] == [PLACE_SNAPSHOT]
+    assert fleet.bridge.asks[0].request.robot == "r1"
+
+
+def test_the_next_day_goes_on_with_the_same_numbers():
+    fleet = Fleet(Config(robots=("r1",)))
+    fleet.tell(houses.scene())
+    fleet.tick()
+    before = fleet.scene()
+    things = [thing if thing[0] != "sofa" else ("sofa", 2.9, 8.2) for thing in houses.THINGS]
+    fleet.tell(houses.scene("r1", MOVED, rooms=houses.ROOMS[1:], things=things), epoch=2)
+    told = fleet.tick()
+    event = next(m for m in told if isinstance(m, PlaceDelta)).event
+    assert "r1 has begun a new session" in event and "sofa moved from living room to bedroom" in event
+    after = fleet.scene()
+    assert {r.label: r.id for r in after.regions} == {r.label: r.id for r in before.regions}
+    numbers = [{i.label: i.id for i in scene.objects if i.label != "sofa"} for scene in (before, after)]
+    assert numbers[0] == numbers[1]
+    assert len(after.place_ids) == len(before.place_ids)
+
+
+def test_numbers_live_on_in_a_file(tmp_path):
+    path = str(tmp_path / "fleet" / "home.msgpack")
+    cfg = msgspec.structs.replace(CFG, memory=path)
+    fleet = Fleet(cfg)
+    fleet.tell(first())
+    fleet.tell(second())
+    fleet.tick()
+    keep(path, fleet.kept[-1])
+    again = Fleet(cfg, epoch=6)
+    again.tell(second())
+    again.tell(first())
+    again.tick()
+    assert again.scene().place_ids.tolist() == fleet.scene().place_ids.tolist()
+    assert {r.label: r.id for r in again.scene().regions} == {r.label: r.id for r in fleet.scene().regions}
+    (tmp_path / "broken").write_bytes(b"no")
+    with pytest.raises(ServiceError, match="holds no numbers"):
+        Fleet(msgspec.structs.replace(CFG, memory=str(tmp_path / "broken")))
+
+
+@pytest.mark.parametrize(
+    ("changes", "why"),
+    [
+        ({"robots": ("r1", "r1")}, "twice"),
+        ({"robots": ("fleet",)}, "reserved"),
+        ({"robots": ("r1",), "transforms": {"r2": (0.0, 0.0, 0.0, 0.0)}}, "name it, too"),
+    ],
+)
+def test_absurd_fleets_are_refused(changes, why):
+    with pytest.raises(ValueError, match=why):
+        Config(**changes)
+
+
+def test_a_fleet_bears_no_robots_name():
+    with pytest.raises(ServiceError, match="another name"):
+        SERVICE.init(Config(robots=("home",)), Identity("home", "fleet", 1))
+
+
+def test_transforms_are_read():
+    assert transforms_of(["r2=1,2,0,180"], ["r1", "r2"], False) == {"r2": (1.0, 2.0, 0.0, np.pi)}
+    assert transforms_of([], ["r1"], True) == {"r1": (0.0, 0.0, 0.0, 0.0)}
+    for text in ("r2=1,2,3", "r2", "r2=1,2,x,4", "r2=1,2,3,inf"):
+        with pytest.raises(UserError, match="no transform"):
+            transforms_of([text], ["r2"], False)

@@ -1,0 +1,141 @@
+"""Merged scenes: numbers that last, places and objects that are one, beliefs that settle conflicts."""
+
+import msgspec
+import numpy as np
+import pytest
+
+from prior_sg.deploy.fleet.core.frames import level
+from prior_sg.deploy.fleet.core.fusing import lens_m
+from prior_sg.deploy.fleet.core.ids import Ids, Name
+from prior_sg.deploy.fleet.core.merging import Memory, Source, merged
+from prior_sg.deploy.fleet.core.sessions import Present, remembered, said
+from prior_sg.services.geometry import inverse
+from tests.help import houses
+
+ONE, TWO = Name("r1", 0), Name("r2", 0)
+MOVED = level(2.3, np.array((12.0, -7.0, 0.4)))
+
+
+def both(memory=None, **changes):
+    """Two robots' maps of one house that overlap in hallway and bedroom."""
+    first = houses.scene(rooms=houses.ROOMS[:4])
+    second = houses.scene("r2", MOVED, rooms=houses.ROOMS[2:], **changes)
+    sources = [Source(ONE, first, np.eye(4)), Source(TWO, second, inverse(MOVED))]
+    return merged("home", sources, memory or Memory()), first, second
+
+
+def test_numbers_are_given_once():
+    ids = Ids()
+    assert ids.of("place", ONE, [7, 9]).tolist() == [0, 1]
+    assert ids.of("place", TWO, [7]).tolist() == [2]
+    assert ids.of("place", ONE, [9, 8]).tolist() == [1, 3]
+    assert ids.of("object", ONE, [7]).tolist() == [0]
+    ids.adopt("object", TWO, 4, 6)
+    assert ids.of("object", TWO, [4, 5]).tolist() == [6, 7]
+
+
+def test_what_both_saw_is_there_once():
+    found, first, second = both()
+    scene = found.scene
+    shared = int((second.place_regions < 2).sum()) - 1  # the bathroom's doorway counts to the hallway
+    assert len(scene.place_ids) == len(first.place_ids) + len(second.place_ids) - shared
+    assert sorted(item.label for item in scene.objects) == sorted(thing[0] for thing in houses.THINGS)
+    assert sorted(region.label for region in scene.regions) == houses.LABELS
+    assert len(np.unique(scene.edges, axis=0)) == len(scene.edges) and np.isin(scene.edges, scene.place_ids).all()
+    bedroom = next(region for region in scene.regions if region.label == "bedroom")
+    assert found.regions[bedroom.id] == [(ONE, 3), (TWO, 1)]
+    assert len(found.objects[next(item.id for item in scene.objects if item.label == "bed")]) == 2
+
+
+def test_what_lies_apart_stays_connected():
+    """Places of the second map that the first has not seen are reached through those that are one."""
+    scene = both()[0].scene
+    rows = np.searchsorted(scene.place_ids, scene.edges)
+    reached, waiting = {0}, [0]
+    while waiting:
+        here = waiting.pop()
+        for other in rows[(rows == here).any(axis=1)].ravel().tolist():
+            if other not in reached:
+                reached.add(other)
+                waiting.append(other)
+    assert len(reached) == len(scene.place_ids)
+
+
+def test_numbers_stay_when_a_frame_is_corrected_or_a_robot_leaves():
+    memory = Memory()
+    found, first, second = both(memory)
+    before = {region.label: region.id for region in found.scene.regions}
+    off = level(0.0, np.array((0.1, 0.05, 0.0))) @ inverse(MOVED)
+    again = merged("home", [Source(ONE, first, np.eye(4)), Source(TWO, second, off)], memory).scene
+    assert {region.label: region.id for region in again.regions} == before
+    alone = merged("home", [Source(TWO, second, inverse(MOVED))], memory).scene
+    assert set(alone.place_ids.tolist()) & set(found.scene.place_ids.tolist())
+    assert {region.label: region.id for region in alone.regions if region.label == "bathroom"} == {
+        "bathroom": before["bathroom"]
+    }
+    back = merged("home", [Source(ONE, first, np.eye(4)), Source(TWO, second, inverse(MOVED))], memory).scene
+    assert back.place_ids.tolist() == found.scene.place_ids.tolist()
+
+
+def test_the_surer_robot_names_the_room():
+    first = houses.scene(rooms=houses.ROOMS[:4])
+    second = houses.scene("r2", MOVED, rooms=houses.ROOMS[2:])
+    bedroom = second.place_regions == 1
+    wrong = second.posteriors.copy()
+    wrong[bedroom] = 0.15
+    wrong[bedroom, houses.LABELS.index("kitchen")] = 0.4
+    regions = [msgspec.structs.replace(r, label="kitchen") if r.id == 1 else r for r in second.regions]
+    second = msgspec.structs.replace(second, posteriors=wrong, regions=regions)
+    sources = [Source(TWO, second, np.eye(4)), Source(ONE, first, MOVED)]
+    scene = merged("home", sources, Memory()).scene
+    assert sorted(region.label for region in scene.regions) == houses.LABELS
+
+
+def test_openings_that_another_map_closes_are_none():
+    first = houses.scene(rooms=houses.ROOMS[:1])
+    spot = int(np.argmax(first.positions_m[:, 1]))
+    fields = {
+        "frontier_ids": np.array([0, spot]),
+        "frontier_directions": np.array([(-1.0, 0, 0), (0, 1.0, 0)], np.float32),
+        "frontier_areas_m2": np.array([1.0, 1.0], np.float32),
+    }
+    first = msgspec.structs.replace(first, **fields)
+    second = houses.scene("r2", rooms=houses.ROOMS[:1])
+    alone = merged("home", [Source(ONE, first, np.eye(4))], Memory()).scene
+    assert alone.frontier_ids.tolist() == [0, spot]
+    moved = level(0.0, np.array((0.0, 1.0, 0.0)))  # the other's kitchen reaches a metre farther
+    scene = merged("home", [Source(ONE, first, np.eye(4)), Source(TWO, second, moved)], Memory()).scene
+    assert scene.frontier_ids.tolist() == [0]
+
+
+def test_the_circle_in_which_balls_meet():
+    gaps, one, other = np.array([1.0, 3.0, 0.2]), np.array([1.0, 1.0, 1.0]), np.array([1.0, 1.0, 0.5])
+    assert lens_m(gaps, one, other) == pytest.approx([np.sqrt(0.75), 0.0, 0.5])
+
+
+def test_a_former_session_is_forgotten_where_it_is_seen_otherwise():
+    former = houses.scene()
+    things = [thing if thing[0] != "sofa" else ("sofa", 2.9, 8.2) for thing in houses.THINGS if thing[0] != "table"]
+    things = [thing for thing in things if thing[0] != "plant"] + [("plant", 7.5, 3.6)]
+    now = houses.scene("r1", MOVED, things=things)
+    kept, changes = remembered(former, MOVED, [Present(now, np.eye(4))])
+    labels = {change.label: change for change in changes}
+    assert set(labels) == {"table", "sofa"} and labels["table"].to_m is None
+    scene = merged("home", [Source(Name("r1", 1), now, inverse(MOVED)), Source(ONE, kept, np.eye(4))], Memory()).scene
+    unmoved = [change._replace(from_m=_back(change.from_m), to_m=_back(change.to_m)) for change in changes]
+    assert sorted(said(change, scene) for change in unmoved) == [
+        "sofa moved from living room to bedroom",
+        "table is gone from kitchen",
+    ]
+    assert sorted(item.label for item in scene.objects) == sorted(thing[0] for thing in things)
+
+
+def _back(spot_m):
+    return None if spot_m is None else (inverse(MOVED) @ np.append(spot_m, 1.0))[:3]
+
+
+def test_what_is_not_seen_again_is_remembered():
+    former, now = houses.scene(), houses.scene("r1", rooms=houses.ROOMS[:2])
+    kept, changes = remembered(former, np.eye(4), [Present(now, np.eye(4))])
+    assert not changes and len(kept.objects) == len(former.objects)
+    assert np.isin(former.place_ids[former.place_regions >= 2], kept.place_ids).all()
