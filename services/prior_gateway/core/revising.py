@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import msgspec
 import numpy as np
 
+from prior_sg.schemas.levels import LevelPrior
 from prior_sg.schemas.names import normal
 from prior_sg.schemas.priors import MOST_OBJECTS, MOST_REGIONS, ObjectPrior, Prior, Provenance, RegionPrior, Tested
 from prior_sg.services.prior_gateway.core.answers import parse
@@ -220,7 +221,18 @@ def extended(prior: Prior, new: Addition, with_name: Callable[[str], list[str]])
         adjacency=touching.astype(np.float32),
         spread=None,  # nobody has said how far generations would differ about the new region
         tested=prior.tested and Tested(regions=np.append(prior.tested.regions, np.float32(0.0))),
+        levels=_with_child(prior.levels, origin),
     )
+
+
+def _with_child(levels: list[LevelPrior], origin: int | None) -> list[LevelPrior]:
+    """The levels with one more region, which is where the one that it splits is, else anywhere."""
+    if not levels:
+        return levels
+    lowest = levels[0]
+    anywhere = np.array([entry.existence for entry in lowest.entries], np.float32)
+    row = anywhere / anywhere.sum() if origin is None else lowest.parents[origin]
+    return [msgspec.structs.replace(lowest, parents=np.vstack((lowest.parents, row))), *levels[1:]]
 
 
 def _shared(regions: list[RegionPrior], origin: int | None, share: float) -> list[RegionPrior]:
