@@ -138,7 +138,6 @@ class Prior(Message, frozen=True, kw_only=True, omit_defaults=True):
 
     def check(self) -> None:
         """Whoever sent it: a model, a file or another robot."""
-        check_levels(self.levels, len(self.regions))
         self._check_names()
         self._check_matrices()
         for region in self.regions:
@@ -148,6 +147,7 @@ class Prior(Message, frozen=True, kw_only=True, omit_defaults=True):
         existence = [region.existence for region in self.regions]
         if abs(sum(existence) - 1) > SUM_TOLERANCE:
             raise ValueError("existence must be positive and sum to one")
+        check_levels(self.levels, len(self.regions))
 
     def _check_names(self) -> None:
         if not self.regions:

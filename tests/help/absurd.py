@@ -90,7 +90,7 @@ def _value(hint: Any) -> st.SearchStrategy[Any]:
     if hint is type(None):
         return st.none()
     if isinstance(hint, type) and issubclass(hint, Message):
-        return absurd(hint)
+        return absurd(hint).filter(lambda message: message is not None)
     if isinstance(hint, type) and issubclass(hint, msgspec.Struct):
         parts = {name: _value(part) for name, part in typing.get_type_hints(hint, include_extras=True).items()}
         return st.builds(lambda **fields: fields, **parts).map(lambda fields: _built(hint, fields))

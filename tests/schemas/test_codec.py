@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import strategies as st
 
-from prior_sg.schemas import features, frames, objects, places, priors, regions, scene, status
+from prior_sg.schemas import features, frames, levels, objects, places, priors, regions, scene, status
 from prior_sg.schemas.codec import (
     ARRAY_EXT_CODE,
     DTYPES,
@@ -105,6 +105,14 @@ GOLDEN: list[Message] = [
             support=np.array([1.0], np.float32),
         ),
         tested=priors.Tested(regions=np.array([2.0], np.float32)),
+        levels=[
+            levels.LevelPrior(
+                name="zone",
+                entries=[levels.Entry(name="day zone", existence=1.0)],
+                parents=np.array([[1.0]], np.float32),
+                adjacency=np.array([[1.0]], np.float32),
+            )
+        ],
     ),
     regions.RegionDelta(
         robot="r",
