@@ -58,8 +58,8 @@ class Trial:
         return Found(regions, borders)
 
     def origins(self, explorer: Explorer, frontiers: Frontiers, seen_m2: np.ndarray) -> np.ndarray:
-        """The region (frontier,) that each opens from: its own, or, while that is not recognised yet, the recognised one
-        that most of its seen border is with."""
+        """The region (frontier,) that each opens from: its own, or, while that is not recognised yet, the recognised
+        one that most of its seen border is with."""
         found = seen_m2 >= FOUND_M2
         a, b = self.crossings
         met = explorer.known[a] & explorer.known[b]

@@ -35,7 +35,7 @@ class ForesightConfig(msgspec.Struct, frozen=True, kw_only=True):
 
     steps: int = 3  # regions ahead
     onward: float = 0.6  # chance that a region beyond leads on, times how many of the others are likely to touch it
-    look_m: float = 3.0  # walked behind an opening to see what is there
+    look_m: float = 1.0  # walked behind an opening to see what is there
     elsewhere_m: float = 40.0  # to what lies behind none of the openings
     told_change: float = 0.05  # smaller changes of a probability are no news
     told_labels: int = 8  # of each opening, the most probable
