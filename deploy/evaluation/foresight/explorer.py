@@ -32,13 +32,22 @@ BORDER_CELLS = 4  # as thick a border may be, in a doorway
 class Plan:
     """What there is to be seen: surfaces, the region of each, and what stops a look."""
 
-    ways: Ways
+    heights: np.ndarray  # (x, y, level) as in `Ways`, of what can be walked to, packed into as few levels as there are
+    clearance: np.ndarray  # (x, y, level)
+    origin_m: np.ndarray  # (3,)
+    voxel_m: float
     blocked: np.ndarray  # (x, y, z) bool: matter in the cell's block of voxels, by layer
     regions: np.ndarray  # (node,) index of the true region, NO_REGION = none
     labels: tuple[str, ...]  # of the true regions
     range_cells: int
     step: int  # voxels
     eye: int  # voxels
+
+    def position_m(self, nodes: np.ndarray) -> np.ndarray:
+        """Points (n, 3) on the ground."""
+        i, j, level = np.unravel_index(nodes, self.heights.shape)
+        x, y = self.origin_m[0] + (i + 0.5) * CELL_M, self.origin_m[1] + (j + 0.5) * CELL_M
+        return np.stack((x, y, self.origin_m[2] + self.heights[i, j, level] * self.voxel_m), axis=1)
 
 
 @dataclass(eq=False)
@@ -63,18 +72,18 @@ class Explorer:
     walked_m: float = 0.0
 
     def __post_init__(self) -> None:
-        self.known = np.zeros(self.plan.ways.heights.size, bool)
+        self.known = np.zeros(self.plan.heights.size, bool)
         self.look()
 
     def look(self) -> None:
         """See what is in sight from here."""
         plan = self.plan
-        loops.look(plan.ways.heights, plan.blocked, self.known, self.node, plan.range_cells, RAYS, plan.step, plan.eye)
+        loops.look(plan.heights, plan.blocked, self.known, self.node, plan.range_cells, RAYS, plan.step, plan.eye)
 
     def reach(self) -> tuple[np.ndarray, np.ndarray]:
         """Cost (node,) in fifths of a cell, FAR = not to be reached through what is known, and the node before."""
-        ways = self.plan.ways
-        return loops.reach(ways.heights, ways.clearance, self.known, self.node, NARROW_CELLS, self.plan.step)
+        plan = self.plan
+        return loops.reach(plan.heights, plan.clearance, self.known, self.node, NARROW_CELLS, plan.step)
 
     def seen_m2(self) -> np.ndarray:
         """Seen area (region,) of each true region."""
@@ -84,8 +93,8 @@ class Explorer:
     def frontiers(self, cost: np.ndarray) -> Frontiers:
         """Frontiers that can be walked to."""
         plan = self.plan
-        edge = loops.edges(plan.ways.heights, plan.ways.clearance, self.known, plan.step)
-        group = loops.grouped(plan.ways.heights, edge, plan.step)
+        edge = loops.edges(plan.heights, plan.clearance, self.known, plan.step)
+        group = loops.grouped(plan.heights, edge, plan.step)
         order = np.flatnonzero(group >= 0)
         order = order[np.argsort(group[order], kind="stable")]
         parts = np.split(order, np.flatnonzero(np.diff(group[order])) + 1) if len(order) else []
@@ -94,9 +103,9 @@ class Explorer:
             reached = nodes[cost[nodes] < FAR]
             if len(nodes) < LEAST_CELLS or not len(reached):
                 continue
-            points_m = plan.ways.position_m(nodes)
+            points_m = plan.position_m(nodes)
             center_m = points_m.mean(axis=0)
-            at_m = plan.ways.position_m(reached)
+            at_m = plan.position_m(reached)
             held = plan.regions[nodes]
             held = held[held != NO_REGION]
             if not len(held):
@@ -114,7 +123,7 @@ class Explorer:
     def revealed(self, nodes: np.ndarray) -> int:
         """Index of the true region that most of the unseen cells just beyond a frontier belong to; NO_REGION = none."""
         plan = self.plan
-        first = loops.beyond(plan.ways.heights, plan.ways.clearance, self.known, nodes, BEYOND_CELLS, plan.step)
+        first = loops.beyond(plan.heights, plan.clearance, self.known, nodes, BEYOND_CELLS, plan.step)
         held = plan.regions[first]
         held = held[held != NO_REGION]
         return int(np.bincount(held).argmax()) if len(held) else NO_REGION
@@ -125,7 +134,7 @@ class Explorer:
         while way[-1] != self.node:
             way.append(int(before[way[-1]]))
         way.reverse()
-        points_m = self.plan.ways.position_m(np.array(way))
+        points_m = self.plan.position_m(np.array(way))
         steps_m = np.linalg.norm(np.diff(points_m, axis=0), axis=1)
         for number, node in enumerate(way[1:], 1):
             self.node = node
@@ -139,12 +148,12 @@ class Explorer:
     def close(self, nodes: np.ndarray) -> None:
         """See all that is beside these nodes."""
         plan = self.plan
-        loops.close(plan.ways.heights, self.known, nodes, plan.step)
+        loops.close(plan.heights, self.known, nodes, plan.step)
 
     def open(self, nodes: np.ndarray) -> bool:
         """Whether anything beside these nodes has not been seen."""
         plan = self.plan
-        return bool(loops.any_edge(plan.ways.heights, plan.ways.clearance, self.known, nodes, plan.step))
+        return bool(loops.any_edge(plan.heights, plan.clearance, self.known, nodes, plan.step))
 
 
 def plan_of(world: World) -> Plan:
@@ -153,16 +162,22 @@ def plan_of(world: World) -> Plan:
     block = round(CELL_M / world.voxel_m)
     nx, ny, nz = world.grid.shape[0] // block, world.grid.shape[1] // block, world.grid.shape[2]
     matter = world.grid[: nx * block, : ny * block].reshape(nx, block, ny, block, nz) != NOTHING
-    nodes = np.flatnonzero(ways.heights.reshape(-1) != NONE)
-    points_m = ways.position_m(nodes) + np.array((0.0, 0.0, ABOVE_M))
-    regions = np.full(ways.heights.size, NO_REGION, np.int64)
-    numbers = {region.id: number for number, region in enumerate(world.truth.regions)}
-    held = world.truth.region_of(points_m)
-    regions[nodes] = [numbers.get(one, NO_REGION) for one in held.tolist()]
+    regions = _regions(ways, world)
+    roomy = np.where(regions >= 0, ways.clearance.reshape(-1), 0)
+    walked = ways.reached(int(roomy.argmax()), 1).reshape(ways.heights.shape)
+    order = np.argsort(~walked, axis=2, kind="stable")[:, :, : int(walked.sum(axis=2).max())]
+    kept = np.take_along_axis(walked, order, axis=2)
+    heights, clearance, held = (
+        np.take_along_axis(column.reshape(walked.shape), order, axis=2)
+        for column in (ways.heights, ways.clearance, regions)
+    )
     return Plan(
-        ways=ways,
+        heights=np.where(kept, heights, NONE).astype(np.int16),
+        clearance=np.where(kept, clearance, 0).astype(np.uint8),
+        origin_m=world.origin_m,
+        voxel_m=world.voxel_m,
         blocked=matter.any(axis=(1, 3)),
-        regions=regions,
+        regions=np.where(kept, held, NO_REGION).reshape(-1),
         labels=tuple(region.label for region in world.truth.regions),
         range_cells=round(RANGE_M[world.outdoors] / CELL_M),
         step=round(STEP_M / world.voxel_m),
@@ -170,15 +185,25 @@ def plan_of(world: World) -> Plan:
     )
 
 
+def _regions(ways: Ways, world: World) -> np.ndarray:
+    """Index (node,) of the true region of each surface, NO_REGION = none."""
+    nodes = np.flatnonzero(ways.heights.reshape(-1) != NONE)
+    points_m = ways.position_m(nodes) + np.array((0.0, 0.0, ABOVE_M))
+    regions = np.full(ways.heights.size, NO_REGION, np.int64)
+    numbers = {region.id: number for number, region in enumerate(world.truth.regions)}
+    regions[nodes] = [numbers.get(one, NO_REGION) for one in world.truth.region_of(points_m).tolist()]
+    return regions
+
+
 def crossings(plan: Plan) -> tuple[np.ndarray, np.ndarray]:
     """Nodes (n,) and (n,) on both sides of all borders that one can walk across."""
-    return loops.crossings(plan.ways.heights, plan.ways.clearance, plan.regions, BORDER_CELLS, plan.step)
+    return loops.crossings(plan.heights, plan.clearance, plan.regions, BORDER_CELLS, plan.step)
 
 
 def starts_of(plan: Plan) -> np.ndarray:
     """Nodes in a region where one can stand, all in reach of each other."""
-    roomy = (plan.ways.clearance.reshape(-1) >= NARROW_CELLS) & (plan.regions != NO_REGION)
-    nodes = np.flatnonzero(roomy)
-    first = nodes[np.argmax(plan.ways.clearance.reshape(-1)[nodes])]
-    reached = plan.ways.reached(int(first), NARROW_CELLS)
-    return nodes[reached[nodes]]
+    roomy = np.where(plan.regions >= 0, plan.clearance.reshape(-1), 0)
+    everything = np.ones(plan.heights.size, bool)
+    first = int(roomy.argmax())
+    cost, _ = loops.reach(plan.heights, plan.clearance, everything, first, NARROW_CELLS, plan.step)
+    return np.flatnonzero((cost < FAR) & (plan.regions >= 0))

@@ -20,7 +20,8 @@ from prior_sg.services.segmenter.core.foresight.config import ForesightConfig
 from prior_sg.services.segmenter.core.foresight.expectation import expected, features
 
 TUNED = range(0, 30)  # seeds that constants are chosen on
-RIDGE = 1e-3  # of the mean log-likelihood
+RIDGE = 1e-2  # of the mean log-likelihood, around what is thought without worlds:
+THOUGHT = (1.0, 1.0, -1.0, -1.0, 0.0, 0.5, 0.5)  # weights of another region's label
 Walk = tuple[Sequence[Moment], Prior]
 
 
@@ -36,8 +37,8 @@ class Rows(NamedTuple):
 def fitted(walks: Sequence[Walk], cfg: ForesightConfig = ForesightConfig()) -> ForesightConfig:
     """The settings that make what was revealed likeliest."""
     rows = [_rows(*walk, cfg) for walk in walks if any(len(moment.outcomes) for moment in walk[0])]
-    same = _least(_same_loss, rows, rows[0].same.shape[1])
-    other = _least(_other_loss, [one for one in rows if len(one.came)], rows[0].other.shape[2])
+    same = _least(_same_loss, rows, np.zeros(rows[0].same.shape[1]))
+    other = _least(_other_loss, [one for one in rows if len(one.came)], np.array(THOUGHT))
     adjacency, existence, again, once, often, count, met = np.round(other, 2).tolist()
     *by_width, by_area, by_spread = np.round(same, 2).tolist()
     return msgspec.structs.replace(
@@ -79,14 +80,14 @@ def _other_loss(weights: np.ndarray, one: Rows) -> tuple[float, np.ndarray]:
 
 
 def _least(
-    loss: Callable[[np.ndarray, Rows], tuple[float, np.ndarray]], rows: Sequence[Rows], count: int
+    loss: Callable[[np.ndarray, Rows], tuple[float, np.ndarray]], rows: Sequence[Rows], around: np.ndarray
 ) -> np.ndarray:
     def whole(weights: np.ndarray) -> tuple[float, np.ndarray]:
         values, slopes = zip(*(loss(weights, one) for one in rows), strict=True)
-        ridge = RIDGE * float(weights @ weights)
-        return float(np.mean(values)) + ridge, np.mean(slopes, axis=0) + 2 * RIDGE * weights
+        off = weights - around
+        return float(np.mean(values)) + RIDGE * float(off @ off), np.mean(slopes, axis=0) + 2 * RIDGE * off
 
-    found: np.ndarray = minimize(whole, np.zeros(count), jac=True, method="L-BFGS-B").x
+    found: np.ndarray = minimize(whole, around, jac=True, method="L-BFGS-B").x
     return found
 
 

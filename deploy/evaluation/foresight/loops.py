@@ -1,8 +1,8 @@
-"""Inner loops of the explorer, over surfaces of cells as `worlds.ways` numbers them."""
+"""Inner loops of the explorer, over surfaces of cells as `worlds.ways` has them, node (i ny + j) levels + level."""
 
 import numpy as np
 
-from prior_sg.deploy.evaluation.worlds.ways import LEVELS, NONE
+from prior_sg.deploy.evaluation.worlds.ways import NONE
 from prior_sg.schemas.regions import NO_REGION
 from prior_sg.services.compiled import compiled
 
@@ -14,7 +14,7 @@ def _step(heights, i, j, height, limit):  # noqa: ANN001, ANN202
     """The level of a cell that one steps to from a height, or NONE."""
     if i < 0 or j < 0 or i >= heights.shape[0] or j >= heights.shape[1]:
         return NONE
-    for level in range(LEVELS):
+    for level in range(heights.shape[2]):
         if heights[i, j, level] != NONE and abs(heights[i, j, level] - height) <= limit:
             return level
     return NONE
@@ -23,8 +23,8 @@ def _step(heights, i, j, height, limit):  # noqa: ANN001, ANN202
 @compiled()
 def look(heights, blocked, known, node, reach, rays, limit, eye):  # noqa: ANN001, ANN201, PLR0917
     """Mark in `known` what is seen from a node, by rays that follow surfaces and pass what is lower than the eye."""
-    ny = heights.shape[1]
-    cell, level = node // LEVELS, node % LEVELS
+    ny, levels = heights.shape[1], heights.shape[2]
+    cell, level = node // levels, node % levels
     i, j = cell // ny, cell % ny
     known[node] = True
     for ray in range(rays):
@@ -39,7 +39,7 @@ def look(heights, blocked, known, node, reach, rays, limit, eye):  # noqa: ANN00
                 break
             other = _step(heights, a, b, height, limit)
             if other != NONE:
-                known[(a * ny + b) * LEVELS + other] = True
+                known[(a * ny + b) * levels + other] = True
                 height = int(heights[a, b, other])
             elif blocked[a, b, min(height + eye, blocked.shape[2] - 1)]:
                 break
@@ -49,7 +49,7 @@ def look(heights, blocked, known, node, reach, rays, limit, eye):  # noqa: ANN00
 def reach(heights, clearance, known, node, least, limit):  # noqa: ANN001, ANN201, PLR0917
     """Cost (node,) of ways over what is known and node before (node,), by Dial's algorithm: a straight step costs 5, a
     diagonal one 7."""
-    ny = heights.shape[1]
+    ny, levels = heights.shape[1], heights.shape[2]
     cost = np.full(heights.size, FAR, np.int32)
     before = np.full(heights.size, NONE, np.int64)
     cost[node] = 0
@@ -63,14 +63,14 @@ def reach(heights, clearance, known, node, least, limit):  # noqa: ANN001, ANN20
             waiting -= 1
             if cost[here] != now:
                 continue
-            cell, level = here // LEVELS, here % LEVELS
+            cell, level = here // levels, here % levels
             i, j = cell // ny, cell % ny
             for a in range(i - 1, i + 2):
                 for b in range(j - 1, j + 2):
                     other = _step(heights, a, b, heights[i, j, level], limit)
                     if other == NONE or clearance[a, b, other] < least:
                         continue
-                    there = (a * ny + b) * LEVELS + other
+                    there = (a * ny + b) * levels + other
                     if not known[there]:
                         continue
                     total = now + (5 if a == i or b == j else 7)
@@ -85,12 +85,12 @@ def reach(heights, clearance, known, node, least, limit):  # noqa: ANN001, ANN20
 
 @compiled(inline="always")
 def _unseen_beside(heights, clearance, known, here, limit):  # noqa: ANN001, ANN202
-    ny = heights.shape[1]
-    cell, level = here // LEVELS, here % LEVELS
+    ny, levels = heights.shape[1], heights.shape[2]
+    cell, level = here // levels, here % levels
     i, j = cell // ny, cell % ny
     for a, b in ((i - 1, j), (i + 1, j), (i, j - 1), (i, j + 1)):
         other = _step(heights, a, b, heights[i, j, level], limit)
-        if other != NONE and clearance[a, b, other] >= 2 and not known[(a * ny + b) * LEVELS + other]:
+        if other != NONE and clearance[a, b, other] >= 2 and not known[(a * ny + b) * levels + other]:
             return True
     return False
 
@@ -107,25 +107,25 @@ def any_edge(heights, clearance, known, nodes, limit):  # noqa: ANN001, ANN201
 @compiled()
 def close(heights, known, nodes, limit):  # noqa: ANN001, ANN201
     """Mark in `known` what is beside these nodes."""
-    ny = heights.shape[1]
+    ny, levels = heights.shape[1], heights.shape[2]
     for here in nodes:
-        cell, level = here // LEVELS, here % LEVELS
+        cell, level = here // levels, here % levels
         i, j = cell // ny, cell % ny
         for a, b in ((i - 1, j), (i + 1, j), (i, j - 1), (i, j + 1)):
             other = _step(heights, a, b, heights[i, j, level], limit)
             if other != NONE:
-                known[(a * ny + b) * LEVELS + other] = True
+                known[(a * ny + b) * levels + other] = True
 
 
 @compiled()
 def crossings(heights, clearance, regions, reach, limit):  # noqa: ANN001, ANN201
     """Nodes on both sides of borders, at most `reach` cells from each other along an axis, over walkable ones."""
-    ny = heights.shape[1]
+    ny, levels = heights.shape[1], heights.shape[2]
     one, two = [0 for _ in range(0)], [0 for _ in range(0)]
     for here in range(heights.size):
         if regions[here] == NO_REGION:
             continue
-        cell, level = here // LEVELS, here % LEVELS
+        cell, level = here // levels, here % levels
         i, j = cell // ny, cell % ny
         for axis in range(2):
             height = heights[i, j, level]
@@ -134,7 +134,7 @@ def crossings(heights, clearance, regions, reach, limit):  # noqa: ANN001, ANN20
                 other = _step(heights, a, b, height, limit)
                 if other == NONE or clearance[a, b, other] < 2:
                     break
-                there = (a * ny + b) * LEVELS + other
+                there = (a * ny + b) * levels + other
                 height = heights[a, b, other]
                 if regions[there] == regions[here]:
                     break
@@ -158,7 +158,7 @@ def edges(heights, clearance, known, limit):  # noqa: ANN001, ANN201
 @compiled()
 def grouped(heights, edge, limit):  # noqa: ANN001, ANN201
     """Number (node,) of the group of touching edge nodes, -1 = none."""
-    ny = heights.shape[1]
+    ny, levels = heights.shape[1], heights.shape[2]
     group = np.full(heights.size, -1, np.int64)
     count = 0
     for first in range(heights.size):
@@ -168,12 +168,12 @@ def grouped(heights, edge, limit):  # noqa: ANN001, ANN201
         front = [first]
         while len(front) > 0:
             here = front.pop()
-            cell, level = here // LEVELS, here % LEVELS
+            cell, level = here // levels, here % levels
             i, j = cell // ny, cell % ny
             for a in range(i - 2, i + 3):
                 for b in range(j - 2, j + 3):
                     other = _step(heights, a, b, heights[i, j, level], limit)
-                    there = (a * ny + b) * LEVELS + other
+                    there = (a * ny + b) * levels + other
                     if other != NONE and edge[there] and group[there] < 0:
                         group[there] = count
                         front.append(there)
@@ -184,20 +184,20 @@ def grouped(heights, edge, limit):  # noqa: ANN001, ANN201
 @compiled()
 def beyond(heights, clearance, known, nodes, depth, limit):  # noqa: ANN001, ANN201, PLR0917
     """Unseen nodes that one comes to from these through unseen ones, at most `depth` cells away."""
-    ny = heights.shape[1]
+    ny, levels = heights.shape[1], heights.shape[2]
     found = [0 for _ in range(0)]
     reached = np.zeros(heights.size, np.bool_)
     front = list(nodes)
     for _ in range(depth):
         following = [0 for _ in range(0)]
         for here in front:
-            cell, level = here // LEVELS, here % LEVELS
+            cell, level = here // levels, here % levels
             i, j = cell // ny, cell % ny
             for a, b in ((i - 1, j), (i + 1, j), (i, j - 1), (i, j + 1)):
                 other = _step(heights, a, b, heights[i, j, level], limit)
                 if other == NONE or clearance[a, b, other] < 2:
                     continue
-                there = (a * ny + b) * LEVELS + other
+                there = (a * ny + b) * levels + other
                 if not known[there] and not reached[there]:
                     reached[there] = True
                     following.append(there)

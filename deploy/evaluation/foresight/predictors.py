@@ -24,10 +24,12 @@ def ours(moment: Moment, prior: Prior, cfg: ForesightConfig) -> np.ndarray:
 
 
 def without_adjacency(moment: Moment, prior: Prior, cfg: ForesightConfig) -> np.ndarray:
-    """Ours, to which all regions may touch alike."""
+    """Ours, to which all regions may touch alike; that the same region goes on is as likely as for ours."""
     flat = msgspec.structs.replace(prior, adjacency=np.ones_like(prior.adjacency))
     found = replace(moment.found, borders=np.zeros_like(moment.found.borders))
-    return ours(replace(moment, found=found), flat, cfg)
+    same = ours(moment, prior, cfg)[:, :1]
+    labels = ours(replace(moment, found=found), flat, cfg)[:, 1:]
+    return np.column_stack((same, (1 - same) * labels / labels.sum(axis=1, keepdims=True)))
 
 
 def existence(moment: Moment, prior: Prior, cfg: ForesightConfig) -> np.ndarray:

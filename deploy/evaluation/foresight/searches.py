@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from prior_sg.deploy.evaluation.foresight.explorer import Explorer, Frontiers
-from prior_sg.deploy.evaluation.foresight.trials import MOST_DECISIONS, Trial, go
+from prior_sg.deploy.evaluation.foresight.trials import FOUND_M2, MOST_DECISIONS, Trial, go
 from prior_sg.deploy.evaluation.worlds.ways import CELL_M
 from prior_sg.services.exploring import expected_metres
 from prior_sg.services.segmenter.core.foresight.beyond import beyond
@@ -14,8 +14,7 @@ from prior_sg.services.segmenter.core.foresight.config import ForesightConfig
 from prior_sg.services.segmenter.core.foresight.expectation import expected
 
 STRAIGHT = 5  # cost of a straight step of one cell
-GOAL_M2 = 1.0  # of the goal's region, seen: it is found ...
-GOAL_SHARE = 0.5  # ... or this share of a smaller one
+GOAL_SHARE = 0.5  # of a region too small to be recognised otherwise, seen: it is found
 
 
 @dataclass(frozen=True)
@@ -46,7 +45,8 @@ def ours(sight: Sight) -> int:
     """The least expected metres by the product's score."""
     one, cfg = sight.quest.trial, sight.cfg
     expectation = expected(one.prior, one.found(sight.explorer, sight.seen_m2), cfg)
-    foreseen = beyond(one.views(sight.frontiers, sight.seen_m2), expectation, cfg)
+    origins = one.origins(sight.explorer, sight.frontiers, sight.seen_m2)
+    foreseen = beyond(one.views(sight.frontiers, origins, sight.seen_m2), expectation, cfg)
     metres = expected_metres(
         sight.frontiers.steps * CELL_M / STRAIGHT,
         sight.frontiers.centers_m,
@@ -89,7 +89,7 @@ def metres(quest: Quest, policy: Policy, cfg: ForesightConfig) -> float:
     one = quest.trial
     explorer = Explorer(one.plan, quest.start)
     whole_m2 = np.bincount(one.plan.regions[one.starts], minlength=len(one.labels)) * CELL_M**2
-    enough_m2 = np.minimum(GOAL_M2, GOAL_SHARE * whole_m2)
+    enough_m2 = np.minimum(FOUND_M2, GOAL_SHARE * whole_m2)
     goals = np.flatnonzero((one.labels == quest.goal) & (whole_m2 > 0))
     rng = one.random(3)
     for _ in range(MOST_DECISIONS):

@@ -19,7 +19,7 @@ from prior_sg.services.segmenter.core.foresight.expectation import Found
 
 ERRORS = 0.15  # share of the regions that are taken for another label
 SURE = 0.85  # belief of the label that a region is taken for
-FOUND_M2 = 1.0  # seen of a region before it counts as found
+FOUND_M2 = 2.0  # seen of a region before it is recognised: what a look through a door shows is not yet a region
 DRAWS = 40  # plans of a kind that make its vocabulary; none of them is a world that is judged
 SAME = -1  # what an opening reveals: more of the region that it opens from
 MOST_DECISIONS = 250
@@ -57,12 +57,26 @@ class Trial:
         np.add.at(borders, (other, one), one != other)
         return Found(regions, borders)
 
-    def views(self, frontiers: Frontiers, seen_m2: np.ndarray) -> Views:
+    def origins(self, explorer: Explorer, frontiers: Frontiers, seen_m2: np.ndarray) -> np.ndarray:
+        """The region (frontier,) that each opens from: its own, or, while that is not recognised yet, the recognised
+        one that most of its seen border is with."""
+        found = seen_m2 >= FOUND_M2
+        a, b = self.crossings
+        met = explorer.known[a] & explorer.known[b]
+        sides = np.stack((self.plan.regions[a[met]], self.plan.regions[b[met]]), axis=1)
+        sides = np.concatenate((sides, sides[:, ::-1]))
+        sides = sides[~found[sides[:, 0]] & found[sides[:, 1]]]
+        origin = np.arange(len(self.labels))
+        for region in np.unique(sides[:, 0]).tolist():
+            origin[region] = np.bincount(sides[sides[:, 0] == region, 1]).argmax()
+        return origin[frontiers.regions]
+
+    def views(self, frontiers: Frontiers, origins: np.ndarray, seen_m2: np.ndarray) -> Views:
         """The openings of one moment."""
         count = len(self.prior.regions)
-        beliefs = np.full((len(frontiers.regions), count), (1 - SURE) / max(count - 1, 1))
-        beliefs[np.arange(len(beliefs)), self.taken[frontiers.regions]] = SURE
-        return Views(beliefs, frontiers.widths_m, seen_m2[frontiers.regions])
+        beliefs = np.full((len(origins), count), (1 - SURE) / max(count - 1, 1))
+        beliefs[np.arange(len(beliefs)), self.taken[origins]] = SURE
+        return Views(beliefs, frontiers.widths_m, seen_m2[origins])
 
 
 @dataclass(frozen=True)
@@ -119,9 +133,10 @@ def moments(one: Trial) -> Iterator[Moment]:
         seen_m2 = explorer.seen_m2()
         revealed = np.array([explorer.revealed(nodes) for nodes in frontiers.nodes], np.int64)
         known = revealed != NO_REGION
-        outcomes = np.where(revealed == frontiers.regions, SAME, np.where(known, one.labels[revealed], SAME))
+        origins = one.origins(explorer, frontiers, seen_m2)
+        outcomes = np.where(revealed == origins, SAME, np.where(known, one.labels[revealed], SAME))
         kept = np.flatnonzero(known & (one.labels[np.maximum(revealed, 0)] >= 0))
-        views = one.views(frontiers, seen_m2)
+        views = one.views(frontiers, origins, seen_m2)
         count = len(one.prior.regions)
         there = np.bincount(one.labels[one.labels >= 0], minlength=count)
         here = np.bincount(one.labels[(seen_m2 >= FOUND_M2) & (one.labels >= 0)], minlength=count)

@@ -26,7 +26,9 @@ from prior_sg.services.segmenter.core.regions import components, ledger
 from prior_sg.services.segmenter.core.state import State
 
 
-def publish(state: State, events: list[RegionEvent], everything: bool, idle: bool, cfg: Config) -> RegionDelta | None:
+def publish(
+    state: State, events: list[RegionEvent], everything: bool, cfg: Config, idle: bool = False
+) -> RegionDelta | None:
     """What followers do not know yet; with `everything`, all. What lies beyond is told if `idle`."""
     places, regions = state.map.places, state.regions
     changed = everything or bool(regions.disturbed)

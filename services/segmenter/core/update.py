@@ -282,7 +282,7 @@ def _segment(state: State, switched: bool, idle: bool, cfg: Config) -> Iterator[
     inference.settle(state, cfg, hurried=not (idle or switched))
     changes = state.regions.partition(state.map, state.aim.in_force.labels, cfg.layers.storeys)
     inference.believe(state, cfg)
-    delta = report.publish(state, changes, switched or state.regions.ledger.head is None, idle, cfg)
+    delta = report.publish(state, changes, switched or state.regions.ledger.head is None, cfg, idle)
     state.labelling.labelled()
     if delta is not None:
         yield delta

@@ -23,6 +23,7 @@ from prior_sg.services.scene_store.core.queries.answering import reply
 from prior_sg.services.scene_store.core.queries.index import Index
 from prior_sg.services.scene_store.core.queries.ranking import calibrated
 from tests.deploy.api.test_scene import message
+from tests.help.foreseen import foresight
 from tests.help.world import prior
 
 ROBOT = "ada"
@@ -224,6 +225,24 @@ def test_the_command_answers_in_tables_and_json(capsys, saved):
     for words in (["within", "0", "0", "1", "1"], ["in-box", "0", "0", "0", "2", "2", "2"]):
         status, out, _ = asked(capsys, saved, *words, "--what", "place", "--json")
         assert status == 0 and len(json.loads(out)["answer"]) >= 2
+
+
+def test_the_command_tells_what_was_not_seen(capsys, tmp_path):
+    scene = message(foresight=foresight(message(), 2, "hall"))
+    path = tmp_path / "scene.msgpack"
+    path.write_bytes(encode(scene))
+    status, out, _ = asked(capsys, path, "unseen", "Hall", "--start", "place:1", "--json")
+    answer = json.loads(out)["answer"]
+    assert (
+        status == 0 and answer["prospects"][0]["opening"]["place_id"] == 3 and answer["route"]["place_ids"] == [1, 2, 3]
+    )
+    status, out, _ = asked(capsys, path, "unseen", "hall")
+    assert status == 0 and "predicted" in out and "adjacency 0.75" in out
+    status, out, _ = asked(capsys, path, "missing")
+    assert status == 0 and "hall" in out and "0.50" in out
+    status, _, err = asked(capsys, path, "unseen", "garage")
+    assert status and "knows no region 'garage'" in err
+    assert Scene(scene).missing()[0].label == "hall"
 
 
 @pytest.mark.parametrize("words", [("near", "nan", "0", "0"), ("near", "1e12", "0", "0"), ("region", "9" * 30)])

@@ -36,7 +36,9 @@ def three_rooms():
         low = number * (ROOM + 1) + 1
         regions[low : low + ROOM, 1:-1] = label
     regions[ways.heights < 0] = -1
-    return Plan(ways, grid != 0, regions.reshape(-1), ("hall", "bath", "kitchen"), 30, 2, 14)
+    blocked, labels = grid != 0, ("hall", "bath", "kitchen")
+    place = (ways.heights, ways.clearance, ways.origin_m, ways.voxel_m)
+    return Plan(*place, blocked, regions.reshape(-1), labels, range_cells=30, step=2, eye=14)
 
 
 PLAN = three_rooms()
@@ -44,8 +46,8 @@ PLAN = three_rooms()
 
 def node(x, y):
     """The node on the floor of a cell."""
-    level = int(np.flatnonzero(PLAN.ways.heights[x, y] >= 0)[0])
-    return (x * PLAN.ways.heights.shape[1] + y) * LEVELS + level
+    level = int(np.flatnonzero(PLAN.heights[x, y] >= 0)[0])
+    return (x * PLAN.heights.shape[1] + y) * LEVELS + level
 
 
 HALL = node(ROOM + 1 + ROOM // 2, ROOM // 2)
@@ -55,7 +57,7 @@ def home_trial():
     matrix = np.full((3, 3), 0.5, np.float32)
     np.fill_diagonal(matrix, 1.0)
     labels = np.arange(3)
-    nodes = np.flatnonzero((PLAN.ways.clearance.reshape(-1) >= 4) & (PLAN.regions >= 0))
+    nodes = np.flatnonzero((PLAN.clearance.reshape(-1) >= 4) & (PLAN.regions >= 0))
     return Trial("home", 1, PLAN, prior(LABELS, adjacency=matrix), labels, labels, crossings(PLAN), nodes)
 
 
@@ -74,7 +76,7 @@ def test_doors_are_frontiers_that_reveal_the_rooms_behind():
     assert {"bath", "kitchen"} <= revealed
     assert cost[HALL] == 0 and cost[node(3, 3)] == FAR
     at = next(at for at, nodes in enumerate(frontiers.nodes) if PLAN.labels[explorer.revealed(nodes)] == "bath")
-    straight_m = np.linalg.norm(PLAN.ways.position_m(frontiers.targets)[at] - PLAN.ways.position_m(np.array([HALL]))[0])
+    straight_m = np.linalg.norm(PLAN.position_m(frontiers.targets)[at] - PLAN.position_m(np.array([HALL]))[0])
     assert straight_m <= frontiers.steps[at] * CELL_M / 5 < 1.2 * straight_m
     go(explorer, before, frontiers, at)
     assert explorer.walked_m == pytest.approx(frontiers.steps[at] * CELL_M / 5, rel=0.02) or explorer.seen_m2()[1] > 3

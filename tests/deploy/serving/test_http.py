@@ -118,6 +118,9 @@ def test_questions_by_address(get):
     assert "word by word" in get(f"{V1}/search?q=room")["answer"]["note"]
     assert get(f"{V1}/task")["answer"]["task"] == "bench"
     assert "not kept" in get(f"{V1}/changes?since=9")["answer"]["reason"]
+    assert get(f"{V1}/missing")["answer"] == {"type": "missing", "labels": [], "openings": 0, "reason": ""}
+    assert "no opening" in get(f"{V1}/unseen?label=room kind 3")["answer"]["reason"]
+    assert "knows no region 'hall'" in get(f"{V1}/unseen?label=hall&from=1,1,1")["answer"]["reason"]
 
 
 def test_routes(get):

@@ -7,6 +7,7 @@ import json
 import os
 import sys
 
+import msgspec
 import numpy as np
 import pytest
 from mcp.client.client import Client
@@ -19,6 +20,7 @@ from prior_sg.deploy.serving.planner import planner, planner_app, uri
 from prior_sg.deploy.serving.planner_text import lean
 from prior_sg.deploy.serving.system import System
 from tests.deploy.serving.test_http import SCENE, TOKEN, relabel, renamed
+from tests.help.foreseen import foresight
 from tests.help.served import served
 from tests.help.store import StandIn
 
@@ -84,6 +86,24 @@ def test_five_questions_about_a_scene():
     assert way["answers"][0]["goal"]["id"] == 2 and len(way["answers"][0]["waypoints_m"]) <= 41
     assert candidates["answers"][0]["beliefs"][0]["label"] == "room kind 1"
     assert changed["answers"][0]["renamed"][0]["thing"]["label"] == "nursery" and changed["revision"] == 1
+
+
+def test_what_has_not_been_seen_is_foretold():
+    scene = msgspec.structs.replace(SCENE, foresight=foresight(SCENE, 40, "room kind 3"))
+
+    async def answers():
+        with opened() as (store, system):
+            store.store(scene)
+            async with Client(planner(system)) as client:
+                looked, _ = await called(client, "where_to_look", label="Room kind 3", start="1,1,1")
+                missing, _ = await called(client, "missing")
+                return json.loads(looked)["answers"][0], json.loads(missing)["answers"][0]
+
+    looked, missing = asyncio.run(answers())
+    assert [one["opening"]["place_id"] for one in looked["prospects"]] == [int(SCENE.place_ids[40])]
+    assert looked["route"]["length_m"] == pytest.approx(looked["prospects"][0]["way_m"], abs=0.01)
+    assert "place_ids" not in looked["route"] and looked["prospects"][0]["probability"] == 0.5
+    assert [one["label"] for one in missing["labels"]] == ["room kind 3"]
 
 
 FAULTY = [

@@ -15,6 +15,7 @@ from prior_sg.deploy.showing.material import Material
 from prior_sg.deploy.showing.text import LEAST_TOKENS, scene_text, tokens_of
 from prior_sg.schemas.regions import Transition
 from tests.deploy.api.test_scene import EMPTY, message, region
+from tests.help.foreseen import foresight
 
 replace = msgspec.structs.replace
 LARGE = synthetic_scene(4000, 800)
@@ -50,6 +51,13 @@ def test_it_says_what_is_where_and_how_to_get_there(tmp_path):
     ]
     save(Material(house()), tmp_path / "scene.txt")
     assert Scene(house()).to_text() == scene_text(house()) == (tmp_path / "scene.txt").read_text()
+
+
+def test_what_is_expected_is_told_as_such():
+    scene = msgspec.structs.replace(house(), foresight=foresight(house(), 1, "hall", 0.6))
+    assert "Expected, not seen: hall p 0.60, most likely p 0.60 beyond (2.5, 0.0, 1.0)\n" in scene_text(scene)
+    faint = msgspec.structs.replace(house(), foresight=foresight(house(), 1, "hall", 0.1))
+    assert "Expected" not in scene_text(faint)
 
 
 def test_without_task_and_regions():

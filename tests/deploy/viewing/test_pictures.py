@@ -13,6 +13,7 @@ from prior_sg.deploy.viewing.shapes import Mesh, difference
 from prior_sg.deploy.viewing.sources import Likeness
 from prior_sg.deploy.viewing.words import headline
 from prior_sg.services.scene_store.core.queries.index import Index
+from tests.help.foreseen import foresight
 from tests.help.homes import home, keyframe, region
 
 
@@ -36,6 +37,24 @@ def test_footprints_of_neighbours_touch_and_never_overlap() -> None:
     kitchen, bedroom = ground[3], ground[7]
     assert kitchen.vertices[:, 0].max() < 4.35 and bedroom.vertices[:, 0].min() > 4.15
     assert kitchen.vertices[:, 0].max() <= bedroom.vertices[:, 0].min() + 0.06
+
+
+def test_expected_regions_are_faint_discs_with_a_name() -> None:
+    scene = home()
+    label = scene.regions[0].label
+    picture = Painter().draw(msgspec.structs.replace(scene, foresight=foresight(scene, 2, label, 0.8)))
+    root = f"/foreseen/{int(scene.place_ids[2])}"
+    assert {name for name in picture if name.startswith("/foreseen/")} == {
+        f"{root}/{part}" for part in ("disc", "way", "name")
+    }
+    disc, name = picture[f"{root}/disc"], picture[f"{root}/name"]
+    assert (
+        disc.opacity == drawing.PREDICTED_OPACITY
+        and disc.color == picture[f"/regions/{scene.regions[0].id}/floor"].color
+    )
+    assert name.text.endswith("40 %, expected")
+    faint = Painter().draw(msgspec.structs.replace(scene, foresight=foresight(scene, 2, label, 0.1)))
+    assert not [name for name in faint if name.startswith("/foreseen/")]
 
 
 def test_a_region_under_another_has_a_name_and_no_ground() -> None:

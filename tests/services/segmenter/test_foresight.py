@@ -105,7 +105,8 @@ def test_narrow_openings_lead_elsewhere_and_wide_ones_show_more_of_the_same():
 def test_a_region_two_rooms_on_is_met_through_the_one_between():
     chained = home(hall_bedroom=0.9, bedroom_bath=0.9, hall_bath=0.01)
     apart = home(hall_bedroom=0.9, bedroom_bath=0.01, hall_bath=0.01)
-    assert foreseen(chained, found()).within[0, 1] > foreseen(apart, found()).within[0, 1]
+    cfg = msgspec.structs.replace(CFG, adjacency=1.0)
+    assert foreseen(chained, found(), cfg=cfg).within[0, 1] > foreseen(apart, found(), cfg=cfg).within[0, 1]
 
 
 def a_map():

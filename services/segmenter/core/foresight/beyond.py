@@ -56,5 +56,6 @@ def beyond(views: Views, expectation: Expectation, cfg: ForesightConfig) -> Beyo
     another = views.beliefs @ expectation.next
     ahead = views.beliefs @ expectation.ahead(cfg.steps, cfg.onward)
     later = views.beliefs @ expectation.ahead(max(cfg.steps - 1, 1), cfg.onward)
-    within = (1.0 - same)[:, None] * ahead + cfg.onward * same[:, None] * later
+    leads = views.beliefs @ expectation.leads(cfg.onward)
+    within = (1.0 - same)[:, None] * ahead + (leads * same)[:, None] * later
     return Beyond(same, (1.0 - same)[:, None] * another, np.minimum(within, 1.0))

@@ -47,13 +47,13 @@ class Expectation:
     next: np.ndarray  # (label, label) rows sum to one: another region, the one before given
     spread: np.ndarray  # (label,) mean number of other labels' regions that touch one, by the prior
 
-    def ahead(self, steps: int, onward: float) -> np.ndarray:
-        """Chance (label, label) that a region of r is met within so many regions after leaving one of i.
+    def leads(self, onward: float) -> np.ndarray:
+        """Chance (label,) that a region leads on: `onward` times its spread over the mean. Closets do not."""
+        return np.minimum(onward * self.spread / max(float(self.spread.mean()), FLOOR), 1.0)
 
-        A region in between leads on with chance `onward` times its spread, less than one: corridors do, closets do not.
-        """
-        count = len(self.next)
-        leads = np.minimum(onward * self.spread / max(float(self.spread.mean()), FLOOR), 1.0)
+    def ahead(self, steps: int, onward: float) -> np.ndarray:
+        """Chance (label, label) that a region of r is met within so many regions after leaving one of i."""
+        count, leads = len(self.next), self.leads(onward)
         met = self.next.copy()
         elsewhere = ~np.eye(count, dtype=bool)
         for _ in range(steps - 1):
