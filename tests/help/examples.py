@@ -93,7 +93,7 @@ PRIOR = priors.Prior(
         adjacency=f4([0.3, 0.4], [0.4, 0.3]),
         support=f4(1.0, 0.5),
     ),
-    tested=priors.Tested(regions=f4(2.0, 0.5)),
+    tested=priors.Counts(regions=f4(2.0, 0.5)),
 )
 EVIDENCE = priors.PriorEvidence(
     robot="r",

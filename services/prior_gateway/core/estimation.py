@@ -23,7 +23,6 @@ from prior_sg.schemas.priors import Prior, PriorEvidence
 from prior_sg.services.prior_gateway.core.turns import LEAST, MOST
 
 STRENGTHS = (1 / 64, 1 / 16, 1 / 4, 1.0, 4.0, 16.0)  # times the first guess
-USUAL = 1.0  # observed regions that an object's frequency in all regions is worth in one that has been observed
 MIXED = 0.1  # P(what is stated of a region is that of another)
 DOUBT = 1.5  # standard deviation of the logarithm of such a factor
 SAME = 0.1  # P(touching) of two regions of one name that were not taken for one
@@ -226,12 +225,10 @@ def revised_statements(prior: Prior, seen: Totals, strength: float) -> Statement
     existence = np.array([region.existence for region in prior.regions])
     existence = (strength * existence + seen.shares) / (strength + seen.maps)
     held, of_rows = likeliest_rows(prior.containment.astype(float), seen.instances, seen.holding, strength)
-    usual = ((of_rows * held + seen.holding) / (of_rows + seen.instances)).mean(axis=0)
-    of_usual = USUAL * np.minimum(seen.instances, 1.0)
     touching, others = prior.adjacency.astype(float), 1 - np.eye(len(existence))
     of_ends = strengths(touching, seen.pairs * others, seen.touching * others, strength)[0]
     of_pairs = np.minimum.outer(of_ends, of_ends)
-    held = (of_rows * held + of_usual * usual + seen.holding) / (of_rows + of_usual + seen.instances)
+    held = (of_rows * held + seen.holding) / (of_rows + seen.instances)
     touching = (of_pairs * touching + seen.touching) / (of_pairs + seen.pairs)
     return Statements(np.maximum(existence, LEAST_SHARE), np.clip(held, LEAST, MOST), np.clip(touching, LEAST, MOST))
 
