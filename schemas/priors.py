@@ -108,7 +108,7 @@ class Spread(Message, frozen=True, kw_only=True):
             raise ValueError("spread is negative")
 
 
-class Tested(Message, frozen=True, kw_only=True):
+class Counts(Message, frozen=True, kw_only=True):
     """What a prior's containment was counted in."""
 
     regions: Annotated[np.ndarray, Shape("float32", "region")]  # observed ones of each name, as far as they are that
@@ -135,6 +135,7 @@ class Prior(Message, frozen=True, kw_only=True, omit_defaults=True):
     spread: Spread | None = None
     levels: list[LevelPrior] = []  # above the regions, from below; where there are some, no region's `parent` counts
     tested: Tested | None = None  # where robots have revised it
+    tested: Counts | None = None  # where robots have revised it
 
     def check(self) -> None:
         """Whoever sent it: a model, a file or another robot."""

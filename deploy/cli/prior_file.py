@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 
 from prior_sg.deploy.errors import UserError
-from prior_sg.schemas.priors import ObjectPrior, Prior, Provenance, RegionPrior, Spread, Tested
+from prior_sg.schemas.priors import Counts, ObjectPrior, Prior, Provenance, RegionPrior, Spread
 
 FORMAT = "prior-sg prior 1"
 Rows = Mapping[str, Mapping[str, float]]
@@ -78,7 +78,7 @@ def read(path: Path) -> Prior:
             adjacency=_matrix(file.adjacency, regions, regions),
             provenance=file.provenance,
             spread=spread,
-            tested=None if file.tested is None else Tested(regions=np.array(file.tested, np.float32)),
+            tested=None if file.tested is None else Counts(regions=np.array(file.tested, np.float32)),
         )
     except (OSError, msgspec.MsgspecError, ValueError, TypeError, OverflowError, RecursionError) as error:
         raise PriorError(f"{path} is no usable prior: {error}") from error

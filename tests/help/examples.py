@@ -126,6 +126,7 @@ PRIOR = priors.Prior(
     ),
     levels=[LEVEL_PRIOR],
     tested=priors.Tested(regions=f4(2.0, 0.5)),
+    tested=priors.Counts(regions=f4(2.0, 0.5)),
 )
 EVIDENCE = priors.PriorEvidence(
     robot="r",

@@ -113,6 +113,7 @@ GOLDEN: list[Message] = [
                 adjacency=np.array([[1.0]], np.float32),
             )
         ],
+        tested=priors.Counts(regions=np.array([2.0], np.float32)),
     ),
     regions.RegionDelta(
         robot="r",

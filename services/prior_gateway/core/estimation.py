@@ -23,7 +23,7 @@ from prior_sg.schemas.priors import Prior, PriorEvidence
 from prior_sg.services.prior_gateway.core.turns import LEAST, MOST
 
 STRENGTHS = (1 / 64, 1 / 16, 1 / 4, 1.0, 4.0, 16.0)  # times the first guess
-USUAL = 1.0  # observed regions that an object's frequency in all regions is worth in one that has been observed
+MIXED = 0.1  # P(what is stated of a region is that of another)
 DOUBT = 1.5  # standard deviation of the logarithm of such a factor
 SAME = 0.1  # P(touching) of two regions of one name that were not taken for one
 LEAST_SHARE = 1e-4
@@ -224,31 +224,45 @@ def revised_statements(prior: Prior, seen: Totals, strength: float) -> Statement
     `strength` as the first guess; so is each region's row of adjacency, and a pair as many as the weaker of its two."""
     existence = np.array([region.existence for region in prior.regions])
     existence = (strength * existence + seen.shares) / (strength + seen.maps)
-    held, touching = prior.containment.astype(float), prior.adjacency.astype(float)
-    of_rows = strengths(held, seen.instances, seen.holding, strength)[:, None]
-    usual = ((of_rows * held + seen.holding) / (of_rows + seen.instances)).mean(axis=0)
-    of_usual = USUAL * np.minimum(seen.instances, 1.0)
-    others = 1 - np.eye(len(existence))
-    of_ends = strengths(touching, seen.pairs * others, seen.touching * others, strength)
+    held, of_rows = likeliest_rows(prior.containment.astype(float), seen.instances, seen.holding, strength)
+    touching, others = prior.adjacency.astype(float), 1 - np.eye(len(existence))
+    of_ends = strengths(touching, seen.pairs * others, seen.touching * others, strength)[0]
     of_pairs = np.minimum.outer(of_ends, of_ends)
-    return Statements(
-        np.maximum(existence, LEAST_SHARE),
-        np.clip(
-            (of_rows * held + of_usual * usual + seen.holding) / (of_rows + of_usual + seen.instances), LEAST, MOST
-        ),
-        np.clip((of_pairs * touching + seen.touching) / (of_pairs + seen.pairs), LEAST, MOST),
-    )
+    held = (of_rows * held + seen.holding) / (of_rows + seen.instances)
+    touching = (of_pairs * touching + seen.touching) / (of_pairs + seen.pairs)
+    return Statements(np.maximum(existence, LEAST_SHARE), np.clip(held, LEAST, MOST), np.clip(touching, LEAST, MOST))
 
 
-def strengths(stated: np.ndarray, trials: np.ndarray, hits: np.ndarray, guess: float) -> np.ndarray:
-    """Strength (row,) of each row of probabilities, among STRENGTHS times the guess, of highest posterior."""
+def likeliest_rows(
+    stated: np.ndarray, trials: np.ndarray, hits: np.ndarray, guess: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """What is stated of each region (region, object), and its strength (region, 1).
+
+    Whoever wrote the prior may have mixed up regions: a row takes the place of another one where that foretold the
+    other's counts so much better that MIXED, how often this happens, is outweighed.
+    """
+    strength, likely = strengths(stated, trials, hits, guess)
+    source, regions = np.arange(len(stated)), len(stated)
+    likely = likely + np.log(1 - MIXED)
+    for shift in range(1, regions):
+        other = np.roll(np.arange(regions), shift)
+        its_strength, its_likely = strengths(stated[other], trials, hits, guess)
+        better = its_likely + np.log(MIXED / (regions - 1)) > likely
+        source[better], strength[better] = other[better], its_strength[better]
+        likely = np.where(better, its_likely + np.log(MIXED / (regions - 1)), likely)
+    return stated[source], strength[:, None]
+
+
+def strengths(stated: np.ndarray, trials: np.ndarray, hits: np.ndarray, guess: float) -> tuple[np.ndarray, np.ndarray]:
+    """Strength (row,) of each row of probabilities, among STRENGTHS times the guess, of highest posterior; and that
+    (row,), as a logarithm without what is the same for all."""
     stated = np.clip(stated, LEAST, MOST)
     scores = []
     for factor in STRENGTHS:
         alpha, beta = factor * guess * stated, factor * guess * (1 - stated)
         likely = betaln(alpha + hits, beta + trials - hits) - betaln(alpha, beta)
         scores.append(likely.sum(axis=1) - 0.5 * (np.log(factor) / DOUBT) ** 2)
-    return guess * np.array(STRENGTHS)[np.argmax(scores, axis=0)]
+    return guess * np.array(STRENGTHS)[np.argmax(scores, axis=0)], np.max(scores, axis=0)
 
 
 def _shares(scores: np.ndarray) -> np.ndarray:

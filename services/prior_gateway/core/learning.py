@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import msgspec
 import numpy as np
 
-from prior_sg.schemas.priors import Prior, PriorEvidence, Provenance, Tested
+from prior_sg.schemas.priors import Counts, Prior, PriorEvidence, Provenance
 from prior_sg.services.prior_gateway.core.estimation import (
     Estimate,
     EstimationConfig,
@@ -59,7 +59,7 @@ def estimate(prior: Prior, evidence: Iterable[PriorEvidence], cfg: LearningConfi
 def revised(prior: Prior, seen: Totals, strength: float, made: Provenance) -> Prior:
     """The posterior mean. A region that no map has shown keeps its rows; its share falls as in any Dirichlet."""
     says = revised_statements(prior, seen, strength)
-    tested = Tested(regions=seen.instances.max(axis=1, initial=0).astype(np.float32))
+    tested = Counts(regions=seen.instances.max(axis=1, initial=0).astype(np.float32))
     return msgspec.structs.replace(_with(prior, says.existence, says.containment, says.adjacency, made), tested=tested)
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from prior_sg.schemas.levels import LevelPrior
 from prior_sg.schemas.names import normal
-from prior_sg.schemas.priors import MOST_OBJECTS, MOST_REGIONS, ObjectPrior, Prior, Provenance, RegionPrior, Tested
+from prior_sg.schemas.priors import MOST_OBJECTS, MOST_REGIONS, Counts, ObjectPrior, Prior, Provenance, RegionPrior
 from prior_sg.services.prior_gateway.core.answers import parse
 from prior_sg.services.prior_gateway.core.faults import Described, faults_of_keys, faults_of_names, faults_of_spans
 from prior_sg.services.prior_gateway.core.learning import corrected
@@ -222,6 +222,7 @@ def extended(prior: Prior, new: Addition, with_name: Callable[[str], list[str]])
         spread=None,  # nobody has said how far generations would differ about the new region
         tested=prior.tested and Tested(regions=np.append(prior.tested.regions, np.float32(0.0))),
         levels=_with_child(prior.levels, origin),
+        tested=prior.tested and Counts(regions=np.append(prior.tested.regions, np.float32(0.0))),
     )
 
 

@@ -104,9 +104,9 @@ def test_a_prior_that_is_right_stays_right():
 
 def test_a_row_that_foretold_what_was_seen_is_worth_more_than_one_that_did_not():
     rows, trials = np.array([[0.9, 0.1], [0.9, 0.1]]), np.full((2, 2), 10.0)
-    firm, loose = estimation.strengths(rows, trials, np.array([[9.0, 1.0], [1.0, 9.0]]), 4.0)
+    (firm, loose), _ = estimation.strengths(rows, trials, np.array([[9.0, 1.0], [1.0, 9.0]]), 4.0)
     assert firm >= 4.0 > loose
-    assert estimation.strengths(rows, np.zeros((2, 2)), np.zeros((2, 2)), 4.0).tolist() == [4.0, 4.0]
+    assert estimation.strengths(rows, np.zeros((2, 2)), np.zeros((2, 2)), 4.0)[0].tolist() == [4.0, 4.0]
 
 
 @pytest.mark.parametrize(

@@ -409,11 +409,10 @@ def test_counts_are_added_as_pseudo_counts():
     ]
     totals = counted(prior, seen)
     after = learning.revised(prior, totals, 4.0, Provenance(source="s"))
-    before = float(prior.containment[1, toilet])
-    rows = estimation.strengths(prior.containment, totals.instances, totals.holding, 4.0)
-    assert after.containment[1, toilet] == pytest.approx((rows[1] * before + 2) / (rows[1] + 4))
+    stated, rows = estimation.likeliest_rows(prior.containment, totals.instances, totals.holding, 4.0)
+    assert after.containment[1, toilet] == pytest.approx((rows[1, 0] * stated[1, toilet] + 2) / (rows[1, 0] + 4))
     assert after.containment[2] == pytest.approx(prior.containment[2].clip(0.01, 0.99)), "never seen, never changed"
-    ends = estimation.strengths(prior.adjacency, totals.pairs, totals.touching, 4.0)
+    ends = estimation.strengths(prior.adjacency, totals.pairs, totals.touching, 4.0)[0]
     worth = min(ends[0], ends[1])
     assert after.adjacency[0, 1] == pytest.approx((worth * float(prior.adjacency[0, 1]) + 4) / (worth + 4))
     share = (4 * prior.regions[0].existence + 2 * 0.75) / (4 + 2)

@@ -28,8 +28,9 @@ def has_say(prior: Prior) -> bool:
 
 
 def words_of_contents(prior: Prior, held: np.ndarray) -> np.ndarray:
-    """Sum (place, label) over the objects of log P(o | r) against its mean over the labels, as far as the row was counted;
-    `held` (place, object) says how surely each is there. That one is missing says nothing: it may not have been seen."""
+    """Sum (place, label) over the objects of log P(o | r) against its mean over the labels, as far as the row was
+    counted; `held` (place, object) says how surely each is there. One that is missing says nothing: it may not have
+    been seen."""
     counted = np.zeros(len(prior.regions)) if prior.tested is None else prior.tested.regions.astype(np.float64)
     likely = np.maximum(prior.containment.astype(np.float64), LEAST)
     words = np.log(likely / likely.mean(axis=0)) * (counted / (counted + TESTED_HALF))[:, None]

@@ -27,8 +27,8 @@ def held(view: ObjectView, positions_m: np.ndarray, regions: np.ndarray, ids: np
 
 
 def held_around(view: ObjectView, positions_m: np.ndarray, regions: np.ndarray) -> np.ndarray:
-    """How surely (place, concept) the region of each place holds each kind of object, the less the farther off: where two
-    rooms were taken for one region, each still hears its own things first."""
+    """How surely (place, concept) the region of each place holds each kind of object, the less the farther off: where
+    two rooms were taken for one region, each still hears its own things first."""
     found = np.zeros((len(positions_m), view.concepts.shape[1]))
     if not (len(view.ids) and len(positions_m)):
         return found
