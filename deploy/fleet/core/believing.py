@@ -74,7 +74,7 @@ def _joint(number: int, own: list[np.ndarray], beside: list[list[np.ndarray]]) -
 
 
 def _labels(one: Placed, joint: np.ndarray, names: list[str], beside: list[np.ndarray]) -> np.ndarray:
-    """Label (place,) of one map's places: that of its region where no other map has a place, else by the joint belief."""
+    """Label (place,) of one map's places: its region's where no other map has a place, else by joint belief."""
     calls = {region.id: names.index(region.label) for region in one.scene.regions if region.label in names}
     own = np.array([calls.get(region, -1) for region in one.scene.place_regions.tolist()], np.int64)
     met = np.zeros(len(own), bool)
