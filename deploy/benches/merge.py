@@ -1,8 +1,8 @@
 """`prior-sg bench merge`: do two robots' maps of one home find together, and never those of two homes?
 
 Each home is walked in two parts that share some of the way, each in a frame of its own (see `partial_walks`). The
-matcher's answer is right when it is within RIGHT_M at the middle of the first map and RIGHT_RAD in heading. Every first
-part is then matched with second parts of other homes: any answer but a refusal is a false accept. Where maps have found
+matcher's answer is right when it is within RIGHT_M at the middle of the first map and RIGHT_RAD in heading. Every
+part is then matched with the parts of other homes: any answer but a refusal is a false accept. Where maps have found
 together, the merged scene is judged as one walk through the whole home is.
 """
 
@@ -19,7 +19,7 @@ from prior_sg.deploy.evaluation.partial_walks import Part, PartialMap, Walks
 from prior_sg.deploy.fleet.core.config import MatchConfig
 from prior_sg.deploy.fleet.core.frames import apart
 from prior_sg.deploy.fleet.core.ids import Name
-from prior_sg.deploy.fleet.core.matching import Map, map_of, match, tested
+from prior_sg.deploy.fleet.core.matching import Map, map_of, match, weighed
 from prior_sg.deploy.fleet.core.merging import Memory, Source, merged
 from prior_sg.deploy.fleet.core.verify import Evidence
 from prior_sg.services.geometry import inverse
@@ -94,7 +94,7 @@ def outcome_of(two: Two, cfg: MatchConfig = CFG) -> Outcome:
     gap_m, gap_rad = np.inf, np.inf
     if answer.b_from_a is not None:
         gap_m, gap_rad = apart(answer.b_from_a, truth, first.shape.centers_m.mean(axis=0))
-    return Outcome(two, tested(truth, first, second).evidence, answer.b_from_a, answer.why, gap_m, gap_rad)
+    return Outcome(two, weighed(truth, first, second).evidence, answer.b_from_a, answer.why, gap_m, gap_rad)
 
 
 def figures(outcomes: list[Outcome]) -> dict[str, float]:
@@ -116,13 +116,14 @@ def figures(outcomes: list[Outcome]) -> dict[str, float]:
 
 
 def false_accepts(homes: Sequence[Two], most: int, cfg: MatchConfig = CFG) -> tuple[int, list[tuple[int, int]]]:
-    """How many pairs of different homes were tried, and those that were taken for one."""
-    pairs = [(one, other) for one in range(len(homes)) for other in range(len(homes)) if one != other]
+    """How many pairs of maps of different homes were tried, and the homes of those that were taken for one."""
+    both = itertools.product((0, 1), repeat=2)
+    pairs = [(*homes_, *parts) for homes_, parts in itertools.product(itertools.combinations(homes, 2), both)]
     order = np.random.default_rng(0).permutation(len(pairs))[:most]
     accepted = []
-    for one, other in (pairs[at] for at in order.tolist()):
-        if match(homes[one].maps[0], homes[other].maps[1], cfg).b_from_a is not None:
-            accepted.append((homes[one].seed, homes[other].seed))
+    for one, other, here, there in (pairs[at] for at in order.tolist()):
+        if match(one.maps[here], other.maps[there], cfg).b_from_a is not None:
+            accepted.append((one.seed, other.seed))
     return len(order), accepted
 
 

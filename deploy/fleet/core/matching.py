@@ -54,7 +54,7 @@ def match(a: Map, b: Map, cfg: MatchConfig) -> Match:
     names = names_in(a.scene, b.scene)
     tried = hypotheses(landmarks_of(a.scene, names), landmarks_of(b.scene, names), cfg)
     tried.sort(key=lambda one: -_promise(one, a.shape, b.shape))
-    found = [tested(refined(one.b_from_a, a.shape, b.shape), a, b) for one in tried[: cfg.refined]]
+    found = [weighed(refined(one.b_from_a, a.shape, b.shape), a, b) for one in tried[: cfg.refined]]
     found.sort(key=lambda one: -one.evidence.total)
     if not found:
         return Match(None, "no landmarks of both agree", [])
@@ -69,7 +69,7 @@ def _promise(one: Hypothesis, a: Shape, b: Shape) -> float:
     return one.weight + PROMISE_STEP * (WALL_WORTH * same - THROUGH_WORTH * through)
 
 
-def tested(b_from_a: np.ndarray, a: Map, b: Map) -> Found:
+def weighed(b_from_a: np.ndarray, a: Map, b: Map) -> Found:
     """A motion with what speaks for it."""
     return Found(b_from_a, evidence_of(b_from_a, (a.scene, a.shape), (b.scene, b.shape)))
 
