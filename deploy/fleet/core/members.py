@@ -4,8 +4,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from prior_sg.deploy.fleet.core.finding.matching import Map, map_of
 from prior_sg.deploy.fleet.core.ids import Name
-from prior_sg.deploy.fleet.core.matching import Map, map_of
 from prior_sg.schemas.objects import ObjectDelta
 from prior_sg.schemas.places import PlaceDelta
 from prior_sg.schemas.regions import RegionDelta

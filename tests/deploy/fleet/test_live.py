@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from prior_sg.deploy.fleet.bridge import SERVICE
-from prior_sg.deploy.fleet.core.frames import level
+from prior_sg.deploy.fleet.core.finding.frames import level
 from prior_sg.deploy.fleet.core.update import Config
 from prior_sg.deploy.keys.access import grants_of
 from prior_sg.deploy.keys.authority import Authority

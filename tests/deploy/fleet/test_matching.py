@@ -5,11 +5,11 @@ import itertools
 import numpy as np
 import pytest
 
-from prior_sg.deploy.fleet.core.cliques import maximum_clique
-from prior_sg.deploy.fleet.core.config import MatchConfig
-from prior_sg.deploy.fleet.core.frames import apart, fitted, level, yaw_of
-from prior_sg.deploy.fleet.core.matching import map_of, match, weighed
-from prior_sg.deploy.fleet.core.refine import refined
+from prior_sg.deploy.fleet.core.finding.cliques import maximum_clique
+from prior_sg.deploy.fleet.core.finding.config import MatchConfig
+from prior_sg.deploy.fleet.core.finding.frames import apart, fitted, level, yaw_of
+from prior_sg.deploy.fleet.core.finding.matching import map_of, match, weighed
+from prior_sg.deploy.fleet.core.finding.refine import refined
 from prior_sg.services.geometry import transform
 from tests.help import houses
 

@@ -4,13 +4,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from prior_sg.deploy.fleet.core.config import MatchConfig
-from prior_sg.deploy.fleet.core.consistency import Hypothesis, hypotheses
-from prior_sg.deploy.fleet.core.frames import apart
-from prior_sg.deploy.fleet.core.landmarks import landmarks_of, names_in
-from prior_sg.deploy.fleet.core.refine import refined
-from prior_sg.deploy.fleet.core.shape import Shape, shape_of
-from prior_sg.deploy.fleet.core.verify import THROUGH_WORTH, WALL_WORTH, Evidence, evidence_of, walls_of
+from prior_sg.deploy.fleet.core.finding.config import MatchConfig
+from prior_sg.deploy.fleet.core.finding.consistency import Hypothesis, hypotheses
+from prior_sg.deploy.fleet.core.finding.frames import apart
+from prior_sg.deploy.fleet.core.finding.landmarks import landmarks_of, names_in
+from prior_sg.deploy.fleet.core.finding.refine import refined
+from prior_sg.deploy.fleet.core.finding.shape import Shape, shape_of
+from prior_sg.deploy.fleet.core.finding.verify import THROUGH_WORTH, WALL_WORTH, Evidence, evidence_of, walls_of
 from prior_sg.schemas.scene import Scene
 
 PROMISE_STEP = 4  # one of so many points of a wall is looked at before a motion is fitted
