@@ -115,6 +115,13 @@ def hydra() -> tuple[dict, dict]:
     return hydra_bench()
 
 
+def merge() -> tuple[dict, dict]:
+    """Maps of two robots that find together; see `prior_sg.deploy.benches.merge`."""
+    from prior_sg.deploy.benches.merge import merge_bench
+
+    return merge_bench()
+
+
 def e2e() -> tuple[dict, dict]:
     """Keyframe in hand → region delta that follows from it, encoder time excluded, without transport."""
     keyframes = _sample_keyframes()
@@ -162,6 +169,7 @@ LONG: dict[str, Callable[[float], tuple[dict, dict]]] = {  # no part of `all`; t
     "foresight": lambda seconds: foresight(),  # worlds of every kind: ten minutes
     "view": lambda seconds: view(),  # needs an extra and a browser
     "hydra": lambda seconds: hydra(),  # needs an extra
+    "merge": lambda seconds: merge(),  # maps dozens of homes, which it keeps
 }
 
 

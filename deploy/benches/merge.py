@@ -1,8 +1,8 @@
 """`prior-sg bench merge`: do two robots' maps of one home find together, and never those of two homes?
 
 Each home is walked in two parts that share some of the way, each in a frame of its own (see `partial_walks`). The
-matcher's answer is right when it is within RIGHT_M at the middle of the first map and RIGHT_RAD in heading. Every first
-part is then matched with second parts of other homes: any answer but a refusal is a false accept. Where maps have found
+matcher's answer is right when it is within RIGHT_M at the middle of the first map and RIGHT_RAD in heading. Every
+part is then matched with the parts of other homes: any answer but a refusal is a false accept. Where maps have found
 together, the merged scene is judged as one walk through the whole home is.
 """
 
@@ -16,18 +16,23 @@ import numpy as np
 
 from prior_sg.deploy.evaluation.metrics import evaluate
 from prior_sg.deploy.evaluation.partial_walks import Part, PartialMap, Walks
-from prior_sg.deploy.fleet.core.config import MatchConfig
-from prior_sg.deploy.fleet.core.frames import apart
+from prior_sg.deploy.fleet.core.finding.config import MatchConfig
+from prior_sg.deploy.fleet.core.finding.frames import apart
+from prior_sg.deploy.fleet.core.finding.matching import Map, map_of, match, weighed
+from prior_sg.deploy.fleet.core.finding.verify import Evidence
 from prior_sg.deploy.fleet.core.ids import Name
-from prior_sg.deploy.fleet.core.matching import Map, map_of, match, tested
+from prior_sg.deploy.fleet.core.members import Relation, member_of_scene
 from prior_sg.deploy.fleet.core.merging import Memory, Source, merged
-from prior_sg.deploy.fleet.core.verify import Evidence
-from prior_sg.services.geometry import inverse
+from prior_sg.deploy.fleet.core.update import merged_of
+from prior_sg.schemas.scene import Scene
+from prior_sg.services.geometry import inverse, transform
 
 SCORED = range(60, 100)
 RIGHT_M, RIGHT_RAD = 0.5, np.radians(5)
 SHARED = (0.05, 0.7)  # share of the walk that both parts hold, drawn anew for each home
 DIFFERENT = 1000  # pairs of different homes
+LEAST_PLACES = 8  # of a region whose number is looked for the next day
+SAME_OBJECT_M = 0.5
 OVERLAPS_M2 = (0.0, 10.0, 20.0, 40.0, np.inf)
 FOLDER = Path("out/bench/merge")
 CFG = MatchConfig()
@@ -59,7 +64,7 @@ class Outcome(NamedTuple):
     @property
     def right(self) -> bool:
         """Whether an answer was given, and a right one."""
-        return self.found is not None and self.gap_m < RIGHT_M and self.gap_rad < RIGHT_RAD
+        return self.found is not None and bool(self.gap_m < RIGHT_M and self.gap_rad < RIGHT_RAD)
 
 
 def merge_bench(seeds: Sequence[int] = SCORED, folder: Path = FOLDER) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -71,6 +76,7 @@ def merge_bench(seeds: Sequence[int] = SCORED, folder: Path = FOLDER) -> tuple[d
     tried, accepted = false_accepts(homes, DIFFERENT)
     metrics |= {"different_pairs": tried, "false_accepts": len(accepted)}
     metrics |= worth(walks, outcomes)
+    metrics |= resumed(outcomes)
     return metrics, {"homes": len(homes), "seeds": f"{min(seeds)}-{max(seeds)}", "right_m": RIGHT_M}
 
 
@@ -94,7 +100,7 @@ def outcome_of(two: Two, cfg: MatchConfig = CFG) -> Outcome:
     gap_m, gap_rad = np.inf, np.inf
     if answer.b_from_a is not None:
         gap_m, gap_rad = apart(answer.b_from_a, truth, first.shape.centers_m.mean(axis=0))
-    return Outcome(two, tested(truth, first, second).evidence, answer.b_from_a, answer.why, gap_m, gap_rad)
+    return Outcome(two, weighed(truth, first, second).evidence, answer.b_from_a, answer.why, gap_m, gap_rad)
 
 
 def figures(outcomes: list[Outcome]) -> dict[str, float]:
@@ -116,13 +122,14 @@ def figures(outcomes: list[Outcome]) -> dict[str, float]:
 
 
 def false_accepts(homes: Sequence[Two], most: int, cfg: MatchConfig = CFG) -> tuple[int, list[tuple[int, int]]]:
-    """How many pairs of different homes were tried, and those that were taken for one."""
-    pairs = [(one, other) for one in range(len(homes)) for other in range(len(homes)) if one != other]
+    """How many pairs of maps of different homes were tried, and the homes of those that were taken for one."""
+    both = itertools.product((0, 1), repeat=2)
+    pairs = [(*homes_, *parts) for homes_, parts in itertools.product(itertools.combinations(homes, 2), both)]
     order = np.random.default_rng(0).permutation(len(pairs))[:most]
     accepted = []
-    for one, other in (pairs[at] for at in order.tolist()):
-        if match(homes[one].maps[0], homes[other].maps[1], cfg).b_from_a is not None:
-            accepted.append((homes[one].seed, homes[other].seed))
+    for one, other, here, there in (pairs[at] for at in order.tolist()):
+        if match(one.maps[here], other.maps[there], cfg).b_from_a is not None:
+            accepted.append((one.seed, other.seed))
     return len(order), accepted
 
 
@@ -146,3 +153,52 @@ def worth(walks: Walks, outcomes: list[Outcome]) -> dict[str, float]:
         scores["f1_s_full"].append(evaluate(whole.scene, whole.voxels, truth)["f1_s"])
         scores["f1_s_better_part"].append(max(evaluate(scene, whole.voxels, truth)["f1_s"] for scene in alone))
     return {name: statistics.mean(values) if values else float("nan") for name, values in scores.items()}
+
+
+def resumed(outcomes: list[Outcome]) -> dict[str, float]:
+    """The second part as the next day's session of the robot that walked the first, in the same home: shares of regions
+    and of objects seen on both days that keep their numbers, and objects that were wrongly said to have gone or moved.
+    """
+    regions, objects, changes = [], [], []
+    for one in outcomes:
+        if one.found is None or not one.right:
+            continue
+        former, present = (member_of_scene(part.scene, day) for day, part in enumerate(one.two.parts))
+        former.relation, present.former = Relation(np.eye(4), given=True), False
+        present.relation = Relation(inverse(one.found), given=False)
+        memory = Memory()
+        before, _ = merged_of("home", [former], memory)
+        after, said = merged_of("home", [present, former], memory)
+        regions += _regions_kept(before.scene, after.scene)
+        together = {frozenset(members) for members in after.objects.values() if len(members) > 1}
+        pairs = _both_days(one.two)
+        objects += [frozenset(((former.name, a), (present.name, b))) in together for a, b in pairs]
+        changes.append(len(said))
+    return {
+        "resumed_regions_kept": float(np.mean(regions)) if regions else float("nan"),
+        "resumed_objects_kept": float(np.mean(objects)) if objects else float("nan"),
+        "resumed_wrong_changes_per_home": float(np.mean(changes)) if changes else float("nan"),
+    }
+
+
+def _regions_kept(before: Scene, after: Scene) -> list[bool]:
+    """Of each region that had some places and still has: whether most of these are in the region of its number."""
+    now = dict(zip(after.place_ids.tolist(), after.place_regions.tolist(), strict=True))
+    kept = []
+    for region in before.regions:
+        places = [now[p] for p in before.place_ids[before.place_regions == region.id].tolist() if p in now]
+        if region.place_count >= LEAST_PLACES and len(places) >= LEAST_PLACES / 2:
+            kept.append(places.count(region.id) > len(places) / 2)
+    return kept
+
+
+def _both_days(two: Two) -> list[tuple[int, int]]:
+    """Numbers of objects of both parts that are truly one: of one name, within SAME_OBJECT_M under the true motion."""
+    first, second = (part.scene.objects for part in two.parts)
+    spots_m = transform(two.second_from_first, np.array([item.position_m for item in first]).reshape(-1, 3))
+    return [
+        (a.id, b.id)
+        for a, spot_m in zip(first, spots_m, strict=True)
+        for b in second
+        if a.label == b.label and np.linalg.norm(spot_m - np.array(b.position_m)) < SAME_OBJECT_M
+    ]

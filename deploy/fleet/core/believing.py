@@ -1,8 +1,9 @@
 """What several robots together believe of each place's label (pure).
 
 Posteriors of robots that saw the same spot are multiplied and divided by the prior they share, the unknown mass of each
-counting as the prior. Two regions that are one room seen twice are settled as a whole, each robot's mean belief of it
-being one voice; where they merely overlap, each place is settled for itself.
+counting as the prior. A place keeps the label of its robot's region where nobody else has seen it; elsewhere the joint
+belief names it. Then neighbours agree: a few rounds in which each place takes the label that its belief and the places
+beside it, by the width of the way there, make likeliest.
 """
 
 from collections.abc import Sequence
@@ -11,12 +12,12 @@ from typing import NamedTuple
 import numpy as np
 
 from prior_sg.deploy.fleet.core.fusing import Fused, Placed
-from prior_sg.schemas.regions import NO_REGION
 
 FLOOR = 1e-3  # of any label's probability, before it is multiplied
-ONE_ROOM = 0.6  # share of two regions' places beside each other, from which they are one room, whatever they are called
-MET = 0.5  # the same of the places that lie beside the other map, when both are called alike
-LEAST_MET = 3
+LEAST = 1e-4  # of any label's joint probability
+ROUNDS = 5
+NEIGHBOUR, OWN = 1.0, 1.0  # what a neighbour across an open way, and the label so far, are worth in log-likelihood
+OPEN_M = 0.6  # clearance from which a way is open
 
 
 class Believed(NamedTuple):
@@ -29,35 +30,28 @@ class Believed(NamedTuple):
     predicted: np.ndarray  # (node,) bool
 
 
-Room = tuple[int, int]  # number of the map, id of its region
-
-
 def believed(maps: Sequence[Placed], found: Fused) -> Believed:
     """Labels and beliefs of all nodes."""
     names = sorted({label for one in maps for label in one.scene.labels})
-    if not names:
-        count = len(found.ids)
-        none = np.zeros((count, 0))
-        return Believed([], np.full(count, -1), none, np.ones(count), np.zeros(count, bool))
-    own = [_spread(one, names) for one in maps]
-    joint = [_joint(number, own, found.beside) for number in range(len(maps))]
-    rooms = _rooms(maps, found, own)
     count = len(found.ids)
+    if not names:
+        return Believed([], np.full(count, -1), np.zeros((count, 0)), np.ones(count), np.zeros(count, bool))
+    own = [_spread(one, names) for one in maps]
     logs, unknown = np.zeros((count, len(names))), np.ones(count)
     labels, seen, predicted = np.full(count, -1), np.zeros(count, int), np.ones(count, bool)
     for number, one in reversed(list(enumerate(maps))):
-        nodes = found.node_of[number]
-        np.add.at(logs, nodes, joint[number])
+        nodes, joint = found.node_of[number], _joint(number, own, found.beside)
+        np.add.at(logs, nodes, joint)
         np.add.at(seen, nodes, 1)
         np.minimum.at(unknown, nodes, one.scene.unknown.astype(float))
         predicted[nodes] &= np.isin(one.scene.place_ids, one.scene.predicted_ids)
-        mine = {region: label for (k, region), label in rooms.items() if k == number}
-        told = _labels(one, joint[number], names, mine, found.beside[number])
+        told = _labels(one, joint, names, found.beside[number])
         labels[nodes] = np.where(told >= 0, told, labels[nodes])
     logs /= np.maximum(seen, 1)[:, None]
     posteriors = np.exp(logs - logs.max(axis=1, keepdims=True))
     posteriors /= posteriors.sum(axis=1, keepdims=True)
-    return Believed(names, labels, posteriors, unknown, predicted)
+    several = len(maps) > 1
+    return Believed(names, _agreed(labels, posteriors, found) if several else labels, posteriors, unknown, predicted)
 
 
 def _spread(one: Placed, names: list[str]) -> np.ndarray:
@@ -79,65 +73,31 @@ def _joint(number: int, own: list[np.ndarray], beside: list[list[np.ndarray]]) -
     return logs
 
 
-def _rooms(maps: Sequence[Placed], found: Fused, own: list[np.ndarray]) -> dict[Room, int]:
-    """The label of each region that is one room with another map's."""
-    held = [{int(r): one.scene.place_regions == r for r in np.unique(one.scene.place_regions)} for one in maps]
-    means = [
-        {region: own[k][rows].mean(axis=0) for region, rows in regions.items() if region != NO_REGION}
-        for k, regions in enumerate(held)
-    ]
-    group: dict[Room, set[Room]] = {(k, r): {(k, r)} for k, regions in enumerate(means) for r in regions}
-    for later in range(len(maps)):
-        for earlier in range(later):
-            for one, other in _same_rooms(maps, found, held, earlier, later):
-                joined = group[one] | group[other]
-                for member in joined:
-                    group[member] = joined
-    return {
-        room: int(np.argmax(sum(means[k][r] for k, r in sorted(members))))
-        for room, members in group.items()
-        if len(members) > 1
-    }
-
-
-def _same_rooms(
-    maps: Sequence[Placed], found: Fused, held: list[dict[int, np.ndarray]], one: int, other: int
-) -> list[tuple[Room, Room]]:
-    """Regions of two maps that are each other's counterpart."""
-    regions = maps[one].scene.place_regions, maps[other].scene.place_regions
-    calls = [{region.id: region.label for region in maps[k].scene.regions} for k in (one, other)]
-    shares: list[dict[tuple[int, int], tuple[float, float]]] = []
-    for side, (here, there) in enumerate(((one, other), (other, one))):
-        rows = found.beside[here][there]
-        met = rows >= 0
-        table: dict[tuple[int, int], tuple[float, float]] = {}
-        mine, theirs = regions[side][met], regions[1 - side][rows[met]]
-        for a, b in {*zip(mine.tolist(), theirs.tolist(), strict=True)}:
-            both, of_a = int(((mine == a) & (theirs == b)).sum()), int((mine == a).sum())
-            if both >= LEAST_MET and NO_REGION not in (a, b):
-                table[a, b] = both / of_a, both / int(held[here][a].sum())
-        shares.append(table)
-    found_pairs = []
-    for (a, b), (of_met, of_all) in shares[0].items():
-        if (b, a) in shares[1]:
-            met_b, all_b = shares[1][b, a]
-            alike = calls[0].get(a) == calls[1].get(b) and min(of_met, met_b) >= MET
-            if alike or min(of_all, all_b) >= ONE_ROOM:
-                found_pairs.append(((one, a), (other, b)))
-    return found_pairs
-
-
-def _labels(
-    one: Placed, joint: np.ndarray, names: list[str], rooms: dict[int, int], beside: list[np.ndarray]
-) -> np.ndarray:
-    """Label (place,) of one map's places: that of the room, else of the region where nobody objects, else of the joint
-    belief."""
+def _labels(one: Placed, joint: np.ndarray, names: list[str], beside: list[np.ndarray]) -> np.ndarray:
+    """Label (place,) of one map's places: its region's where no other map has a place, else by joint belief."""
     calls = {region.id: names.index(region.label) for region in one.scene.regions if region.label in names}
-    regions = one.scene.place_regions.tolist()
-    own = np.array([calls.get(region, -1) for region in regions], np.int64)
-    settled = np.array([rooms.get(region, -1) for region in regions], np.int64)
+    own = np.array([calls.get(region, -1) for region in one.scene.place_regions.tolist()], np.int64)
     met = np.zeros(len(own), bool)
     for rows in beside:
         met |= rows >= 0
-    best = np.where(met & (own >= 0), joint.argmax(axis=1), own) if joint.size else own
-    return np.where(settled >= 0, settled, best)
+    return np.where(met & (own >= 0), joint.argmax(axis=1), own) if len(own) else own
+
+
+def _agreed(labels: np.ndarray, posteriors: np.ndarray, found: Fused) -> np.ndarray:
+    """Labels (node,) after neighbours were heard; a node without a label keeps none."""
+    known = np.flatnonzero(labels >= 0)
+    logs = np.log(np.maximum(posteriors, LEAST))
+    logs[known, labels[known]] += OWN
+    weights = NEIGHBOUR * np.minimum(found.clearances_m / OPEN_M, 1.0)
+    now = labels
+    for _ in range(ROUNDS):
+        votes = np.zeros_like(logs)
+        for here, there in ((0, 1), (1, 0)):
+            heard = now[found.edges[:, there]] >= 0
+            ends = found.edges[heard]
+            np.add.at(votes, (ends[:, here], now[ends[:, there]]), weights[heard])
+        then = np.where(labels >= 0, (logs + votes).argmax(axis=1), -1)
+        if (then == now).all():
+            break
+        now = then
+    return now

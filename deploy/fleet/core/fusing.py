@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
+from prior_sg.deploy.fleet.core.finding.shape import Shape
 from prior_sg.deploy.fleet.core.ids import Name
-from prior_sg.deploy.fleet.core.shape import Shape
 from prior_sg.schemas.scene import Scene
 from prior_sg.services.geometry import transform
 

@@ -4,9 +4,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from prior_sg.deploy.fleet.core.finding.matching import Map, map_of
 from prior_sg.deploy.fleet.core.ids import Name
-from prior_sg.deploy.fleet.core.matching import Map, map_of
-from prior_sg.schemas.codec import Message
 from prior_sg.schemas.objects import ObjectDelta
 from prior_sg.schemas.places import PlaceDelta
 from prior_sg.schemas.regions import RegionDelta
@@ -90,10 +89,15 @@ class Followed:
                     self.member.touch()
         return None
 
-    def lacking(self, delta: Message) -> bool:
+    def lacking(self, delta: Delta) -> bool:
         """Whether the stream of this delta has a gap."""
-        of = {PlaceDelta: self.places, RegionDelta: self.regions, ObjectDelta: self.objects}
-        return of[type(delta)].needs_snapshot  # type: ignore[index]
+        match delta:
+            case PlaceDelta():
+                return self.places.needs_snapshot
+            case RegionDelta():
+                return self.regions.needs_snapshot
+            case ObjectDelta():
+                return self.objects.needs_snapshot
 
     def _begun(self, delta: PlaceDelta) -> Member | None:
         """A new writer that knows nothing of the former places begins a session: the former map stays as it is."""
@@ -111,7 +115,7 @@ class Followed:
 def _goes_on(graph: scenes.Graph, delta: PlaceDelta) -> bool:
     """Whether the places of a new writer are the former ones: most ids are where they were."""
     known = [
-        np.linalg.norm(np.subtract(graph.places[place].position_m, position_m)) < KEPT_M
+        float(np.linalg.norm(np.subtract(graph.places[place].position_m, position_m))) < KEPT_M
         for place, position_m in zip(delta.place_ids.tolist(), delta.positions_m, strict=True)
         if place in graph.places
     ]

@@ -6,10 +6,10 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
+from prior_sg.deploy.fleet.core.finding.shape import Shape
+from prior_sg.deploy.fleet.core.finding.verify import CLEAR_M, SEEN_M
 from prior_sg.deploy.fleet.core.fusing import ALIKE_M, ONE_M
-from prior_sg.deploy.fleet.core.shape import Shape
 from prior_sg.deploy.fleet.core.things import SAME_M
-from prior_sg.deploy.fleet.core.verify import CLEAR_M, SEEN_M
 from prior_sg.schemas.objects import SceneObject
 from prior_sg.schemas.scene import Scene
 from prior_sg.services.geometry import transform

@@ -10,13 +10,13 @@ from dataclasses import dataclass, field
 import msgspec
 import numpy as np
 
-from prior_sg.deploy.fleet.core.config import MatchConfig
-from prior_sg.deploy.fleet.core.frames import apart, level
+from prior_sg.deploy.fleet.core.finding.config import MatchConfig
+from prior_sg.deploy.fleet.core.finding.frames import apart, level
+from prior_sg.deploy.fleet.core.finding.matching import fault_of, map_of, match, weighed
+from prior_sg.deploy.fleet.core.finding.refine import refined
 from prior_sg.deploy.fleet.core.ids import Name
-from prior_sg.deploy.fleet.core.matching import fault_of, map_of, match, tested
 from prior_sg.deploy.fleet.core.members import Delta, Followed, Member, Relation
 from prior_sg.deploy.fleet.core.merging import Memory, Merged, Source, merged
-from prior_sg.deploy.fleet.core.refine import refined
 from prior_sg.deploy.fleet.core.sessions import Change, Present, remembered, said
 from prior_sg.deploy.fleet.core.telling import Teller
 from prior_sg.schemas.codec import Message
@@ -225,7 +225,7 @@ def _correct(state: State, one: Member, members: list[Member], cfg: Config) -> N
         return
     other = map_of(others)
     pose = refined(one.relation.fleet_from_own, one.map().shape, other.shape)
-    evidence = tested(pose, one.map(), other).evidence
+    evidence = weighed(pose, one.map(), other).evidence
     lenient = msgspec.structs.replace(
         cfg.match, fitting_least=DOUBT * cfg.match.fitting_least, landmarks_least=0, evidence_least=0.0
     )

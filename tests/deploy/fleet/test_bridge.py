@@ -7,7 +7,7 @@ import pytest
 from prior_sg.deploy.cli.fleet import transforms_of
 from prior_sg.deploy.errors import UserError
 from prior_sg.deploy.fleet.bridge import KEEP_NUMBERS, SERVICE
-from prior_sg.deploy.fleet.core.frames import level
+from prior_sg.deploy.fleet.core.finding.frames import level
 from prior_sg.deploy.fleet.core.update import Config, NumbersKept
 from prior_sg.deploy.fleet.keeping import keep
 from prior_sg.schemas.places import PlaceDelta, SnapshotRequest

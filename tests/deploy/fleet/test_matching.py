@@ -5,11 +5,11 @@ import itertools
 import numpy as np
 import pytest
 
-from prior_sg.deploy.fleet.core.cliques import maximum_clique
-from prior_sg.deploy.fleet.core.config import MatchConfig
-from prior_sg.deploy.fleet.core.frames import apart, fitted, level, yaw_of
-from prior_sg.deploy.fleet.core.matching import map_of, match, tested
-from prior_sg.deploy.fleet.core.refine import refined
+from prior_sg.deploy.fleet.core.finding.cliques import maximum_clique
+from prior_sg.deploy.fleet.core.finding.config import MatchConfig
+from prior_sg.deploy.fleet.core.finding.frames import apart, fitted, level, yaw_of
+from prior_sg.deploy.fleet.core.finding.matching import map_of, match, weighed
+from prior_sg.deploy.fleet.core.finding.refine import refined
 from prior_sg.services.geometry import transform
 from tests.help import houses
 
@@ -70,8 +70,8 @@ def test_fitting_brings_a_wrong_start_nearer():
 
 def test_walls_in_anothers_free_space_speak_against_it():
     one, other = map_of(houses.scene()), map_of(houses.scene("r2"))
-    right = tested(np.eye(4), one, other).evidence
-    wrong = tested(level(0.0, np.array((1.5, 0.7, 0.0))), one, other).evidence
+    right = weighed(np.eye(4), one, other).evidence
+    wrong = weighed(level(0.0, np.array((1.5, 0.7, 0.0))), one, other).evidence
     assert right.fitting == 1.0 and right.objects_same == len(houses.THINGS) and not right.objects_gone
     assert wrong.fitting < 0.6 and wrong.objects_same <= 2 and wrong.total < 0.2 * right.total
 

@@ -4,7 +4,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from prior_sg.deploy.fleet.core.frames import level
+from prior_sg.deploy.fleet.core.finding.frames import level
 from prior_sg.deploy.fleet.core.fusing import lens_m
 from prior_sg.deploy.fleet.core.ids import Ids, Name
 from prior_sg.deploy.fleet.core.merging import Memory, Source, merged

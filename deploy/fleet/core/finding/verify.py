@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from prior_sg.deploy.fleet.core.shape import Shape
+from prior_sg.deploy.fleet.core.finding.shape import Shape
 from prior_sg.schemas.objects import SceneObject
 from prior_sg.schemas.scene import Scene
 from prior_sg.services.geometry import inverse, transform

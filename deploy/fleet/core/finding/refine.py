@@ -7,8 +7,8 @@ directions there do not agree, and far residuals are left out.
 import numpy as np
 from scipy.spatial import cKDTree
 
-from prior_sg.deploy.fleet.core.frames import level
-from prior_sg.deploy.fleet.core.shape import Shape
+from prior_sg.deploy.fleet.core.finding.frames import level
+from prior_sg.deploy.fleet.core.finding.shape import Shape
 from prior_sg.services.geometry import transform
 
 Surface = tuple[np.ndarray, np.ndarray]  # points (n, 3), directions (n, 3) out of it

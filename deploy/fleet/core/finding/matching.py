@@ -4,13 +4,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from prior_sg.deploy.fleet.core.config import MatchConfig
-from prior_sg.deploy.fleet.core.consistency import Hypothesis, hypotheses
-from prior_sg.deploy.fleet.core.frames import apart
-from prior_sg.deploy.fleet.core.landmarks import landmarks_of, names_in
-from prior_sg.deploy.fleet.core.refine import refined
-from prior_sg.deploy.fleet.core.shape import Shape, shape_of
-from prior_sg.deploy.fleet.core.verify import THROUGH_WORTH, WALL_WORTH, Evidence, evidence_of, walls_of
+from prior_sg.deploy.fleet.core.finding.config import MatchConfig
+from prior_sg.deploy.fleet.core.finding.consistency import Hypothesis, hypotheses
+from prior_sg.deploy.fleet.core.finding.frames import apart
+from prior_sg.deploy.fleet.core.finding.landmarks import landmarks_of, names_in
+from prior_sg.deploy.fleet.core.finding.refine import refined
+from prior_sg.deploy.fleet.core.finding.shape import Shape, shape_of
+from prior_sg.deploy.fleet.core.finding.verify import THROUGH_WORTH, WALL_WORTH, Evidence, evidence_of, walls_of
 from prior_sg.schemas.scene import Scene
 
 PROMISE_STEP = 4  # one of so many points of a wall is looked at before a motion is fitted
@@ -54,7 +54,7 @@ def match(a: Map, b: Map, cfg: MatchConfig) -> Match:
     names = names_in(a.scene, b.scene)
     tried = hypotheses(landmarks_of(a.scene, names), landmarks_of(b.scene, names), cfg)
     tried.sort(key=lambda one: -_promise(one, a.shape, b.shape))
-    found = [tested(refined(one.b_from_a, a.shape, b.shape), a, b) for one in tried[: cfg.refined]]
+    found = [weighed(refined(one.b_from_a, a.shape, b.shape), a, b) for one in tried[: cfg.refined]]
     found.sort(key=lambda one: -one.evidence.total)
     if not found:
         return Match(None, "no landmarks of both agree", [])
@@ -69,7 +69,7 @@ def _promise(one: Hypothesis, a: Shape, b: Shape) -> float:
     return one.weight + PROMISE_STEP * (WALL_WORTH * same - THROUGH_WORTH * through)
 
 
-def tested(b_from_a: np.ndarray, a: Map, b: Map) -> Found:
+def weighed(b_from_a: np.ndarray, a: Map, b: Map) -> Found:
     """A motion with what speaks for it."""
     return Found(b_from_a, evidence_of(b_from_a, (a.scene, a.shape), (b.scene, b.shape)))
 

@@ -9,10 +9,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from prior_sg.deploy.fleet.core.cliques import maximum_clique
-from prior_sg.deploy.fleet.core.config import MatchConfig
-from prior_sg.deploy.fleet.core.frames import apart, fitted, wrapped
-from prior_sg.deploy.fleet.core.landmarks import OBJECT, Landmarks
+from prior_sg.deploy.fleet.core.finding.cliques import maximum_clique
+from prior_sg.deploy.fleet.core.finding.config import MatchConfig
+from prior_sg.deploy.fleet.core.finding.frames import apart, fitted, wrapped
+from prior_sg.deploy.fleet.core.finding.landmarks import OBJECT, Landmarks
 from prior_sg.services.geometry import transform
 
 LEAST_CLIQUE = 3

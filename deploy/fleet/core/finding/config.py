@@ -19,7 +19,7 @@ class MatchConfig(msgspec.Struct, frozen=True, kw_only=True):
 
     least_places: int = 12  # in each map
     overlap_least_m2: float = 8.0  # of floor that both have seen
-    walls_least: int = 150  # points of walls that both have
+    walls_least: int = 110  # points of walls that both have
     fitting_least: float = 0.55  # share of the walls that both can tell of and both have
     landmarks_least: int = 3  # objects that agree
     evidence_least: float = 8.0  # log-likelihood ratio of all that was found, against chance

@@ -1,0 +1,59 @@
+"""What `prior-sg bench merge` counts, on small houses."""
+
+import numpy as np
+import pytest
+
+from prior_sg.deploy.benches import merge
+from prior_sg.deploy.evaluation.partial_walks import PartialMap, drifting, moved
+from prior_sg.deploy.fleet.core.finding.frames import level
+from prior_sg.deploy.fleet.core.finding.matching import map_of
+from prior_sg.services.geometry import inverse
+from tests.help import houses
+
+MOVED = level(2.3, np.array((12.0, -7.0, 0.4)))
+OTHER = [("kitchen", 0, 0, 4.2, 3), ("hallway", 4.2, 0, 5.6, 6), ("bedroom", 0, 3, 4.2, 6), ("bathroom", 5.6, 0, 8, 6)]
+
+
+def two(seed, first, second, pose=MOVED):
+    parts = PartialMap(first, np.eye(4), None), PartialMap(second, pose, None)
+    return merge.Two(seed, (map_of(first), map_of(second)), parts)
+
+
+@pytest.fixture(scope="module")
+def house():
+    return two(1, houses.scene(rooms=houses.ROOMS[:4]), houses.scene("r2", MOVED, rooms=houses.ROOMS[1:]))
+
+
+def test_right_answers_are_right_and_wrong_ones_wrong(house):
+    outcome = merge.outcome_of(house)
+    assert outcome.right and outcome.gap_m < 0.1
+    lying = two(1, house.parts[0].scene, house.parts[1].scene, level(0.3, np.zeros(3)) @ MOVED)
+    wrong = merge.outcome_of(lying)
+    assert wrong.found is not None and not wrong.right
+    figures = merge.figures([outcome, wrong])
+    assert figures["success"] == 0.5 and figures["wrong_transforms"] == 1
+    assert sum(figures[name] for name in figures if name.startswith("homes_overlap")) == 2
+
+
+def test_another_home_counts_as_tried_and_one_home_under_two_names_as_false(house):
+    things = [("stove", 3.5, 0.4), ("bed", 1.0, 5.2), ("toilet", 7.5, 5.5)]
+    another = houses.scene("r2", rooms=OTHER, things=things)
+    different = two(2, another, another, np.eye(4))
+    assert merge.false_accepts([house, different], 10) == (4, [])
+    tried, accepted = merge.false_accepts([house, house], 10)
+    assert tried == 4 and set(accepted) == {(1, 1)}
+
+
+def test_the_next_day_keeps_numbers(house):
+    figures = merge.resumed([merge.outcome_of(house)])
+    assert figures["resumed_regions_kept"] == 1.0 and figures["resumed_objects_kept"] == 1.0
+    assert figures["resumed_wrong_changes_per_home"] == 0.0
+
+
+def test_walks_are_moved_and_drift():
+    rng = np.random.default_rng(0)
+    pose = moved(rng)
+    assert pose[:3, :3] @ pose[:3, :3].T == pytest.approx(np.eye(3)) and pose[2, 2] > np.cos(np.radians(1.5))
+    told = drifting([pose] * 50, rng)
+    gaps_m = [np.linalg.norm((inverse(pose) @ one)[:3, 3]) for one in told]
+    assert 0.01 < max(gaps_m) < 0.4
