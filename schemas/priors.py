@@ -134,7 +134,6 @@ class Prior(Message, frozen=True, kw_only=True, omit_defaults=True):
     provenance: Provenance
     spread: Spread | None = None
     levels: list[LevelPrior] = []  # above the regions, from below; where there are some, no region's `parent` counts
-    tested: Tested | None = None  # where robots have revised it
     tested: Counts | None = None  # where robots have revised it
 
     def check(self) -> None:

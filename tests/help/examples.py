@@ -125,7 +125,6 @@ PRIOR = priors.Prior(
         support=f4(1.0, 0.5),
     ),
     levels=[LEVEL_PRIOR],
-    tested=priors.Tested(regions=f4(2.0, 0.5)),
     tested=priors.Counts(regions=f4(2.0, 0.5)),
 )
 EVIDENCE = priors.PriorEvidence(

@@ -104,7 +104,6 @@ GOLDEN: list[Message] = [
             adjacency=np.array([[0.3]], np.float32),
             support=np.array([1.0], np.float32),
         ),
-        tested=priors.Tested(regions=np.array([2.0], np.float32)),
         levels=[
             levels.LevelPrior(
                 name="zone",

@@ -220,7 +220,6 @@ def extended(prior: Prior, new: Addition, with_name: Callable[[str], list[str]])
         containment=held.astype(np.float32),
         adjacency=touching.astype(np.float32),
         spread=None,  # nobody has said how far generations would differ about the new region
-        tested=prior.tested and Tested(regions=np.append(prior.tested.regions, np.float32(0.0))),
         levels=_with_child(prior.levels, origin),
         tested=prior.tested and Counts(regions=np.append(prior.tested.regions, np.float32(0.0))),
     )
