@@ -76,9 +76,8 @@ def load(
             row = step(stream, plan, seconds, folder / name.replace(", ", "-").replace(" ", ""))
             rows.append(row)
             segmented = row["segmented"]
-            say(
-                f"{name}: segmented after {segmented['p50_s']:.2f} / {segmented['p99_s']:.2f} s, follows: {row['follows']}"
-            )
+            late = f"{segmented['p50_s']:.2f} / {segmented['p99_s']:.2f} s"
+            say(f"{name}: segmented after {late}, follows: {row['follows']}")
             if not row["follows"]:
                 break
     return rows
