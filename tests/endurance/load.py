@@ -35,7 +35,7 @@ def step(stream: Stream, plan: Plan, seconds: float, folder: Path) -> dict[str, 
         "dropped": dropped,
         "place": percentiles([one.place_s for one in lateness]),
         "pyramid": percentiles([one.pyramid_s for one in lateness]),
-        "region": percentiles([one.region_s for one in lateness]),
+        "segmented": percentiles([one.segmented_s for one in lateness]),
         "cores": cores(first, last),
     }
     return figures | {"follows": follows(figures)}
@@ -44,13 +44,13 @@ def step(stream: Stream, plan: Plan, seconds: float, folder: Path) -> dict[str, 
 def follows(figures: dict[str, Any]) -> bool:
     """Whether the system keeps up with this load: keyframes come at their rate, none is dropped, and what follows them
     does not pile up."""
-    region = figures["region"]
+    segmented = figures["segmented"]
     return bool(
         figures["came"] >= KEPT_UP
         and not figures["dropped"]
-        and region["count"]
-        and region["never"] <= (1 - KEPT_UP) * (region["count"] + region["never"])
-        and region["p50_s"] <= LATEST_S
+        and segmented["count"]
+        and segmented["never"] <= (1 - KEPT_UP) * (segmented["count"] + segmented["never"])
+        and segmented["p50_s"] <= LATEST_S
     )
 
 
@@ -75,8 +75,9 @@ def load(
             name = f"{plan.robots} robots, {plan.rate_hz:g} Hz, {plan.workers} workers"
             row = step(stream, plan, seconds, folder / name.replace(", ", "-").replace(" ", ""))
             rows.append(row)
-            region = row["region"]
-            say(f"{name}: regions after {region['p50_s']:.2f} / {region['p99_s']:.2f} s, follows: {row['follows']}")
+            segmented = row["segmented"]
+            late = f"{segmented['p50_s']:.2f} / {segmented['p99_s']:.2f} s"
+            say(f"{name}: segmented after {late}, follows: {row['follows']}")
             if not row["follows"]:
                 break
     return rows

@@ -13,8 +13,8 @@ import psutil
 from prior_sg.schemas.features import Pyramid
 from prior_sg.schemas.frames import Keyframe
 from prior_sg.schemas.places import PlaceDelta
-from prior_sg.schemas.regions import RegionDelta
-from prior_sg.schemas.topics import KEYFRAME, PLACE_DELTA, PYRAMID, REGION_DELTA
+from prior_sg.schemas.status import Consumed
+from prior_sg.schemas.topics import JOURNAL, KEYFRAME, PLACE_DELTA, PYRAMID
 from prior_sg.services.runtime.bus import Sample, message_in
 from tests.endurance.edge import Edge
 
@@ -45,7 +45,7 @@ class Late(msgspec.Struct, frozen=True, kw_only=True):
     at_s: float
     place_s: float | None = None
     pyramid_s: float | None = None
-    region_s: float | None = None  # the first regions that were sent after the pyramid
+    segmented_s: float | None = None  # the segmenter has done with the pyramid; it tells regions where that is news
 
 
 class Meter:
@@ -55,10 +55,9 @@ class Meter:
         self.edge, self.began_s = edge, time.time()
         self.looks: list[Look] = []
         self._sent_s: dict[tuple[str, int], float] = {}
-        self._after: dict[str, dict[tuple[str, int], float]] = {"place": {}, "pyramid": {}, "region": {}}
-        self._open: dict[str, list[tuple[str, int]]] = {}  # by robot: with a pyramid, and no regions yet
+        self._after: dict[str, dict[tuple[str, int], float]] = {"place": {}, "pyramid": {}, "segmented": {}}
         self._lock = threading.Lock()
-        for topic in (KEYFRAME, PLACE_DELTA, PYRAMID, REGION_DELTA):
+        for topic in (KEYFRAME, PLACE_DELTA, PYRAMID, JOURNAL):
             edge.client.listen(topic, "*", self._saw)
 
     def look(self) -> Look:
@@ -100,13 +99,9 @@ class Meter:
                 case PlaceDelta():
                     self._after["place"].setdefault((message.robot, message.frame_id), at_s)
                 case Pyramid():
-                    keyframe = (message.robot, message.frame_id)
-                    if keyframe not in self._after["pyramid"]:
-                        self._after["pyramid"][keyframe] = at_s
-                        self._open.setdefault(message.robot, []).append(keyframe)
-                case RegionDelta():
-                    for keyframe in self._open.pop(message.robot, []):
-                        self._after["region"].setdefault(keyframe, at_s)
+                    self._after["pyramid"].setdefault((message.robot, message.frame_id), at_s)
+                case Consumed(service="segmenter", topic=PYRAMID.name):
+                    self._after["segmented"].setdefault((message.robot, message.frame_id), at_s)
 
 
 def slope_per_hour(looks: list[Look], value: Callable[[Look], float | None]) -> float:

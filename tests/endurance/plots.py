@@ -18,7 +18,7 @@ def draw(looks: list[Look], lateness: list[Late], path: Path) -> None:
         minutes = [at_min for at_min, _ in found]
         memory.plot(minutes, [one.resident_mb for _, one in found], label=name)
         handles.plot(minutes, [one.handles for _, one in found], label=name)
-    for kind in ("place_s", "pyramid_s", "region_s"):
+    for kind in ("place_s", "pyramid_s", "segmented_s"):
         came = [(one.at_s / 60, getattr(one, kind)) for one in lateness if getattr(one, kind) is not None]
         late.plot(*zip(*came, strict=True), ".", markersize=2, label=kind.removesuffix("_s"))
     for axes, what in ((memory, "resident MB"), (handles, "open handles"), (late, "s after the keyframe")):

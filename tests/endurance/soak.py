@@ -56,7 +56,7 @@ def summed(looks: list[Look], lateness: list, window_s: float) -> dict[str, Any]
         "disk_mb_per_hour": slope_per_hour(steady, lambda look: look.disk_mb),
         **{
             f"{kind}_{when}": percentiles([getattr(one, f"{kind}_s") for one in found])
-            for kind in ("place", "pyramid", "region")
+            for kind in ("place", "pyramid", "segmented")
             for when, found in (
                 ("first", [one for one in lateness if one.at_s < first_s + window_s]),
                 # What came last may still be under way.
