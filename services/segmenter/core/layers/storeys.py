@@ -25,8 +25,8 @@ class StoreyConfig(msgspec.Struct, frozen=True, kw_only=True):
     """What counts as a storey."""
 
     least_height_m: float = 2.2  # from floor to floor
-    least_m2: float = 12.0  # of places' discs on a floor
-    part_m2: float = 3.0  # the same of a region's part on one storey, where it is torn
+    least_m2: float = 30.0  # of places' discs on a floor
+    part_m2: float = 6.0  # the same of a region's part on one storey, where it is torn
     valley: float = 0.5  # density between two floors at most, of that at the lesser one
     tolerance_m: float = 0.3  # a bottom so far below a floor is still on it
     clutter_m: float = 0.8  # bottoms up to so far above a floor are on it
