@@ -120,6 +120,31 @@ def test_each_room_becomes_one_region_with_its_name():
         assert region.probability == pytest.approx(mean, abs=0.02)
 
 
+def test_the_levels_above_follow_the_regions():
+    positions, edges, frames = world()
+    zones = msgspec.structs.replace(prior(ROOMS), regions=[
+        msgspec.structs.replace(region, parent="night zone" if region.name == "bedroom" else "day zone")
+        for region in prior(ROOMS).regions
+    ])  # fmt: skip
+    run = Run().feed(place_delta(positions, edges), task(), zones, *frames, TICK)
+    told = {}
+    for delta in run.deltas:
+        told = {} if delta.snapshot else told
+        for key in delta.removed_nodes:
+            del told[key]
+        told |= {(node.level, node.id): node for node in delta.nodes}
+    assert told == run.state.layers.known
+    by_label = {region.label: region.id for region in run.reader.regions.values()}
+    assert {node.label: node.member_ids for node in told.values() if node.level == "zone"} == {
+        "day zone": sorted((by_label["kitchen"], by_label["hall"])),
+        "night zone": [by_label["bedroom"]],
+    }
+    assert [node.label for node in told.values() if node.level != "zone"] == ["floor 0", "building"]
+    assert {region.label: region.parent for region in run.reader.regions.values()}["hall"] == "day zone"
+    before = len(run.deltas)
+    assert len(run.feed(TICK, TICK).deltas) == before
+
+
 def test_posteriors_are_distributions_and_unseen_places_are_unknown():
     positions, edges, frames = world()
     lonely = np.vstack((positions, [(30.0, 30.0, 1.0)])).astype(np.float32)
