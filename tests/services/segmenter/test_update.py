@@ -35,6 +35,8 @@ from prior_sg.services.segmenter.core.config import AdjacencyConfig, Config
 from prior_sg.services.segmenter.core.energy.mrf import energy
 from prior_sg.services.segmenter.core.energy.solver import minimise
 from prior_sg.services.segmenter.core.experts.context import ObjectView
+from prior_sg.services.segmenter.core.layers.alignment import AlignmentConfig
+from prior_sg.services.segmenter.core.layers.stacking import LayersConfig
 from prior_sg.services.segmenter.core.map.place_map import edge_weights
 from prior_sg.services.segmenter.service import SERVICE
 from tests.help.world import (
@@ -126,7 +128,9 @@ def test_the_levels_above_follow_the_regions():
         msgspec.structs.replace(region, parent="night zone" if region.name == "bedroom" else "day zone")
         for region in prior(ROOMS).regions
     ])  # fmt: skip
-    run = Run().feed(place_delta(positions, edges), task(), zones, *frames, TICK)
+    free = LayersConfig(alignment=AlignmentConfig(node_cost=0.0))  # as a single room costs more than it gains
+    cfg = msgspec.structs.replace(CFG, layers=free)
+    run = Run(cfg=cfg).feed(place_delta(positions, edges), task(), zones, *frames, TICK)
     told = {}
     for delta in run.deltas:
         told = {} if delta.snapshot else told
