@@ -48,13 +48,16 @@ def test_floors_are_found_and_stairs_lie_between():
     assert found.between[64:76].mean() > 0.5 and not found.between[:64].any()
 
 
-@pytest.mark.parametrize("bottoms", ["slope", "hall", "far"])
+@pytest.mark.parametrize("bottoms", ["slope", "hall", "far", "trees"])
 def test_where_no_height_stands_out_there_is_one_storey(bottoms):
     (places, radii_m) = storey(0, 16)
     if bottoms == "slope":  # a ramp that rises 5 m
         places[:, 2] += places[:, 0] / 3
     elif bottoms == "hall":  # spheres as large as the hall is high stand on its floor
         places[:, 2], radii_m = 3.0, np.full(len(places), 3.0)
+    elif bottoms == "trees":  # free space over a few of them
+        places = np.concatenate((places, places[:10] + (0, 0, 4.0)))
+        radii_m = np.concatenate((radii_m, radii_m[:10]))
     else:  # a mistake of the map, too far off to be drawn up
         places[0, 2] = 1e7
     assert len(storeys_of(graph_of([(places, radii_m)]), CFG).floors_m) == 1
