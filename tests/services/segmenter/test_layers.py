@@ -56,7 +56,7 @@ def test_where_no_height_stands_out_there_is_one_storey(bottoms):
     elif bottoms == "hall":  # spheres as large as the hall is high stand on its floor
         places[:, 2], radii_m = 3.0, np.full(len(places), 3.0)
     elif bottoms == "trees":  # free space over a few of them
-        places = np.concatenate((places, places[:10] + (0, 0, 4.0)))
+        places = np.concatenate((places, places[:10] + np.array((0, 0, 4.0))))
         radii_m = np.concatenate((radii_m, radii_m[:10]))
     else:  # a mistake of the map, too far off to be drawn up
         places[0, 2] = 1e7

@@ -34,12 +34,12 @@ class StoreyConfig(msgspec.Struct, frozen=True, kw_only=True):
     stairs: float = 0.4  # share of a region between floors from which on it is stairs, which span storeys
 
     def __post_init__(self) -> None:
-        if min(self.least_height_m, self.least_m2, self.part_m2, self.tolerance_m) <= 0 or not (
-            0 < self.stairs <= 1 and 0 <= self.least_share < 1
-        ):
-            raise ValueError("a height or an area is not positive, stairs not in (0, 1] or least_share not in [0, 1)")
-        if self.tolerance_m + self.clutter_m >= self.least_height_m or self.clutter_m < 0 or self.valley < 0:
-            raise ValueError("tolerance_m and clutter_m leave nothing between two floors, or valley is negative")
+        if min(self.least_height_m, self.least_m2, self.part_m2, self.tolerance_m) <= 0 or self.valley < 0:
+            raise ValueError("a height or an area is not positive, or valley negative")
+        if not (0 < self.stairs <= 1 and 0 <= self.least_share < 1):
+            raise ValueError("stairs is not in (0, 1], or least_share not in [0, 1)")
+        if self.tolerance_m + self.clutter_m >= self.least_height_m or self.clutter_m < 0:
+            raise ValueError("tolerance_m and clutter_m leave nothing between two floors")
 
 
 class Storeys(NamedTuple):
