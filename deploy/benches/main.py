@@ -164,7 +164,7 @@ LONG: dict[str, Callable[[float], tuple[dict, dict]]] = {  # no part of `all`; t
     "pool": attacked_pool,
     "store_crashes": lambda seconds: crashes(),
     "lidar": lambda seconds: lidar(),  # seven minutes and more
-    "levels": lambda seconds: levels(),  # ten minutes
+    "levels": lambda seconds: levels(),  # many minutes
     "exchange": lambda seconds: exchanged(),  # nine runs of the sample at half its pace
     "foresight": lambda seconds: foresight(),  # worlds of every kind: ten minutes
     "view": lambda seconds: view(),  # needs an extra and a browser

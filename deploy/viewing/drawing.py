@@ -162,9 +162,9 @@ def _levels(scene: Scene, ground: dict[int, Footprint], colors: dict[str, Color]
     picture: Picture = {}
     held: dict[tuple[LevelName, int], list[np.ndarray]] = {}
     for level in LEVELS:
-        for region, node in regions_in(scene.nodes, level).items():
+        for region, number in regions_in(scene.nodes, level).items():
             if region in ground:
-                held.setdefault((level, node), []).append(ground[region].outline)
+                held.setdefault((level, number), []).append(ground[region].outline)
     for node in scene.nodes:
         lifted = np.array((0, 0, ABOVE_FLOOR_M + ABOVE_REGIONS_M * (2 + LEVELS.index(node.level))), np.float32)
         root, (x, y, z) = f"/{node.level}s/{node.id}", node.position_m

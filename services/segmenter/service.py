@@ -115,7 +115,8 @@ def bequest(state: State, identity: Identity, cfg: Config) -> Bequest:
         instance=identity.instance,
         regions=None if silent else report.snapshot(state),
         objects=None if silent else state.objects.ledger.snapshot(state.robot, state.epoch),
-        next_ids={"regions": state.regions.next_id, "objects": state.objects.tracks.next_id, **state.layers.next_ids},
+        next_ids={"regions": state.regions.next_id, "objects": state.objects.tracks.next_id}
+        | {str(level): next_id for level, next_id in state.layers.next_ids.items()},
     )
 
 

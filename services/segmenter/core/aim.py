@@ -102,7 +102,9 @@ class Aim:
         text = self.text_of(space, region_concepts(prior, cfg.object_phrases))
         if text is None:
             return None
-        levels = {level.name: LevelInForce(level, border_costs(level, cfg)) for level in prior.levels_above}
+        levels: dict[str, LevelInForce] = {
+            level.name: LevelInForce(level, border_costs(level, cfg)) for level in prior.levels_above
+        }
         self.in_force = PriorInForce(prior, digest, text, border_costs(prior, cfg), levels)
         return self.in_force
 

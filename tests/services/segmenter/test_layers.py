@@ -1,15 +1,20 @@
 """Levels above regions: storeys by geometry, zones and buildings by the prior, ids that last."""
 
+import dataclasses
+
 import msgspec
 import numpy as np
 import pytest
 
 from prior_sg.schemas.levels import Entry, LevelNode, LevelPrior, nodes_above, regions_in
 from prior_sg.schemas.priors import Prior
+from prior_sg.schemas.regions import Region, Transition
 from prior_sg.services.segmenter.core.layers.alignment import AlignmentConfig, Members
-from prior_sg.services.segmenter.core.layers.stacking import LevelInForce, layers_of
-from prior_sg.services.segmenter.core.layers.storeys import StoreyConfig, split, storeys_of
+from prior_sg.services.segmenter.core.layers.layer_map import LayerMap
+from prior_sg.services.segmenter.core.layers.stacking import LayersConfig, LevelInForce, layers_of
+from prior_sg.services.segmenter.core.layers.storeys import StoreyConfig, Storeys, split, storeys_of
 from prior_sg.services.segmenter.core.map.received import ReceivedGraph
+from prior_sg.services.segmenter.core.map.table import Places
 from prior_sg.services.segmenter.core.regions.components import numbered
 from tests.help.examples import PRIOR
 
@@ -43,13 +48,16 @@ def test_floors_are_found_and_stairs_lie_between():
     assert found.between[64:76].mean() > 0.5 and not found.between[:64].any()
 
 
-@pytest.mark.parametrize("bottoms", ["slope", "hall", "far"])
+@pytest.mark.parametrize("bottoms", ["slope", "hall", "far", "trees"])
 def test_where_no_height_stands_out_there_is_one_storey(bottoms):
     (places, radii_m) = storey(0, 16)
     if bottoms == "slope":  # a ramp that rises 5 m
         places[:, 2] += places[:, 0] / 3
     elif bottoms == "hall":  # spheres as large as the hall is high stand on its floor
         places[:, 2], radii_m = 3.0, np.full(len(places), 3.0)
+    elif bottoms == "trees":  # free space over a few of them
+        places = np.concatenate((places, places[:10] + np.array((0, 0, 4.0))))
+        radii_m = np.concatenate((radii_m, radii_m[:10]))
     else:  # a mistake of the map, too far off to be drawn up
         places[0, 2] = 1e7
     assert len(storeys_of(graph_of([(places, radii_m)]), CFG).floors_m) == 1
@@ -87,7 +95,7 @@ ROOMS = np.eye(3)
 ZONES = [(0.95, 0.05), (0.5, 0.5), (0.05, 0.95)]
 
 
-def row_of(labels, areas_m2=20.0):
+def row_of(labels, areas_m2=60.0):
     count = len(labels)
     edges = np.stack((np.arange(count - 1), np.arange(1, count)), axis=1)
     return Members(np.full(count, areas_m2), ROOMS[labels], edges, np.ones(count - 1))
@@ -114,15 +122,65 @@ def test_zones_never_span_storeys_and_each_storey_is_a_floor():
 def test_floors_are_of_one_building_each():
     outside = level("building", [(0.95, 0.05), (0.9, 0.1), (0.05, 0.95)], names=("building", "outdoors"))
     floors, buildings = layers_of(
-        row_of([0, 1, 2, 2, 0]), np.zeros(5, np.int64), {"building": outside}, AlignmentConfig()
+        row_of([0, 1, 2, 2, 0, 0]), np.zeros(6, np.int64), {"building": outside}, AlignmentConfig()
     )
     assert buildings.labels == ["building", "outdoors", "building"]
-    assert buildings.groups.tolist() == floors.groups.tolist() == [0, 0, 1, 1, 2]
+    assert buildings.groups.tolist() == floors.groups.tolist() == [0, 0, 1, 1, 2, 2]
 
 
 def test_no_region_has_no_level():
     none = Members(np.zeros(0), np.zeros((0, 3)), np.zeros((0, 2), np.int64), np.zeros(0))
     assert layers_of(none, np.zeros(0, np.int64), {"zone": level("zone", ZONES)}, AlignmentConfig()) == []
+
+
+def known(labels, first_id=0):
+    """Regions of one place each in a row, 60 m2, an open way between neighbours; and the table of their places."""
+    ids = [first_id + row for row in range(len(labels))]
+    regions = {}
+    for row, number in enumerate(ids):
+        ways = [
+            Transition(region=other, edge=(0, 1), position_m=(0, 0, 0), clearance_m=1.0, door=False)
+            for other in (number - 1, number + 1)
+            if other in ids
+        ]
+        regions[number] = Region(
+            id=number,
+            label="",
+            place_count=1,
+            probability=1.0,
+            position_m=(float(row), 0.0, 1.0),
+            area_m2=60.0,
+            transitions=ways,
+        )
+    places = dataclasses.replace(Places.none(), regions=np.array(ids), posteriors=ROOMS[labels].astype(np.float32))
+    count = len(labels)
+    ground = Storeys(
+        np.zeros(1), np.zeros(count, np.int64), np.ones(count, bool), np.zeros(count, bool), np.ones(count)
+    )
+    return regions, places, ground
+
+
+def test_nodes_keep_their_ids_while_regions_come_and_go():
+    layers, levels = LayerMap(), {"zone": level("zone", ZONES)}
+    layers.renew(*known([0, 1, 0, 2, 1, 2]), levels, LayersConfig())
+    assert {key: one.member_ids for key, one in layers.known.items() if key[0] == "zone"} == {
+        ("zone", 0): [0, 1, 2],
+        ("zone", 1): [3, 4, 5],
+    }
+    assert layers.known["zone", 1].label == layers.zone_of(4) == "surgery"
+    assert layers.known["floor", 0].members == "zone" and layers.known["floor", 0].member_ids == [0, 1]
+    assert layers.known["zone", 0].parent_id == 0 and layers.known["zone", 0].area_m2 == 180
+    layers.renew(*known([1, 0, 2, 1, 2, 2], first_id=1), levels, LayersConfig())  # 0 is gone, 6 is new
+    assert layers.known["zone", 1].member_ids == [3, 4, 5, 6] and layers.known["zone", 0].member_ids == [1, 2]
+
+
+def test_a_successor_goes_on_with_the_ids():
+    former, levels = LayerMap(), {"zone": level("zone", ZONES)}
+    former.renew(*known([0, 0, 2, 2, 2]), levels, LayersConfig())
+    successor = LayerMap()
+    successor.inherit(list(former.known.values()), {"zone": 9})
+    successor.renew(*known([0, 2, 2, 2, 0, 0, 0], first_id=1), levels, LayersConfig())
+    assert sorted(number for name, number in successor.known if name == "zone") == [0, 1, 9]
 
 
 def node(level, number, members, of="region", label=""):

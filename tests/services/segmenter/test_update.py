@@ -35,6 +35,8 @@ from prior_sg.services.segmenter.core.config import AdjacencyConfig, Config
 from prior_sg.services.segmenter.core.energy.mrf import energy
 from prior_sg.services.segmenter.core.energy.solver import minimise
 from prior_sg.services.segmenter.core.experts.context import ObjectView
+from prior_sg.services.segmenter.core.layers.alignment import AlignmentConfig
+from prior_sg.services.segmenter.core.layers.stacking import LayersConfig
 from prior_sg.services.segmenter.core.map.place_map import edge_weights
 from prior_sg.services.segmenter.service import SERVICE
 from tests.help.world import (
@@ -118,6 +120,33 @@ def test_each_room_becomes_one_region_with_its_name():
         np.testing.assert_allclose(region.position_m, positions[members].mean(axis=0), atol=0.006)
         mean = np.mean([run.reader.beliefs[place][1][ROOMS.index(region.label)] for place in members])
         assert region.probability == pytest.approx(mean, abs=0.02)
+
+
+def test_the_levels_above_follow_the_regions():
+    positions, edges, frames = world()
+    zones = msgspec.structs.replace(prior(ROOMS), regions=[
+        msgspec.structs.replace(region, parent="night zone" if region.name == "bedroom" else "day zone")
+        for region in prior(ROOMS).regions
+    ])  # fmt: skip
+    free = LayersConfig(alignment=AlignmentConfig(node_cost=0.0))  # as a single room costs more than it gains
+    cfg = msgspec.structs.replace(CFG, layers=free)
+    run = Run(cfg=cfg).feed(place_delta(positions, edges), task(), zones, *frames, TICK)
+    told = {}
+    for delta in run.deltas:
+        told = {} if delta.snapshot else told
+        for key in delta.removed_nodes:
+            del told[key]
+        told |= {(node.level, node.id): node for node in delta.nodes}
+    assert told == run.state.layers.known
+    by_label = {region.label: region.id for region in run.reader.regions.values()}
+    assert {node.label: node.member_ids for node in told.values() if node.level == "zone"} == {
+        "day zone": sorted((by_label["kitchen"], by_label["hall"])),
+        "night zone": [by_label["bedroom"]],
+    }
+    assert [node.label for node in told.values() if node.level != "zone"] == ["floor 0", "building"]
+    assert {region.label: region.parent for region in run.reader.regions.values()}["hall"] == "day zone"
+    before = len(run.deltas)
+    assert len(run.feed(TICK, TICK).deltas) == before
 
 
 def test_posteriors_are_distributions_and_unseen_places_are_unknown():

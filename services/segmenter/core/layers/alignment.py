@@ -3,10 +3,12 @@
 The entities of the level below are the field's nodes. With b the belief of a member over the entries below and P of the
 prior's level, its unary cost of an entry e is
 
-    -w log(sum_c b(c) P(e | c) / P(e)) - lambda log P(e),    w = 2 area / (area + saturation),
+    -w (log sum_c b(c) P(e | c) - rho log P(e)) - lambda log P(e),    w = 2 area / (area + saturation),
 
-the evidence of what it holds, in the measure that it is large, and what is expected anyhow (Bayes; the environment
-expert). Borders cost what they cost between regions, by the level's own adjacency, times the ways that lead across.
+the evidence of what it holds, in the measure that it is large, and what is expected anyhow (the environment expert).
+With rho = 1 that is Bayes' rule for members that are independent given their node; members resemble each other, and a
+smaller rho keeps rare entries from being found everywhere. Borders cost what they cost between regions, by the level's
+own adjacency, times the ways that lead across.
 Connected members of one entry are a node, and a node that gains less than `node_cost` becomes part of a neighbour.
 """
 
@@ -26,16 +28,17 @@ FLOOR = 1e-4  # least probability in a logarithm
 class AlignmentConfig(msgspec.Struct, frozen=True, kw_only=True):
     """How firmly members bind to each other and to what the prior says."""
 
-    saturation_m2: float = 8.0  # area at which a member counts once
-    existence: float = 0.1  # reliability of P(e)
+    saturation_m2: float = 20.0  # area at which a member counts once
+    rarity: float = 0.25  # rho
+    existence: float = 0.1  # lambda
     border: float = 0.6  # times the cost of a border between regions
     way_m: float = 0.8  # clearance from which on a way counts once; half of it in a usual door
     ways: float = 2.0  # of one border that count at most
-    node_cost: float = 0.5  # of each node, in the energy's unit
+    node_cost: float = 1.5  # of each node, in the energy's unit
     temperature: float = 1.0  # of the probabilities
 
     def __post_init__(self) -> None:
-        numbers = (self.existence, self.border, self.ways, self.node_cost)
+        numbers = (self.rarity, self.existence, self.border, self.ways, self.node_cost)
         if min(numbers) < 0 or min(self.saturation_m2, self.way_m, self.temperature) <= 0:
             raise ValueError("a cost is negative, or saturation_m2, way_m or temperature not positive")
 
@@ -69,7 +72,7 @@ def unary_costs(members: Members, level: LevelPrior, cfg: AlignmentConfig) -> np
     existence = np.maximum(np.array([entry.existence for entry in level.entries]), FLOOR)
     held = np.maximum(members.beliefs @ level.parents.astype(np.float64), FLOOR)
     weights = 2 * members.areas_m2 / (members.areas_m2 + cfg.saturation_m2)
-    evidence = np.log(held) - np.log(existence)
+    evidence = np.log(held) - cfg.rarity * np.log(existence)
     return -weights[:, None] * evidence - cfg.existence * np.log(existence)
 
 

@@ -25,18 +25,21 @@ class StoreyConfig(msgspec.Struct, frozen=True, kw_only=True):
     """What counts as a storey."""
 
     least_height_m: float = 2.2  # from floor to floor
-    least_m2: float = 12.0  # of places' discs on a floor
-    part_m2: float = 3.0  # the same of a region's part on one storey, where it is torn
+    least_m2: float = 30.0  # of places' discs on a floor
+    least_share: float = 0.15  # of the most on any floor: treetops and roofs are no storeys
+    part_m2: float = 6.0  # the same of a region's part on one storey, where it is torn
     valley: float = 0.5  # density between two floors at most, of that at the lesser one
     tolerance_m: float = 0.3  # a bottom so far below a floor is still on it
     clutter_m: float = 0.8  # bottoms up to so far above a floor are on it
     stairs: float = 0.4  # share of a region between floors from which on it is stairs, which span storeys
 
     def __post_init__(self) -> None:
-        if min(self.least_height_m, self.least_m2, self.part_m2, self.tolerance_m) <= 0 or not 0 < self.stairs <= 1:
-            raise ValueError("a height or an area is not positive, or stairs not in (0, 1]")
-        if self.tolerance_m + self.clutter_m >= self.least_height_m or self.clutter_m < 0 or self.valley < 0:
-            raise ValueError("tolerance_m and clutter_m leave nothing between two floors, or valley is negative")
+        if min(self.least_height_m, self.least_m2, self.part_m2, self.tolerance_m) <= 0 or self.valley < 0:
+            raise ValueError("a height or an area is not positive, or valley negative")
+        if not (0 < self.stairs <= 1 and 0 <= self.least_share < 1):
+            raise ValueError("stairs is not in (0, 1], or least_share not in [0, 1)")
+        if self.tolerance_m + self.clutter_m >= self.least_height_m or self.clutter_m < 0:
+            raise ValueError("tolerance_m and clutter_m leave nothing between two floors")
 
 
 class Storeys(NamedTuple):
@@ -72,13 +75,15 @@ def floors_of(bottoms_m: np.ndarray, weights_m2: np.ndarray, cfg: StoreyConfig) 
     padded = np.concatenate(([-1.0], profile, [-1.0]))
     modes = np.flatnonzero((padded[1:-1] > padded[:-2]) & (padded[1:-1] >= padded[2:]))
     apart = cfg.least_height_m / CELL_M
-    floors: list[int] = []
+    floors, most_m2 = list[int](), 0.0
     for mode in modes[np.argsort(-profile[modes], kind="stable")].tolist():
         reach = slice(max(mode - round(cfg.tolerance_m / CELL_M), 0), mode + round(cfg.clutter_m / CELL_M) + 1)
         ground_m2 = float(profile[reach].sum()) * CELL_M
         distant = all(abs(mode - floor) >= apart for floor in floors)
-        if not floors or (distant and ground_m2 >= cfg.least_m2 and _valleys(profile, mode, floors, cfg)):
+        enough = ground_m2 >= max(cfg.least_m2, cfg.least_share * most_m2)
+        if not floors or (distant and enough and _valleys(profile, mode, floors, cfg)):
             floors.append(mode)
+            most_m2 = max(most_m2, ground_m2)
     return low_m + CELL_M * np.array(sorted(floors))
 
 
