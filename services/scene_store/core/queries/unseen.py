@@ -5,7 +5,7 @@ import numpy as np
 from prior_sg.schemas.foresight import Foresight, Opening
 from prior_sg.schemas.names import same
 from prior_sg.schemas.queries import Missing, Outlook, Prospect, RouteBetween, Spot, WhatIsMissing, WhereToLook
-from prior_sg.services.exploring import expected_metres
+from prior_sg.services.exploring import expected_metres, hedged_metres
 from prior_sg.services.scene_store.core.queries.index import Index
 from prior_sg.services.scene_store.core.queries.labels import AFTER_A_TASK, nearest_labels
 from prior_sg.services.scene_store.core.queries.routes import NoSuchSpot, lengths_from, route
@@ -15,7 +15,7 @@ DIGITS = 2
 
 
 def outlook(index: Index, question: WhereToLook) -> Outlook:
-    """Openings behind which a region of the label may be, the least expected metres first, and the way to the first."""
+    """Openings behind which a region of the label may be, the best to begin with first, and the way to the first."""
     foresight, label = index.scene.foresight, _known(index, question.label)
     if not label:
         return Outlook(label=question.label, reason=_unknown(index, question.label))
@@ -51,7 +51,8 @@ def _prospects(
     foresight: Foresight, held: list[Opening], ways_m: np.ndarray, chances: np.ndarray, points_m: np.ndarray
 ) -> list[Prospect]:
     likely = np.flatnonzero((chances > 0) & np.isfinite(ways_m))
-    metres = expected_metres(ways_m[likely], points_m[likely], chances[likely], foresight.look_m, foresight.elsewhere_m)
+    asked = (ways_m[likely], points_m[likely], chances[likely], foresight.look_m, foresight.elsewhere_m)
+    metres, choice = expected_metres(*asked), hedged_metres(*asked)
     return [
         Prospect(
             opening=held[likely[at]],
@@ -59,7 +60,7 @@ def _prospects(
             expected_m=round(float(metres[at]), DIGITS),
             way_m=round(float(ways_m[likely[at]]), DIGITS),
         )
-        for at in np.argsort(metres, kind="stable").tolist()
+        for at in np.argsort(choice, kind="stable").tolist()
     ]
 
 
