@@ -20,14 +20,14 @@ def outlook(index: Index, question: WhereToLook) -> Outlook:
     if not label:
         return Outlook(label=question.label, reason=_unknown(index, question.label))
     seen = things(index, "region", index.labelled("region", label))
-    held = [opening for opening in foresight.openings if index.row("place", opening.place_id) is not None]
+    placed = [(opening, index.row("place", opening.place_id)) for opening in foresight.openings]
+    held, rows = [one for one, row in placed if row is not None], [row for _, row in placed if row is not None]
     if not held:
         return Outlook(label=label, found=seen, reason="nothing is known to be open: no opening to unobserved space")
     try:
         lengths_m = lengths_from(index, question.start, question.clearance_m)
     except NoSuchSpot as error:
         return Outlook(label=label, found=seen, reason=str(error))
-    rows = [index.row("place", opening.place_id) for opening in held]
     ways_m = lengths_m[rows]
     chances = np.array([_chance(opening, label) for opening in held])
     prospects = _prospects(foresight, held, ways_m, chances, index.points_m[rows])[: question.limit]
