@@ -156,8 +156,8 @@ class NodesOf(Part, frozen=True, kw_only=True, tag="nodes_of"):
 
 
 class WhereToLook(Part, frozen=True, kw_only=True, tag="where_to_look"):
-    """Behind which opening a region of a label that nobody has seen is most likely found first → Outlook, the least
-    expected metres first."""
+    """Behind which opening a region of a label that nobody has seen is most likely found first → Outlook, the best
+    to begin with first."""
 
     label: Text
     start: Spot = Spot(here=True)

@@ -149,8 +149,8 @@ class Asking(ABC):
     def where_to_look(
         self, label: str, start: SpotLike = "here", clearance_m: float = 0.0, limit: int = MOST_RANKED
     ) -> Outlook:
-        """Where a region of a label that nobody has seen is likely found first: openings to unobserved space, the least
-        expected metres first, and the way to the first. All of it is predicted.
+        """Where a region of a label that nobody has seen is likely found first: openings to unobserved space, the best
+        to begin with first, and the way to the first. All of it is predicted.
         """
         question = WhereToLook(label=label, start=_spot(start), clearance_m=clearance_m, limit=limit)
         outlook: Outlook = self._understood(question)

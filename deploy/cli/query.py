@@ -273,23 +273,17 @@ def _show_outlook(found: "Outlook") -> None:
     if found.found:
         console.print(f"seen already: {', '.join(f'{one.label} {one.id}' for one in found.found)}")
     console.print(f"another {found.label} behind any opening: {found.probability:.2f} (predicted)")
-    table = Table(
-        "expected m", "probability", "way m", "opening at place", "width m", "out of region", "beyond m", "why"
-    )
+    table = Table("expected m", "probability", "way m", "place", "width m", "out of", "beyond m")
     for one in found.prospects:
         opening = one.opening
-        why = next(entry for entry in opening.labels if entry.label == found.label)
-        table.add_row(
-            f"{one.expected_m:.1f}",
-            f"{one.probability:.2f}",
-            f"{one.way_m:.1f}",
-            str(opening.place_id),
-            f"{opening.width_m:.1f}",
-            str(opening.region),
-            _at(opening.beyond_m),
-            f"adjacency {why.adjacency:.2f}, existence {why.existence:.2f}, found {why.found}, met {why.met}",
-        )
+        figures = (f"{one.expected_m:.1f}", f"{one.probability:.2f}", f"{one.way_m:.1f}", str(opening.place_id))
+        table.add_row(*figures, f"{opening.width_m:.1f}", f"region {opening.region}", _at(opening.beyond_m))
     console.print(table)
+    why = next(entry for entry in found.prospects[0].opening.labels if entry.label == found.label)
+    told = (
+        f"adjacency {why.adjacency:.2f}, existence {why.existence:.2f}, {why.found} found, {why.met} such borders met"
+    )
+    console.print(f"why the first: {told}")
     if found.route is not None:
         _show_route(found.route)
 

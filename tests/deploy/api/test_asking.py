@@ -229,8 +229,8 @@ def test_the_command_answers_in_tables_and_json(capsys, saved):
 
 def test_the_command_tells_what_was_not_seen(capsys, tmp_path):
     scene = message(foresight=foresight(message(), 2, "hall"))
-    path = tmp_path / "scene.msgpack"
-    path.write_bytes(encode(scene))
+    path = tmp_path / "scene.json"
+    Scene(scene).save(path)
     status, out, _ = asked(capsys, path, "unseen", "Hall", "--start", "place:1", "--json")
     answer = json.loads(out)["answer"]
     assert (

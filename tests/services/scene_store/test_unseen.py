@@ -55,13 +55,13 @@ def test_of_equal_chances_the_nearer_comes_first_with_the_way_there():
 
 
 def test_a_surer_one_is_worth_a_walk_and_the_route_is_the_shortest_way():
-    found = ask(index_of(opening(40, 0.02), opening(300, 0.95)))
+    found = ask(index_of(opening(60, 0.02), opening(300, 0.95)))
     best = found.prospects[0]
     assert best.opening.place_id == int(SCENE.place_ids[300])
     way = answer(NEAR, q.RouteBetween(start=START, goal=q.Spot(what="place", id=best.opening.place_id)))
     assert found.route.place_ids == way.place_ids
     assert best.way_m == pytest.approx(way.length_m, abs=0.01)
-    assert ask(index_of(opening(40, 0.02), opening(300, 0.95)), limit=1).prospects == [best]
+    assert ask(index_of(opening(60, 0.02), opening(300, 0.95)), limit=1).prospects == [best]
 
 
 @pytest.mark.parametrize(

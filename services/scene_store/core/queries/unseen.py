@@ -5,7 +5,7 @@ import numpy as np
 from prior_sg.schemas.foresight import Foresight, Opening
 from prior_sg.schemas.names import same
 from prior_sg.schemas.queries import Missing, Outlook, Prospect, RouteBetween, Spot, WhatIsMissing, WhereToLook
-from prior_sg.services.exploring import expected_metres
+from prior_sg.services.exploring import expected_metres, hedged_metres
 from prior_sg.services.scene_store.core.queries.index import Index
 from prior_sg.services.scene_store.core.queries.labels import AFTER_A_TASK, nearest_labels
 from prior_sg.services.scene_store.core.queries.routes import NoSuchSpot, lengths_from, route
@@ -15,19 +15,19 @@ DIGITS = 2
 
 
 def outlook(index: Index, question: WhereToLook) -> Outlook:
-    """Openings behind which a region of the label may be, the least expected metres first, and the way to the first."""
+    """Openings behind which a region of the label may be, the best to begin with first, and the way to the first."""
     foresight, label = index.scene.foresight, _known(index, question.label)
     if not label:
         return Outlook(label=question.label, reason=_unknown(index, question.label))
     seen = things(index, "region", index.labelled("region", label))
-    held = [opening for opening in foresight.openings if index.row("place", opening.place_id) is not None]
+    placed = [(opening, index.row("place", opening.place_id)) for opening in foresight.openings]
+    held, rows = [one for one, row in placed if row is not None], [row for _, row in placed if row is not None]
     if not held:
         return Outlook(label=label, found=seen, reason="nothing is known to be open: no opening to unobserved space")
     try:
         lengths_m = lengths_from(index, question.start, question.clearance_m)
     except NoSuchSpot as error:
         return Outlook(label=label, found=seen, reason=str(error))
-    rows = [index.row("place", opening.place_id) for opening in held]
     ways_m = lengths_m[rows]
     chances = np.array([_chance(opening, label) for opening in held])
     prospects = _prospects(foresight, held, ways_m, chances, index.points_m[rows])[: question.limit]
@@ -51,7 +51,8 @@ def _prospects(
     foresight: Foresight, held: list[Opening], ways_m: np.ndarray, chances: np.ndarray, points_m: np.ndarray
 ) -> list[Prospect]:
     likely = np.flatnonzero((chances > 0) & np.isfinite(ways_m))
-    metres = expected_metres(ways_m[likely], points_m[likely], chances[likely], foresight.look_m, foresight.elsewhere_m)
+    asked = (ways_m[likely], points_m[likely], chances[likely], foresight.look_m, foresight.elsewhere_m)
+    metres, choice = expected_metres(*asked), hedged_metres(*asked)
     return [
         Prospect(
             opening=held[likely[at]],
@@ -59,7 +60,7 @@ def _prospects(
             expected_m=round(float(metres[at]), DIGITS),
             way_m=round(float(ways_m[likely[at]]), DIGITS),
         )
-        for at in np.argsort(metres, kind="stable").tolist()
+        for at in np.argsort(choice, kind="stable").tolist()
     ]
 
 
