@@ -1,7 +1,7 @@
 """`prior-sg bench learning`: does a prior that is wrong about the world come right while robots explore homes?
 
 The prior in hand is the library's. In each world some pairs of regions have exchanged their objects, neighbours and
-frequencies, or none, where learning must do no harm. Robots explore home after home, each labelled by the real segmenter
+frequencies, or none, where learning must do no harm. Robots explore home after home, each labelled by the segmenter
 under the prior as revised so far; what the segmenter sees revises it. Other homes of the same world, the same for every
 prior, give F1_S.
 """

@@ -170,14 +170,14 @@ def without_pyramid(config: Config) -> dict[str, Variant]:
 def expert_rows(config: Config) -> list[Method]:
     """Every set of registered experts with the visual one; without E the prior's structure is uniform.
 
-    An object expert without E has nothing to say (paper, Ablation Studies) and is left out.
+    Experts that rest on containment have nothing to say without E (paper, Ablation Studies) and are left out.
     """
     weights = {name: config.experts.get(name, Config().experts.get(name, 1.0)) for name in REGISTRY}
     others = [name for name in REGISTRY if name not in ("visual", "environment")]
     rows = []
     for size, structure in itertools.product(range(len(others) + 1), (False, True)):
         for extra in itertools.combinations(others, size):
-            if not structure and any(name.startswith("object") for name in extra):
+            if not structure and any(name in ("object", "contents") for name in extra):
                 continue
             chosen = ("visual", *(["environment"] if structure else []), *extra)
             variant = Variant(msgspec.structs.replace(config, experts={name: weights[name] for name in chosen}))

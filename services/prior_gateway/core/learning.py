@@ -157,18 +157,19 @@ def told(entries: Iterable[Disagreement]) -> tuple[str, dict[str, dict[str, dict
 
 
 def unexplained(prior: Prior, seen: Estimate) -> tuple[str, list[str]]:
-    """Regions of maps that hold little of what a region of their name holds, as lines; and what they hold instead."""
+    """Regions of maps that hold little of what any region of the prior does, as lines by what they were taken for; and
+    what they hold instead."""
     names, things = [region.name for region in prior.regions], [item.name for item in prior.objects]
     strange: dict[int, Counter[str]] = {}
     taken, met = Counter[int](), Counter[int]()
     for one, belief in zip(seen.maps, seen.beliefs, strict=True):
         for label, contents in zip(belief.argmax(axis=1).tolist(), one.contents, strict=True):
             there = np.flatnonzero(contents >= HELD)
-            alien = there[prior.containment[label, there] < ALIEN]
+            aliens = (prior.containment[:, there] < ALIEN).sum(axis=1).min()
             taken[label] += 1
-            if len(alien) >= MOST_ALIEN and 2 * len(alien) > len(there):
+            if aliens >= MOST_ALIEN and 2 * aliens > len(there):
                 met[label] += 1
-                strange.setdefault(label, Counter()).update(things[i] for i in alien.tolist())
+                strange.setdefault(label, Counter()).update(things[i] for i in there.tolist())
     lines, objects = [], Counter[str]()
     for label, number in met.most_common():
         if number < LEAST_STRANGE:

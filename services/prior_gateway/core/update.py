@@ -377,7 +377,7 @@ def _revise(state: State, making: Making, cfg: Config) -> Iterator[Told]:
         yield from _give_up(state, making, "nothing has been observed", cfg)
         return
     if making.revision.by_model:
-        yield from _ask_about(state, making, current, seen, cfg)
+        yield from _ask_about(state, making, (root, current), seen, cfg)
         return
     robots = len({one.robot for one in known.values()})
     note = f"revised by counting in {counted(len(known), 'map')} of {counted(robots, 'robot')}"
@@ -394,10 +394,14 @@ def _revise(state: State, making: Making, cfg: Config) -> Iterator[Told]:
     yield _keep(making, learning.revised(root, seen.totals, cfg.learning.strength, made), state)
 
 
-def _ask_about(state: State, making: Making, current: Prior, seen: Estimate, cfg: Config) -> Iterator[Told]:
-    """Show the model what was expected and what was observed, if it may still be asked today."""
+def _ask_about(
+    state: State, making: Making, priors: tuple[Prior, Prior], seen: Estimate, cfg: Config
+) -> Iterator[Told]:
+    """Show the model what was expected and what was observed, if it may still be asked today. `priors` are that before
+    any revision and the one in force."""
+    root, current = priors
     lines, form = learning.told(learning.disagreements(current, seen.totals, cfg.learning.told))
-    strange = ("", []) if making.task.regions else learning.unexplained(current, seen)
+    strange = ("", []) if making.task.regions else learning.unexplained(root, seen)
     if cfg.provider == "library" or not (form or strange[0]):
         yield from _give_up(state, making, "there is no model, or nothing to disagree about", cfg)
         return

@@ -564,7 +564,7 @@ def test_posterior_explains_the_label():
     assert reply.found and reply.label == "kitchen" and reply.labels == ROOMS and reply.frames > 0
     weighted = [np.array(vote.log_probabilities) * vote.weight for vote in reply.votes]
     np.testing.assert_allclose(reply.unary, -sum(weighted), atol=1e-9)
-    assert [vote.expert for vote in reply.votes] == ["visual", "geometric", "object", "environment"]
+    assert [vote.expert for vote in reply.votes] == ["visual", "geometric", "object", "environment", "contents"]
     assert reply.votes[0].weight == pytest.approx(4.0 * reply.votes[0].confidence)
     np.testing.assert_allclose(reply.posterior, run.reader.beliefs[5][1], atol=0.02)
     likelihoods = np.exp(-(np.array(reply.unary) + reply.pull) / reply.temperature)
