@@ -148,7 +148,7 @@ def _tick(state: State, cfg: Config) -> Iterator[Message]:
 
 
 def _numbers(memory: Memory) -> bytes:
-    given = [
+    given: list[tuple[str, str, int, int, int]] = [
         (kind, name.robot, name.session, number, fleet)
         for kind, known in memory.ids.given.items()
         for (name, number), fleet in known.items()
