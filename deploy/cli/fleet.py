@@ -2,6 +2,7 @@
 
 import argparse
 import asyncio
+import logging
 import math
 import time
 import uuid
@@ -96,7 +97,7 @@ def show_fleet(out: Path) -> int:
     from prior_sg.deploy.viewing.live import Live
     from prior_sg.deploy.viewing.page import Options, Page
 
-    tell_logs()
+    logging.getLogger().setLevel(logging.ERROR)  # what robots warn of is none of the user's; the demo tells events
     demo = FleetDemo(out, console.print)
     page = Page(Live(demo.bus(), NAME, "two robots, one map"), Options())
     console.print(f"look at it: {page.address}; Ctrl-C stops")

@@ -71,10 +71,9 @@ class WalkingRobot:
         task = Task(
             robot=self.name, stamp_ns=1, environment=prior.environment, task=prior.task, regions=prior.vocabulary
         )
-        self._pipeline.publish(TASK, task)
-        self._pipeline.publish(PRIOR, prior)
+        published = self._pipeline.publish(TASK, task) + self._pipeline.publish(PRIOR, prior)
         for number, frame in enumerate(self.frames, 1):
-            published = self._pipeline.publish(KEYFRAME, msgspec.structs.replace(frame, robot=self.name))
+            published += self._pipeline.publish(KEYFRAME, msgspec.structs.replace(frame, robot=self.name))
             if (pyramid := self._pyramids.get(frame.frame_id)) is not None:
                 published += self._pipeline.publish(PYRAMID, msgspec.structs.replace(pyramid, robot=self.name))
             told = [(topic, message) for topic, message in published if topic in (PLACE_DELTA, REGION_DELTA)]
@@ -83,6 +82,7 @@ class WalkingRobot:
                 told += [(topic, message) for topic, message in looked if topic is REGION_DELTA]
                 told += self._things(frame.stamp_ns)
             yield told
+            published = []
 
     def close(self) -> None:
         """Let its services end."""

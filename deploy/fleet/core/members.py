@@ -24,6 +24,7 @@ class Relation:
     fleet_from_own: np.ndarray  # (4, 4)
     given: bool  # by whoever started the bridge, not found
     places: int = 0  # of the map when this was last looked at
+    tick: int = 0  # then
 
 
 @dataclass
@@ -37,6 +38,7 @@ class Member:
     why: str = "it has not been looked at yet"  # there is no relation
     tried_places: int = 0  # of the map when a relation was last sought
     changed: bool = True  # since the merged scene was last made
+    unfitted: bool = True  # changed since the relation was last looked at
     _map: Map | None = None
 
     def map(self) -> Map:
@@ -52,7 +54,13 @@ class Member:
 
     def touch(self) -> None:
         """Something of the map has changed."""
-        self.changed, self._map = True, None
+        self.changed = self.unfitted = True
+        self._map = None
+
+    @property
+    def to_fit(self) -> bool:
+        """Whether there is a relation that was found, and that has not seen the map as it is."""
+        return self.relation is not None and not self.relation.given and self.unfitted
 
 
 @dataclass

@@ -30,6 +30,7 @@ from prior_sg.services.losses import Losses
 from prior_sg.services.scene_store.core import graph as scenes
 
 GROWN = 1.1  # times as many places as when it was looked at last: a map is looked at again
+REST_TICKS = 5  # from one fitting of a relation to the next, of a map that changes and hardly grows
 DOUBT = 0.8  # of what is asked for when maps are first related: a relation that has less is given up
 
 
@@ -66,6 +67,7 @@ class State:
     merged: Merged | None = None
     events: list[str] = field(default_factory=list)  # to be told with the next delta
     noted: set[tuple[Name, int]] = field(default_factory=set)  # objects of former sessions whose change was told
+    ticks: int = 0
     kept_ids: int = 0  # numbers that are kept on disk
     losses: Losses = field(default_factory=Losses)
 
@@ -123,7 +125,8 @@ def _follow(state: State, delta: Delta) -> Iterator[Message]:
 
 def _tick(state: State, cfg: Config) -> Iterator[Message]:
     members = state.members()
-    if not any(one.changed for one in members):
+    state.ticks += 1
+    if not any(one.changed or one.to_fit for one in members):
         return
     relate(state, cfg)
     related = [one for one in members if one.relation is not None and one.graph.places]
@@ -145,7 +148,7 @@ def _tick(state: State, cfg: Config) -> Iterator[Message]:
 
 
 def _numbers(memory: Memory) -> bytes:
-    given = [
+    given: list[tuple[str, str, int, int, int]] = [
         (kind, name.robot, name.session, number, fleet)
         for kind, known in memory.ids.given.items()
         for (name, number), fleet in known.items()
@@ -181,7 +184,7 @@ def relate(state: State, cfg: Config) -> None:
     for one in members:
         if one.relation is None and len(one.graph.places) >= GROWN * one.tried_places:
             _seek(state, one, members, cfg)
-        elif one.relation is not None and not one.relation.given and _grown(one):
+        elif one.to_fit and _due(state, one):
             _correct(state, one, members, cfg)
 
 
@@ -192,9 +195,11 @@ def _given(members: list[Member], transforms: Mapping[str, tuple[float, float, f
             one.relation, one.why = Relation(level(yaw, np.array((x, y, z))), given=True), ""
 
 
-def _grown(one: Member) -> bool:
+def _due(state: State, one: Member) -> bool:
+    """Fitting looks at whole maps: it is done when one has grown by a share, else every few ticks."""
     assert one.relation is not None
-    return len(one.graph.places) >= GROWN * one.relation.places or (one.changed and one.graph.places != {})
+    grown = len(one.graph.places) >= GROWN * one.relation.places
+    return grown or state.ticks >= one.relation.tick + REST_TICKS
 
 
 def _others(state: State, one: Member, members: list[Member]) -> Scene | None:
@@ -212,8 +217,9 @@ def _seek(state: State, one: Member, members: list[Member], cfg: Config) -> None
     found = match(one.map(), map_of(others), cfg.match)
     one.why = found.why
     if found.b_from_a is not None:
-        one.relation = Relation(found.b_from_a, given=False, places=len(one.graph.places))
+        one.relation = Relation(found.b_from_a, given=False, places=len(one.graph.places), tick=state.ticks)
         one.touch()
+        one.unfitted = False
         state.events.append(f"{one.name.robot} has been found in the map of {state.robot}")
 
 
@@ -233,7 +239,9 @@ def _correct(state: State, one: Member, members: list[Member], cfg: Config) -> N
         gap_m, gap_rad = apart(pose, one.relation.fleet_from_own, one.map().shape.centers_m.mean(axis=0))
         moves = gap_m > cfg.min_change_m or gap_rad > cfg.min_change_m
         kept = pose if moves else one.relation.fleet_from_own
-        one.relation = Relation(kept, given=False, places=len(one.graph.places))
+        one.relation = Relation(kept, given=False, places=len(one.graph.places), tick=state.ticks)
+        one.unfitted = False
+        one.changed |= moves
         return
     one.relation = None
     _seek(state, one, members, cfg)

@@ -130,7 +130,8 @@ def test_a_late_loop_closure_is_followed():
         later = msgspec.structs.replace(delta, revision=1, snapshot=False)
         fleet.pipeline.publish(topic_of(type(delta)), later)
     before = fleet.scene()
-    fleet.tick()
+    for _ in range(6):
+        fleet.tick()
     after = fleet.scene()
     assert after.place_ids.tolist() == ids
     assert np.abs(after.positions_m - before.positions_m).max() < 0.1  # in the frame of home nothing has moved
@@ -148,7 +149,7 @@ def test_a_map_that_comes_to_contradict_is_taken_out():
     other = houses.scene("r2", MOVED, rooms=rooms, things=[("bed", 1.0, 5.2), ("stove", 3.0, 1.0)])
     for delta in houses.deltas(other):
         fleet.pipeline.publish(topic_of(type(delta)), msgspec.structs.replace(delta, revision=1))
-    told = fleet.tick()
+    told = [message for _ in range(6) for message in fleet.tick()]
     assert any("r2 fits no longer" in m.event for m in told if isinstance(m, PlaceDelta))
     assert fleet.scene().place_ids.tolist() == alone.scene().place_ids.tolist()
 
@@ -221,3 +222,23 @@ def test_transforms_are_read():
     for text in ("r2=1,2,3", "r2", "r2=1,2,x,4", "r2=1,2,3,inf"):
         with pytest.raises(UserError, match="no transform"):
             transforms_of([text], ["r2"], False)
+
+
+def test_a_stored_scene_is_gone_on_in(tmp_path):
+    path = tmp_path / "scene.sqlite"
+    with Runner(BY_NAME["scene_store"], StoreConfig(path=str(path)), Identity("*", "store", 1)) as store:
+        store.feed(*houses.deltas(houses.scene()))
+    fleet = Fleet(Config(robots=("r1",), stored=(f"r1={path}",)))
+    fleet.tell(houses.scene("r1", MOVED, rooms=houses.ROOMS[1:]), epoch=2)
+    fleet.tick()
+    scene = fleet.scene()
+    assert sorted(region.label for region in scene.regions) == houses.LABELS  # the kitchen is remembered
+    assert len(scene.objects) == len(houses.THINGS)
+    kitchen = next(region for region in scene.regions if region.label == "kitchen")
+    assert kitchen.position_m[:2] == pytest.approx((1.5, 2.0), abs=0.3)  # in the stored frame
+
+
+@pytest.mark.parametrize(("stored", "why"), [("r1", "ROBOT=PATH"), ("r1=/nowhere/scene.json", "does not exist")])
+def test_scenes_that_are_not_there_are_refused(stored, why):
+    with pytest.raises(ServiceError, match=why):
+        Fleet(Config(robots=("r1",), stored=(stored,)))

@@ -103,3 +103,10 @@ def test_small_maps_wait():
     few = houses.scene(rooms=[("hallway", 0.0, 4.0, 2.0, 5.5)])
     found = match(map_of(few), map_of(houses.scene()), CFG)
     assert found.b_from_a is None and "places yet" in found.why
+
+
+@pytest.mark.parametrize("things", [[], houses.THINGS[:1]])
+def test_rooms_alone_never_suffice(things):
+    one, other = houses.scene(things=things), houses.scene("r2", MOVED, offset_m=0.2)
+    for found in (match(map_of(one), map_of(other), CFG), match(map_of(other), map_of(one), CFG)):
+        assert found.b_from_a is None and found.why

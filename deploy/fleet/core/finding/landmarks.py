@@ -93,7 +93,7 @@ def _doors(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
 def _surroundings(positions_m: np.ndarray, spots_m: np.ndarray, beliefs: np.ndarray) -> np.ndarray:
     """How much of each name lies in each ring around each landmark, without the landmark itself."""
     if not (len(spots_m) and len(positions_m)):
-        return np.zeros((len(positions_m), 0))
+        return np.zeros((len(positions_m), len(NEIGHBOURS_M) * beliefs.shape[1]))
     distances_m = np.linalg.norm(positions_m[:, None] - spots_m[None], axis=2)
     inner = 0.05
     rings = []
