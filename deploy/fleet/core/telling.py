@@ -105,6 +105,7 @@ class Teller:
             now,
             {region.id: region for region in scene.regions},
             [],
+            nodes={},
             everything=everything,
             tolerance=posterior_change,
         )
