@@ -166,7 +166,7 @@ LONG: dict[str, Callable[[float], tuple[dict, dict]]] = {  # no part of `all`; t
     "lidar": lambda seconds: lidar(),  # seven minutes and more
     "levels": lambda seconds: levels(),  # many minutes
     "exchange": lambda seconds: exchanged(),  # nine runs of the sample at half its pace
-    "foresight": lambda seconds: foresight(),  # worlds of every kind: ten minutes
+    "foresight": lambda seconds: foresight(),  # worlds of every kind: long
     "view": lambda seconds: view(),  # needs an extra and a browser
     "hydra": lambda seconds: hydra(),  # needs an extra
     "merge": lambda seconds: merge(),  # maps dozens of homes, which it keeps
