@@ -264,8 +264,9 @@ class PriorClaim(Message, frozen=True, kw_only=True):
         key_part(self.question)
 
 
-_NO_PIECES, _NO_TABLE = np.zeros(0, np.float32), np.zeros((0, 0), np.float32)
-_NO_LINKS = np.zeros((0, 2), np.int32)
+_NO_PIECES = msgspec.field(default_factory=lambda: np.zeros(0, np.float32))
+_NO_TABLE = msgspec.field(default_factory=lambda: np.zeros((0, 0), np.float32))
+_NO_LINKS = msgspec.field(default_factory=lambda: np.zeros((0, 2), np.int32))
 
 
 class PriorEvidence(Message, frozen=True, kw_only=True):

@@ -145,7 +145,7 @@ def test_what_is_known_of_services_without_loading_them_is_what_they_declare():
 @pytest.mark.parametrize(
     ("service", "without"),
     [
-        ("prior_gateway", {"numba", "scipy", "cv2", "torch"}),
+        ("prior_gateway", {"numba", "cv2", "torch"}),
         ("scene_store", {"numba", "cv2", "torch"}),
         ("ingest", {"numba", "scipy", "torch"}),
         ("place_graph", {"torch"}),

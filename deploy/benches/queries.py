@@ -23,11 +23,14 @@ from prior_sg.schemas.queries import (
     InRadius,
     Nearest,
     NeighboursOf,
+    NodesOf,
     ObjectsInRegions,
     Question,
     RouteBetween,
     SceneQuery,
     Spot,
+    WhatIsMissing,
+    WhereToLook,
     WordsInUse,
 )
 from prior_sg.schemas.regions import Region, Transition
@@ -114,6 +117,9 @@ def kinds_of_questions(scene: Scene, rng: np.random.Generator, count: int) -> di
         "beliefs_of": lambda: BeliefsOf(region=some(regions)),
         "words_in_use": WordsInUse,
         "answers_to": lambda: AnswersTo(text="t", regions={LABELS[1]: 0.5}, objects={KINDS[1]: 0.5}),
+        "nodes_of": lambda: NodesOf(region=some(regions)),
+        "where_to_look": lambda: WhereToLook(label=LABELS[1], start=Spot(point_m=point())),
+        "what_is_missing": WhatIsMissing,
     }
     return {name: iter([make() for _ in range(count + 1)]) for name, make in one_of_each.items()}
 

@@ -5,6 +5,7 @@ the bus gives nothing more to this process. A disk that takes nothing for `STUCK
 comes meanwhile is left out, and counted.
 """
 
+import logging
 import math
 import threading
 import time
@@ -19,6 +20,8 @@ from prior_sg.services.registry import SERVICES
 from prior_sg.services.runtime.bus import Sample, message_in
 from prior_sg.services.runtime.client import BusClient
 from prior_sg.services.runtime.record import LogError, LogWriter
+
+log = logging.getLogger(__name__)
 
 FLUSH_S = 1.0
 MOST_WAITING_BYTES = 256_000_000  # of messages not written yet
@@ -139,6 +142,9 @@ class Recorder:
                     self._log.flush()
             except LogError as error:
                 self.error = self.error or error
+            except Exception as error:  # a fault of ours: without a word the run would go on, and its log end here
+                log.exception("recording failed")
+                self.error = self.error or LogError(f"{self._path} cannot be written on: {error!r}")
 
     def _add(self, sample: Sample) -> None:
         """Record what is valid; what is not never reached any service's state either."""

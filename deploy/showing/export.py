@@ -73,15 +73,13 @@ def scene_json(scene: Scene) -> dict[str, Any]:
                 "hull_m": _short(region.hull_m),
                 "places": scene.place_ids[members[region.id]].tolist(),
                 "objects": region.object_ids,
-                "transitions": [msgspec.to_builtins(way) for way in region.transitions],
+                "transitions": [_plain(way) for way in region.transitions],
                 "adjacent": sorted(b if a == region.id else a for a, b in adjacent if region.id in (a, b)),
             }
             for region in scene.regions
         ],
         "zones": [{"label": label, "regions": ids} for label, ids in zones(scene)],
-        "levels": [
-            msgspec.to_builtins(node) | {"regions": regions_of(scene, node.level)[node.id]} for node in scene.nodes
-        ],
+        "levels": [_plain(node) | {"regions": regions_of(scene, node.level)[node.id]} for node in scene.nodes],
         "places": [
             _place_json(scene, row, names, predicted)
             | _opening_json(frontiers.get(place_id))
@@ -99,7 +97,7 @@ def scene_json(scene: Scene) -> dict[str, Any]:
 
 
 def _foresight_json(foresight: Foresight) -> dict[str, Any]:
-    told: dict[str, Any] = msgspec.to_builtins(foresight)
+    told: dict[str, Any] = _plain(foresight)
     return told | {"is_predicted": True, "openings": [one | {"is_predicted": True} for one in told["openings"]]}
 
 
@@ -229,3 +227,9 @@ def _short(value: Any) -> Any:
     """Numbers as plain floats of few digits, in (nested) lists for arrays."""
     rounded = np.round(np.asarray(value, float), DECIMALS)
     return rounded.tolist()
+
+
+def _plain(part: msgspec.Struct) -> dict[str, Any]:
+    """As JSON has it: lists, no tuples."""
+    found: dict[str, Any] = msgspec.json.decode(msgspec.json.encode(part))
+    return found

@@ -29,11 +29,11 @@ FAILS = """
 import asyncio, sys
 from dataclasses import replace
 from prior_sg.deploy.running import serve
-from prior_sg.services import registry
+from prior_sg.services.scene_store import service as store
 def step(state, message, cfg):
     raise RuntimeError("cannot go on, see postgresql://joe:hunter2@host/db")
     yield
-registry.BY_NAME["scene_store"] = replace(registry.BY_NAME["scene_store"], step=step)
+store.SERVICE = replace(store.SERVICE, step=step)
 sys.argv[0] = "serve"
 sys.exit(serve.main())
 """

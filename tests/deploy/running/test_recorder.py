@@ -128,3 +128,19 @@ def test_a_writer_knows_how_large_its_file_is(tmp_path):
         log.flush()
         assert log.size_bytes >= empty + 100_000
         assert log.size_bytes == (tmp_path / "log.mcap").stat().st_size
+
+
+def test_a_fault_of_ours_ends_no_recording_in_silence(tmp_path, monkeypatch):
+    client, seen = BusClient(LocalBus(Hub())), []
+    recorder = Recorder(client, tmp_path / "log.mcap")
+    recorder.taps.append(lambda sample, message: seen.append(message))
+
+    def fails(*_):
+        raise TypeError("no such schema")
+
+    monkeypatch.setattr(recorder._log, "add", fails)
+    for _ in range(3):
+        client.publish(POSE_UPDATE, update(2))
+    until(lambda: len(seen) == 3)
+    with pytest.raises(LogError, match=r"log\.mcap cannot be written on: TypeError\('no such schema'\)"):
+        recorder.close()

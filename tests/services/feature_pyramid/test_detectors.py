@@ -23,6 +23,7 @@ from prior_sg.services.feature_pyramid.detectors.prompted import as_sentences, b
 from prior_sg.services.feature_pyramid.encoders import torchvision_parts
 from prior_sg.services.feature_pyramid.encoders.base import EncoderUnavailable
 from prior_sg.services.runtime.runner import Runner
+from tests.help.long import long_run
 from tests.help.world import prior, task
 
 CAMERA = Intrinsics(640, 480, 500.0, 500.0, 320.0, 240.0)
@@ -212,8 +213,10 @@ def test_detection_can_be_switched_off():
     [
         ("segmnets", "depth", "no detector is called 'segmnets'"),
         ("owlv2:", "depth", "no detector is called 'owlv2:'"),
-        ("owlv2:/nowhere", "depth", "weights of the detector owlv2:/nowhere cannot be loaded"),
-        ("grounding_dino:/nowhere", "depth", "cannot be loaded"),
+        pytest.param(
+            "owlv2:/nowhere", "depth", "weights of the detector owlv2:/nowhere cannot be loaded", marks=long_run
+        ),
+        pytest.param("grounding_dino:/nowhere", "depth", "cannot be loaded", marks=long_run),
         ("segments", "sam:/nowhere", "'segments' has none"),
     ],
 )

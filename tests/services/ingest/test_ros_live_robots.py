@@ -62,7 +62,7 @@ def assert_alike(frames, recorded):
 @pytest.mark.parametrize(
     ("pictures", "message", "domain"),
     [
-        (True, cloud, 21),
+        pytest.param(True, cloud, 21, marks=long_run),
         pytest.param(False, cloud, 22, marks=long_run),
         pytest.param(True, livox, 23, marks=long_run),
     ],

@@ -15,7 +15,7 @@ from mcap.reader import make_reader
 from prior_sg.schemas.codec import decode, encode
 from prior_sg.schemas.frames import CameraState, IngestState
 from prior_sg.schemas.migrations import MIGRATIONS
-from prior_sg.schemas.topics import CAMERA_STATE, INGEST_STATE, KEYFRAME
+from prior_sg.schemas.topics import CAMERA_STATE, INGEST_STATE, KEYFRAME, TOPICS
 from prior_sg.services.runtime.record import LogError, LogWriter, attachments, contents, metadata, read_log, summary
 from tests.help import reading
 from tests.help.paths import ROOT
@@ -248,3 +248,13 @@ def test_a_missing_log_and_an_unwritable_place_are_named(tmp_path):
 def test_a_full_disk_is_named():
     with pytest.raises(LogError, match="No space left"):
         LogWriter("/dev/full")
+
+
+def test_every_topic_has_a_schema_that_a_log_can_hold(tmp_path):
+    path = tmp_path / "log.mcap"
+    with LogWriter(path) as log:
+        for topic in TOPICS:
+            log.add(topic, topic.name, b"", "w", 0, 0, 1)
+    with path.open("rb") as file:
+        schemas = make_reader(file).get_summary().schemas.values()
+    assert {schema.name.split("/")[0] for schema in schemas} >= {topic.type.__name__ for topic in TOPICS}
