@@ -23,7 +23,8 @@ test: $(VENV)/installed-dev
 test-long: $(VENV)/installed-dev
 	PSG_TEST_LONG=1 $(BIN)/python -m pytest tests/test_hosts.py tests/test_exchange.py tests/test_encoder_swap.py \
 		tests/test_ros_robot.py tests/chaos tests/services/ingest/test_ros_live_robots.py tests/deploy/keys \
-		tests/deploy/evaluation tests/deploy/running/test_fleet_demo.py
+		tests/deploy/evaluation tests/deploy/running/test_fleet_demo.py \
+		tests/services/feature_pyramid/test_detectors.py tests/endurance
 
 # Shares of the cores that tests run; measuring makes them half as slow again.
 coverage: $(VENV)/installed-dev
