@@ -31,7 +31,7 @@ class StoreyConfig(msgspec.Struct, frozen=True, kw_only=True):
     valley: float = 0.5  # density between two floors at most, of that at the lesser one
     tolerance_m: float = 0.3  # a bottom so far below a floor is still on it
     clutter_m: float = 0.8  # bottoms up to so far above a floor are on it
-    stairs: float = 0.4  # share of a region between floors from which on it is stairs, which span storeys
+    stairs: float = 0.25  # share of a region between floors from which on it is stairs, which span storeys
 
     def __post_init__(self) -> None:
         if min(self.least_height_m, self.least_m2, self.part_m2, self.tolerance_m) <= 0 or self.valley < 0:
