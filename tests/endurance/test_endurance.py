@@ -39,7 +39,8 @@ def test_percentiles_count_what_never_came():
     assert percentiles([1.0, None, 3.0]) == {"p50_s": 2.0, "p99_s": pytest.approx(2.98), "count": 2, "never": 1}
 
 
-FOLLOWED = {"came": 1.0, "dropped": 0, "segmented": {"p50_s": 0.3, "count": 99, "never": 1}}
+LATE = {"p50_s": 0.3, "count": 99, "never": 1}
+FOLLOWED = {"came": 1.0, "dropped": 0, "place": LATE, "segmented": LATE}
 
 
 @pytest.mark.parametrize(
@@ -48,6 +49,7 @@ FOLLOWED = {"came": 1.0, "dropped": 0, "segmented": {"p50_s": 0.3, "count": 99, 
         {"came": 0.9},
         {"dropped": 1},
         {"segmented": {"p50_s": 3.0, "count": 100, "never": 0}},
+        {"place": {"p50_s": 3.0, "count": 100, "never": 0}},
         {"segmented": {"p50_s": 0.3, "count": 90, "never": 10}},
         {"segmented": {"p50_s": 0.0, "count": 0, "never": 0}},
     ],
