@@ -3,7 +3,7 @@
 import logging
 from collections.abc import Iterator
 
-from prior_sg.schemas.codec import Message
+from prior_sg.schemas.codec import LAST_NUMBER, Message
 from prior_sg.schemas.frames import ArchiveReply, ArchiveRequest, Keyframe, PoseUpdate
 from prior_sg.schemas.places import MapRequest, PlaceDelta, SnapshotRequest, VoxelMap
 from prior_sg.schemas.scene import Scene, SceneRequest
@@ -66,8 +66,13 @@ def _ask_former(state: State) -> Ask:
 
 def _hear_former(state: State, legacy: Legacy) -> Iterator[Output]:
     state.legacy, state.unnamed = legacy, False
-    if state.lacking and not state.behind:
+    if state.behind:
+        return
+    if state.lacking:
         yield from _catch_up(state, max(state.lacking) + 1)
+    elif len(legacy.ids) and not state.seen:
+        # No keyframe need come by itself: the source may be at its end, and its reader may have begun anew.
+        yield from _catch_up(state, LAST_NUMBER)
 
 
 def _catch_up(state: State, end_frame_id: int) -> Iterator[Output]:

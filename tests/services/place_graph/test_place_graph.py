@@ -18,8 +18,9 @@ from scipy.sparse.csgraph import connected_components
 from prior_sg.schemas.codec import encode
 from prior_sg.schemas.frames import ArchiveReply, Intrinsics, Keyframe, PoseUpdate
 from prior_sg.schemas.places import MapRequest, PlaceDelta, SnapshotRequest
+from prior_sg.schemas.scene import SceneRequest
 from prior_sg.schemas.succession import Succession, TakesOver
-from prior_sg.schemas.topics import ARCHIVE, PLACE_DELTA, PLACE_SNAPSHOT, VOXEL_MAP
+from prior_sg.schemas.topics import ARCHIVE, PLACE_DELTA, PLACE_SNAPSHOT, SCENE, VOXEL_MAP
 from prior_sg.services import images
 from prior_sg.services.geometry import inside_polygon, pose_from_quaternion
 from prior_sg.services.place_graph import service
@@ -40,6 +41,7 @@ from prior_sg.services.place_graph.core.volume.grid import (
     VoxelGrid,
 )
 from prior_sg.services.refusals import NotYet
+from prior_sg.services.registry import BY_NAME
 from prior_sg.services.runtime.config import resolve
 from prior_sg.services.runtime.runner import Runner
 from prior_sg.services.runtime.service import Identity
@@ -949,6 +951,18 @@ def test_a_successor_says_which_keyframes_it_lacks():
     second.answers[PLACE_SNAPSHOT] = first
     second.feed(Succession(predecessor="p"), ROOM_WALK[5])
     assert "3 keyframes of its predecessor's map" in service.lacks(second.state, CFG)
+
+
+def test_a_successor_of_a_dead_one_needs_no_new_keyframe():
+    first = Runner(service.SERVICE, CFG, Identity("r", "p", 1))
+    store = Runner(BY_NAME["scene_store"])
+    store.feed(*[delta for _, delta in first.feed(*ROOM_WALK[:6])])
+    former = store.answer(SCENE, SceneRequest(robot="r"))
+    second = Runner(service.SERVICE, CFG, Identity("r", "q", 2), {ARCHIVE: archive_of(ROOM_WALK[:6]), SCENE: store})
+    [(_, delta)] = second.feed(Succession())
+    assert delta.snapshot and sorted(delta.past_frame_ids.tolist()) == [frame.frame_id for frame in ROOM_WALK[:6]]
+    assert len(former.place_ids) and np.isin(former.place_ids, delta.place_ids).mean() >= 0.9
+    assert len(second.feed(ROOM_WALK[6])) == 1
 
 
 def test_a_pose_update_from_before_the_first_keyframe_empties_no_readers_map():
