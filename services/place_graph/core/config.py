@@ -131,8 +131,9 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
     # 2D places.
     surface_min_clearance_m: float = 1.0  # free height above ground
     surface_max_step_m: float = 0.2  # greatest difference in height of neighbouring ground
-    surface_max_slope: float = 0.6  # greatest rise over run: 31 degrees
+    surface_max_slope: float = 0.6  # greatest rise over run: 31 degrees; the voxel that rounding may add is not counted
     min_cluster_area_m2: float = 2.0  # smaller connected ground is an outlier: table tops (Hydra: 600 mesh vertices)
+    furniture_max_area_m2: float = 8.0  # smaller ground from which one falls on most sides is a table top or a bed
     pure_final_place_size_m: float = 1.0  # pieces with a longer side are halved ... (uhumans2; in the code 3)
     min_final_place_points: int = 10  # ... if they have more voxels than this (uhumans2; in the code 1000 vertices)
     place_overlap_threshold_m: float = 0.1  # smallest overlap of ellipses that are joined
@@ -220,6 +221,7 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
             cluster=round(self.min_cluster_area_m2 / self.voxel_m**2),
             overlap=self.voxels(self.place_overlap_threshold_m),
             rise=self.voxels(self.place_max_neighbor_z_diff_m),
+            furniture=round(self.furniture_max_area_m2 / self.voxel_m**2),
         )
 
     @property

@@ -18,9 +18,11 @@ import numpy as np
 from prior_sg.services.compiled import compiled
 from prior_sg.services.place_graph.core.columns import GroundColumns
 from prior_sg.services.place_graph.core.skeleton.graph import Changes, GraphRules, Place, PlaceGraph, Voxel
-from prior_sg.services.place_graph.core.volume.grid import FREE, OCCUPIED, Box, VoxelGrid
+from prior_sg.services.place_graph.core.volume.grid import FREE, OCCUPIED, UNOBSERVED, Box, VoxelGrid
 
 TILE_PIECES = 4  # side of a tile in pieces of the final size
+EDGE_VOXELS = 3  # how far beside an edge one looks for what lies below
+OPEN, FALL = 1, 2  # what an edge of ground may be
 
 
 @dataclass(frozen=True)
@@ -35,6 +37,7 @@ class GroundRules:
     cluster: int  # connected ground of fewer voxels is an outlier
     overlap: float  # smallest overlap of two ellipses that are joined
     rise: float  # greatest difference in height of two pieces that are joined
+    furniture: int = 0  # connected ground of fewer voxels is none where one falls from most of its edge
 
     @property
     def tile(self) -> int:
@@ -156,8 +159,10 @@ def divide(grid: VoxelGrid, tile: Box, rules: GroundRules) -> list[Piece]:
     voxels = np.argwhere(ground)
     part = parts[tuple(voxels.T)]
     sizes = np.bincount(part, minlength=count)
+    falls, edges = edge_of(label, parts, count, rules.step)
+    furniture = (sizes < rules.furniture) & (2 * falls >= np.maximum(edges, 1))
     voxels += window.low
-    kept = tile.contains(voxels) & (sizes[part] >= rules.cluster)
+    kept = tile.contains(voxels) & ((sizes >= rules.cluster) & ~furniture)[part]
     pieces: list[Piece] = []
     for number in np.unique(part[kept]).tolist():
         pieces += (_piece(points) for points in _halved(voxels[kept & (part == number)], rules))
@@ -265,7 +270,10 @@ def ground_voxels(label, clearance, step, slope):  # noqa: ANN001, ANN201
 
 @compiled()
 def _rise(standing, i, j, k, dx, dy, step):  # noqa: ANN001, ANN202, PLR0917
-    """Rise over run along an axis: over two voxels to either side, as far as small steps lead."""
+    """Rise over run along an axis: over two voxels to either side, as far as small steps lead.
+
+    Both ends are rounded, so that a voxel of rise may be none: stairs that rise evenly do so by steps of one voxel and two.
+    """
     ends = np.zeros(2, np.int64)
     run = 0
     for side in (-1, 1):
@@ -284,7 +292,7 @@ def _rise(standing, i, j, k, dx, dy, step):  # noqa: ANN001, ANN202, PLR0917
             height = found
             run += 1
         ends[(side + 1) // 2] = height
-    return abs(ends[1] - ends[0]) / run if run else 0.0
+    return max(abs(ends[1] - ends[0]) - 1, 0) / run if run else 0.0
 
 
 @compiled()
@@ -317,6 +325,51 @@ def connected(ground, step):  # noqa: ANN001, ANN201
                                 depth += 1
                 count += 1
     return parts, count
+
+
+@compiled()
+def edge_of(label, parts, count, step):  # noqa: ANN001, ANN201
+    """Of how many edges of each part's voxels one falls by more than a step, and how many do not end at a wall."""
+    nx, ny, nz = label.shape
+    falls, edges = np.zeros(count, np.int64), np.zeros(count, np.int64)
+    for i in range(nx):
+        for j in range(ny):
+            for k in range(nz):
+                part = parts[i, j, k]
+                if part < 0:
+                    continue
+                for side in range(4):
+                    found = _beside(label, parts, i, j, k, side, step)
+                    edges[part] += found > 0
+                    falls[part] += found == FALL
+    return falls, edges
+
+
+@compiled()
+def _beside(label, parts, i, j, k, side, step):  # noqa: ANN001, ANN202, PLR0917
+    """What the edge of a voxel is, on one of its four sides: 0 = no edge, or a wall; OPEN, or FALL."""
+    nx, ny, nz = label.shape
+    found = 0
+    for n in range(1, EDGE_VOXELS + 1):
+        a = i + n * (side == 0) - n * (side == 1)
+        b = j + n * (side == 2) - n * (side == 3)
+        if a < 0 or b < 0 or a >= nx or b >= ny:
+            return found
+        for c in range(max(0, k - step), min(nz, k + step + 1)):
+            if parts[a, b, c] == parts[i, j, k]:
+                return 0
+        for c in range(k + 1, min(nz, k + 1 + EDGE_VOXELS)):
+            if label[a, b, c] == OCCUPIED:
+                return 0
+        found = OPEN
+        for c in range(k, -1, -1):
+            if label[a, b, c] == UNOBSERVED:
+                break
+            if label[a, b, c] == OCCUPIED:
+                if c < k - step:
+                    return FALL
+                break
+    return found
 
 
 @compiled()

@@ -1,5 +1,7 @@
 """2D places: ground, pieces and edges on worlds by hand, against the definition, and in any order of keyframes."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -78,6 +80,54 @@ def test_outlier_clusters_are_left_out():
     label[30:34, 30:34, 3] = OCCUPIED  # 16 voxels
     pieces = ground.divide(grid_of(label), Box(np.zeros(3, np.int64), np.array((40, 40, 32))), RULES)
     assert pieces and max(piece.voxels[:, 0].max() for piece in pieces) < 20
+
+
+FURNISHED = dataclasses.replace(RULES, furniture=400)
+
+
+def heights_of_pieces(label, rules=FURNISHED):
+    """The heights at which a hall has pieces of ground."""
+    whole = Box(np.zeros(3, np.int64), np.array((40, 40, 32)))
+    return sorted(
+        {int(z) for piece in ground.divide(grid_of(label), whole, rules) for z in np.unique(piece.voxels[:, 2])}
+    )
+
+
+def furnished(*, floor: int = 3, wall: int = 0) -> np.ndarray:
+    """A hall with a bed of 12 by 18 voxels, 5 above the floor, `wall` voxels from a wall of the hall."""
+    label = hall(floor=floor)
+    label[10:12, :, floor + 1 :] = OCCUPIED
+    label[12 + wall : 24 + wall, 12:30, floor + 1 : floor + 6] = OCCUPIED
+    return label
+
+
+@pytest.mark.parametrize("wall", [0, 8])
+def test_beds_and_table_tops_are_no_ground(wall):
+    label = furnished(wall=wall)
+    assert heights_of_pieces(label, RULES) == [3, 8] and heights_of_pieces(label) == [3]
+    label[12 + wall : 24 + wall, 12:30, 4:8] = FREE  # a table, on nothing
+    assert heights_of_pieces(label, RULES) == [3, 8] and heights_of_pieces(label) == [3]
+
+
+def test_what_one_can_reach_stays_ground_however_high():
+    label = furnished(wall=8)
+    for step in range(4):
+        label[32 + 2 * step : 34 + 2 * step, 14:22, 4 : 8 - step] = OCCUPIED  # a ramp of one in two up to it
+    assert 8 in heights_of_pieces(label)
+    kerb = hall()
+    kerb[20:32, 12:30, 4:6] = OCCUPIED
+    assert heights_of_pieces(kerb) == [3, 5]
+
+
+def test_large_platforms_and_floors_that_end_unseen_stay_ground():
+    large = hall()
+    large[12:, 12:40, 4:9] = OCCUPIED  # a stage
+    assert heights_of_pieces(large) == [3, 8]
+    island = hall()
+    island[:, :, :4] = UNOBSERVED
+    island[12:24, 12:30, 8] = OCCUPIED  # all that was seen of a floor, through a door
+    island[:, :, 4:8] = UNOBSERVED
+    assert heights_of_pieces(island) == [8]
 
 
 def test_no_edge_where_the_straight_line_leaves_the_ground():
