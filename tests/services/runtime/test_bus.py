@@ -7,7 +7,7 @@ import msgspec
 import pytest
 import zenoh
 
-from prior_sg.schemas.codec import DecodeError, decode, encode
+from prior_sg.schemas.codec import DecodeError, Scratch, decode, encode
 from prior_sg.schemas.frames import IngestState
 from prior_sg.schemas.migrations import MIGRATIONS
 from prior_sg.schemas.places import SnapshotRequest
@@ -317,3 +317,15 @@ def test_what_a_link_loses_comes_later_and_still_in_its_order(monkeypatch):
         for bus in (reader, writer):
             bus.close()
         stop()
+
+
+def test_what_was_put_may_be_written_over_at_once(new_bus):
+    reader, writer, got = new_bus(), new_bus(), []
+    reader.subscribe(TASK, TASK.pattern("over"), got.append, lambda topic, number: None)
+    find_each_other(writer, "over", got)
+    scratch = Scratch()
+    for index in range(20):
+        message = task("over", str(index))
+        writer.put(TASK, TASK.key_of(message), scratch.encoded(message), pack_header("w", index, 1))
+    eventually(lambda: len(got) == 20)
+    assert [decode(Task, sample.payload).task for sample in got] == [str(index) for index in range(20)]
