@@ -16,6 +16,7 @@ from pathlib import Path
 from prior_sg.schemas.codec import DecodeError, Message
 from prior_sg.schemas.status import Consumed
 from prior_sg.schemas.topics import TOPICS, Topic
+from prior_sg.services.errors import PriorSgError
 from prior_sg.services.registry import SERVICES
 from prior_sg.services.runtime.bus import Sample, message_in
 from prior_sg.services.runtime.client import BusClient
@@ -29,6 +30,10 @@ STUCK_S = 10.0
 REST_S = 1.5  # without inputs, until the segmenter rests, adapts to the whole map, and settles
 TICKS_AFTER = {service.name: math.ceil(REST_S / service.tick_s) for service in SERVICES if service.tick_s is not None}
 Tap = Callable[[Sample, Message], None]
+
+
+class TapError(PriorSgError):
+    """What follows the messages beside the log has failed; the text is one sentence for the user."""
 
 
 class Waiting:
@@ -86,7 +91,8 @@ class Waiting:
 
 
 class Recorder:
-    """Subscribes at once; writes on its own thread until `close`. `taps` see every valid message on that thread.
+    """Subscribes at once; writes on its own thread until `close`. `taps` see every valid message on that thread; one
+    that fails sees no more, and what it is for ends by that.
 
     With `limit_mb`, recording ends when the log has grown to so much; 0 = it does not. The taps go on.
     """
@@ -101,6 +107,7 @@ class Recorder:
         self.beyond = 0  # messages that came when the log was full
         self.attachments: dict[str, tuple[str, bytes]] = {}  # name: media type and content, written at the end
         self.error: LogError | None = None
+        self.tap_error: TapError | None = None
         self._waiting = Waiting()
         self._thread = threading.Thread(target=self._write, name="recorder", daemon=True)
         self._thread.start()
@@ -109,16 +116,24 @@ class Recorder:
                 client.listen(topic, "*", self._waiting.put)
 
     def close(self) -> None:
-        """Write what has arrived, then finish the file. Raises LogError when something could not be written."""
+        """Write what has arrived, then finish the file. Raises LogError when something could not be written, and
+        TapError, the file finished, when a tap has failed.
+        """
         self._waiting.close()
         self._thread.join()
-        self.check()
+        self._check_log()
         for name, (media_type, data) in self.attachments.items():
             self._log.attach(name, media_type, data)
         self._log.close()
+        self.check()
 
     def check(self) -> None:
-        """Raise LogError when writing has failed."""
+        """Raise LogError when writing has failed, TapError when a tap has."""
+        self._check_log()
+        if self.tap_error is not None:
+            raise self.tap_error
+
+    def _check_log(self) -> None:
         if self.error is not None:
             raise self.error
 
@@ -153,8 +168,8 @@ class Recorder:
         except DecodeError:
             self.malformed[sample.topic.name] += 1
             return
-        for tap in self.taps:
-            tap(sample, message)
+        for tap in list(self.taps):
+            self._show(tap, sample, message)
         if self._limit_bytes and self._log.size_bytes >= self._limit_bytes:
             self.beyond += 1
             return
@@ -162,6 +177,18 @@ class Recorder:
         if sample.writer and self.error is None:
             self._log.add(
                 sample.topic, sample.key, sample.payload, sample.writer, sample.sequence, sample.sent_ns, time.time_ns()
+            )
+
+    def _show(self, tap: Tap, sample: Sample, message: Message) -> None:
+        try:
+            tap(sample, message)
+        except Exception as error:  # a fault of ours: the log has nothing to do with it
+            name = getattr(tap, "__name__", type(tap).__name__)
+            log.exception("a tap failed")
+            self.taps.remove(tap)
+            self.tap_error = self.tap_error or TapError(
+                f"{name}, which follows what is recorded, failed at a message of {sample.topic.name}: {error!r}; "
+                f"{self._path} is whole, report this with it"
             )
 
 

@@ -67,6 +67,7 @@ LOGGED = "error"
 LOGGED_BEYOND = (
     f"{LOGGED},zenoh_link_tls::unicast=warn,zenoh::net::routing::interceptor::access_control=info"  # who is not let in
 )
+STAMPS = {"enabled": False}  # writers number their samples; a stamp of a clock ahead would be an error at each hop
 TRANSPORT: dict[str, Any] = {
     "link": {
         "tx": {"lease": LEASE_MS, "keep_alive": 4},
@@ -98,7 +99,7 @@ def client_config(endpoint: str, bundle: Bundle | None = None) -> zenoh.Config:
                     "retry": RETRY,
                 },
                 "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
-                "timestamping": {"enabled": True},
+                "timestamping": STAMPS,
                 "transport": _transport(bundle if secured(endpoint) else None),
             }
         )
@@ -113,7 +114,7 @@ def router_settings(endpoint: str, beyond: Beyond | None = None) -> dict[str, An
         "mode": "router",
         "listen": {"endpoints": [endpoint, *(beyond.listen if beyond else ())]},
         "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": beyond is None}},
-        "timestamping": {"enabled": True},
+        "timestamping": STAMPS,
         "transport": _transport(beyond.bundle if beyond else None),
         "low_pass_filter": size_filters(),
     }
@@ -237,7 +238,7 @@ class ZenohBus:
                     raise BusError(unanswered(endpoint)) from error
                 time.sleep(0.2)
 
-    def put(self, topic: Topic, key: str, payload: bytes, header: bytes) -> None:
+    def put(self, topic: Topic, key: str, payload: bytes | bytearray, header: bytes) -> None:
         """Publish one sample. Raises BusError for one that no router and no reader would take."""
         if len(payload) > topic.most_bytes:
             raise BusError(f"{topic.name}: a message of {len(payload)} bytes, and at most {topic.most_bytes} are taken")

@@ -4,6 +4,7 @@ import asyncio
 import logging
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from prior_sg.schemas.codec import Message, encode
@@ -23,6 +24,19 @@ class Reply:
 
     ask: Ask
     payload: bytes
+
+
+async def answer_to(bus: Bus, key: str, request: bytes, timeout_s: float) -> Answer:
+    """Ask on a bus, which answers on a foreign thread, perhaps when nobody waits any more."""
+    loop = asyncio.get_running_loop()
+    answered: asyncio.Future[Answer] = loop.create_future()
+
+    def receive(answer: Answer) -> None:
+        if not answered.done():
+            answered.set_result(answer)
+
+    await asyncio.to_thread(bus.call, key, request, timeout_s, partial(loop.call_soon_threadsafe, receive))
+    return await answered
 
 
 class Asks:

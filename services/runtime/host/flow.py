@@ -8,6 +8,7 @@ from collections.abc import Callable
 
 log = logging.getLogger(__name__)
 STUCK_S = 60.0
+STANDBY_S = 0.5  # between two messages while a successor catches up, which must gain on any stream
 
 
 class Progress:
@@ -21,6 +22,8 @@ class Progress:
         self._moved_s: dict[str, float] = {}  # when a reader last finished with something, or had nothing to do
         self._stuck: set[str] = set()
         self._alive: set[str] = set()
+        self._standby: set[str] = set()
+        self._published_s: dict[str, float] = {}  # when, by topic
         self.event = asyncio.Event()
 
     def published(self, topic: str, sequence: int) -> None:
@@ -28,7 +31,7 @@ class Progress:
         for instance, topics in list(self._reads.items()):
             if topic in topics and self._consumed.get((instance, topic), -1) >= self._published.get(topic, -1):
                 self._moved_s[instance] = self._clock_s()
-        self._published[topic] = sequence
+        self._published[topic], self._published_s[topic] = sequence, self._clock_s()
 
     def reader(self, instance: str, topics: list[str]) -> None:
         """A process says what it reads."""
@@ -42,20 +45,28 @@ class Progress:
         self._moved_s[instance] = self._clock_s()
         self._consumed[instance, topic] = max(sequence, self._consumed.get((instance, topic), -1))
 
+    def stands_by(self, instance: str, so: bool) -> None:
+        """A process reads what another that serves still reads, and knows nothing of what went before; or no longer."""
+        (self._standby.add if so else self._standby.discard)(instance)
+
     def alive(self, instance: str, alive: bool) -> None:
         """A process has come or gone."""
         (self._alive.add if alive else self._alive.discard)(instance)
+        if not alive:
+            self._standby.discard(instance)
         self._moved_s[instance] = self._clock_s()
 
     def lag(self, topic: str) -> float:
         """By how many messages the slowest live reader is behind; infinitely many when nobody reads. One that has
-        finished with nothing for `STUCK_S`, though there is something, is waited for no longer.
+        finished with nothing for `STUCK_S`, though there is something, is waited for no longer; one that stands by
+        slows the stream down and does not stop it, for another serves.
         """
         newest = self._published.get(topic, -1)
+        passes = self._clock_s() - self._published_s.get(topic, -math.inf) >= STANDBY_S
         lags = {
             instance: newest - self._consumed.get((instance, topic), -1)
             for instance, topics in list(self._reads.items())
-            if topic in topics and instance in self._alive
+            if topic in topics and instance in self._alive and not (passes and instance in self._standby)
         }
         return max((lag for instance, lag in lags.items() if not self._is_stuck(instance, lag)), default=math.inf)
 

@@ -18,7 +18,8 @@ from prior_sg.schemas.status import EpochKnown, EpochRequest
 from prior_sg.schemas.topics import EPOCH, WAITING, Topic, lease_key
 from prior_sg.services.deltas import fault_of_epoch, next_epoch
 from prior_sg.services.errors import PriorSgError
-from prior_sg.services.runtime.bus import Answer, Bus, BusError
+from prior_sg.services.runtime.bus import Bus, BusError
+from prior_sg.services.runtime.host.asks import answer_to
 
 log = logging.getLogger(__name__)
 
@@ -248,13 +249,7 @@ class Lease:
 
     async def _ask(self, topic: str, keeper: str) -> EpochKnown | None:
         request = EpochRequest(robot=self._robot, topic=topic, keeper=keeper)
-        answered: asyncio.Future[Answer] = self._loop.create_future()
-
-        def receive(answer: Answer) -> None:
-            self._loop.call_soon_threadsafe(answered.set_result, answer)
-
-        await asyncio.to_thread(self._bus.call, EPOCH.key_of(request), encode(request), ANSWER_S, receive)
-        payload = (await answered).payload
+        payload = (await answer_to(self._bus, EPOCH.key_of(request), encode(request), ANSWER_S)).payload
         try:
             told = None if payload is None else decode(EpochKnown, payload)
         except DecodeError as error:

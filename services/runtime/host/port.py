@@ -13,6 +13,7 @@ from prior_sg.services.runtime.host.inbox import Inbox
 from prior_sg.services.runtime.jobs.pool import JobPool
 
 log = logging.getLogger(__name__)
+LOOK_S = 0.1  # for what only time brings: who is stuck, or stands by, is waited for no longer
 
 
 @dataclass(frozen=True)
@@ -54,6 +55,6 @@ class Port:
                 said = True
                 log.info("waiting for readers and workers", extra={"lags": lags, "jobs": jobs})
             try:
-                await asyncio.wait_for(self.progress.event.wait(), timeout=1.0)
+                await asyncio.wait_for(self.progress.event.wait(), timeout=LOOK_S)
             except TimeoutError:
                 continue

@@ -4,6 +4,7 @@ import asyncio
 from functools import partial
 
 from prior_sg.schemas.status import Consumed, Started
+from prior_sg.schemas.succession import Succession, TakesOver
 from prior_sg.schemas.topics import JOURNAL, alive_key
 from prior_sg.services.runtime.bus import Bus, Sample
 from prior_sg.services.runtime.host.door import Door
@@ -33,6 +34,12 @@ class Readers:
                 started = admitted(Started, entry.inline, fault_of=lambda started: "")
                 if isinstance(started, Started):
                     self._progress.reader(entry.instance, started.reads)
+            case Consumed(topic=Succession.__name__) as entry:
+                succession = admitted(Succession, entry.inline, fault_of=lambda told: "")
+                if isinstance(succession, Succession):
+                    self._progress.stands_by(entry.instance, bool(succession.predecessor))
+            case Consumed(topic=TakesOver.__name__) as entry:
+                self._progress.stands_by(entry.instance, False)
             case Consumed() as entry:
                 own = entry.writer == self._writer
                 self._progress.consumed(entry.instance, entry.topic, entry.sequence if own else -1)

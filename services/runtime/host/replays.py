@@ -2,6 +2,8 @@
 
 A repeat with its own number is ordinary, for delivery is at least once: it is dropped before it is decoded. What rises
 from one message of a writer to the next cannot fall while their numbers rise: then somebody else sends what was said.
+No window is needed for links that lose or reorder: the bus holds what comes early until what it lacks has come again,
+and hands on each writer's samples in their order.
 """
 
 from collections import OrderedDict

@@ -14,6 +14,7 @@ from prior_sg.schemas.codec import DecodeError, decode, encode
 from prior_sg.schemas.succession import Bequest, YieldRequest
 from prior_sg.schemas.topics import alive_key, yield_key
 from prior_sg.services.runtime.bus import NOBODY, Answer, Bus
+from prior_sg.services.runtime.host.asks import answer_to
 from prior_sg.services.runtime.host.lease import Lease
 from prior_sg.services.runtime.service import ServiceError
 
@@ -54,16 +55,8 @@ class Predecessor:
         raise ServiceError(f"{self.instance} does not yield ({answer.reason}): it serves on, and this process ends")
 
     async def _asked(self) -> Answer:
-        loop = asyncio.get_running_loop()
-        answered: asyncio.Future[Answer] = loop.create_future()
-
-        def receive(answer: Answer) -> None:
-            loop.call_soon_threadsafe(answered.set_result, answer)
-
         key = yield_key(self.whose, self.service, self.instance)
-        request = encode(YieldRequest(successor=self.successor))
-        await asyncio.to_thread(self.bus.call, key, request, YIELD_S, receive)
-        return await answered
+        return await answer_to(self.bus, key, encode(YieldRequest(successor=self.successor)), YIELD_S)
 
     async def _is_alive(self) -> bool:
         return bool(await asyncio.to_thread(self.bus.announced, alive_key(self.service, self.instance), ALIVE_S))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from prior_sg.deploy.running import recorder as recording
-from prior_sg.deploy.running.recorder import Recorder, Waiting
+from prior_sg.deploy.running.recorder import Recorder, TapError, Waiting
 from prior_sg.schemas.frames import PoseUpdate
 from prior_sg.schemas.topics import POSE_UPDATE
 from prior_sg.services.runtime.bus import Hub, LocalBus, Sample
@@ -144,3 +144,22 @@ def test_a_fault_of_ours_ends_no_recording_in_silence(tmp_path, monkeypatch):
     until(lambda: len(seen) == 3)
     with pytest.raises(LogError, match=r"log\.mcap cannot be written on: TypeError\('no such schema'\)"):
         recorder.close()
+
+
+def test_a_tap_that_fails_is_no_log_that_cannot_be_written(tmp_path):
+    client, seen = BusClient(LocalBus(Hub())), []
+    recorder = Recorder(client, tmp_path / "log.mcap")
+
+    def counts(sample, message):
+        raise ValueError("a number too many")
+
+    recorder.taps += [counts, lambda sample, message: seen.append(message)]
+    for _ in range(3):
+        client.publish(POSE_UPDATE, update(2))
+    until(lambda: len(seen) == 3)
+    said = r"counts, which follows .* POSE_UPDATE: ValueError\('a number too many'\); .*log\.mcap is whole"
+    with pytest.raises(TapError, match=said):
+        recorder.check()
+    with pytest.raises(TapError, match=said):
+        recorder.close()
+    assert recorder.counts["POSE_UPDATE"] == 3 and len(list(read_log(tmp_path / "log.mcap"))) == 3

@@ -3,18 +3,23 @@
 import threading
 import time
 
+import msgspec
 import pytest
 import zenoh
 
-from prior_sg.schemas.codec import DecodeError, decode, encode
+from prior_sg.schemas.codec import DecodeError, Scratch, decode, encode
 from prior_sg.schemas.frames import IngestState
 from prior_sg.schemas.migrations import MIGRATIONS
 from prior_sg.schemas.places import SnapshotRequest
 from prior_sg.schemas.priors import Task
 from prior_sg.schemas.topics import INGEST_STATE, KEYFRAME, PLACE_SNAPSHOT, TASK
+from prior_sg.services.runtime import zenoh_bus
 from prior_sg.services.runtime.bus import Answer, BusError, Hub, LocalBus, key_matches, pack_header, unpack_header
+from prior_sg.services.runtime.host.inbox import Inbox
+from prior_sg.services.runtime.host.replays import Replays
 from prior_sg.services.runtime.zenoh_bus import ZenohBus, client_config
 from tests.help import reading
+from tests.help.examples import KEYFRAME as FRAME
 
 
 @pytest.fixture(params=["local", "zenoh"])
@@ -277,3 +282,69 @@ def test_questions_and_answers_name_their_schema_and_are_refused_like_samples(en
     with pytest.raises(DecodeError, match="PlaceDelta/2 is newer than this program's PlaceDelta/1"):
         decode(PLACE_SNAPSHOT.reply, answer.payload)
     bus.close()
+
+
+def test_what_a_link_loses_comes_later_and_still_in_its_order(monkeypatch):
+    settings = zenoh_bus.router_settings
+
+    def loses(endpoint, beyond=None):
+        rules = [{"key_expr": KEYFRAME.pattern("*"), "freq": 10}]
+        return settings(endpoint, beyond) | {
+            "downsampling": [{"flows": ["ingress"], "messages": ["put"], "rules": rules}]
+        }
+
+    monkeypatch.setattr(zenoh_bus, "router_settings", loses)
+    endpoint, stop = zenoh_bus.open_free_router("tcp/127.0.0.1:0")
+    reader, writer, got, live = ZenohBus(endpoint), ZenohBus(endpoint), [], []
+    inbox, replays = Inbox(wake=lambda: None), Replays()
+    try:
+        reader.subscribe(KEYFRAME, KEYFRAME.pattern("loses"), got.append, lambda topic, number: None)
+        beside = reader._session.declare_subscriber(KEYFRAME.pattern("loses"), live.append)
+        time.sleep(0.3)
+        frames = [msgspec.structs.replace(FRAME, robot="loses", frame_id=number) for number in range(20)]
+        for number, frame in enumerate(frames):
+            put(writer, KEYFRAME, frame, "w", number)
+            time.sleep(0.02)
+        eventually(lambda: len(got) == 20)
+        beside.undeclare()
+        assert 0 < len(live) < 20  # most were taken off the link
+        for sample, frame in zip(got, frames, strict=True):
+            inbox.offer(sample)
+            assert replays.fault_of(inbox.take(), frame) == ""
+        counts = inbox.of(KEYFRAME.name)
+        assert (counts.received, counts.duplicate, counts.missed) == (20, 0, 0)
+    finally:
+        for bus in (reader, writer):
+            bus.close()
+        stop()
+
+
+def test_what_was_put_may_be_written_over_at_once(new_bus):
+    reader, writer, got = new_bus(), new_bus(), []
+    reader.subscribe(TASK, TASK.pattern("over"), got.append, lambda topic, number: None)
+    find_each_other(writer, "over", got)
+    scratch = Scratch()
+    for index in range(20):
+        message = task("over", str(index))
+        writer.put(TASK, TASK.key_of(message), scratch.encoded(message), pack_header("w", index, 1))
+    eventually(lambda: len(got) == 20)
+    assert [decode(Task, sample.payload).task for sample in got] == [str(index) for index in range(20)]
+
+
+def test_no_sample_carries_a_clock_that_others_could_refuse(endpoint):
+    """Zenoh takes a stamp more than half a second ahead for an error, and says so at every hop."""
+    writer, stamps = ZenohBus(endpoint), []
+    session = zenoh.open(client_config(endpoint))
+    try:
+        session.declare_subscriber("psg/clock/**", lambda sample: stamps.append(sample.timestamp))
+        time.sleep(0.3)
+        put(writer, TASK, task("clock", "t"), "w", 0)
+        state = IngestState(
+            robot="clock", stamp_ns=1, frames_read=1, frames_total=2, keyframes=1, encoded=0, rejected=0, finished=False
+        )
+        put(writer, INGEST_STATE, state, "w", 0)
+        eventually(lambda: len(stamps) >= 2)
+        assert set(stamps) == {None}
+    finally:
+        writer.close()
+        session.close()

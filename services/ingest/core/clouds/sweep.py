@@ -12,6 +12,7 @@ MOST_POINTS = 1 << 25
 NEAREST_M = 0.1  # drivers write zeros where nothing came back, and see their own mount
 SLICE_NS = 1_000_000  # within which the sensor is taken to stand still
 LONGEST_NS = 1_000_000_000  # a sweep; longer offsets are no offsets
+EDGE_NS = 100_000_000  # a last sweep may end so long after the last pose
 DATES = ((1e17, 1), (1e14, 10**3), (1e11, 10**6), (1e8, 10**9))  # times from here on are dates of so many ns per unit
 
 

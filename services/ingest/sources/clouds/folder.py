@@ -20,7 +20,7 @@ import numpy as np
 
 from prior_sg.services.geometry import inverse
 from prior_sg.services.ingest.core.clouds.files import ENDINGS, columns_of
-from prior_sg.services.ingest.core.clouds.sweep import CloudError, Sweep, sweep_of
+from prior_sg.services.ingest.core.clouds.sweep import EDGE_NS, CloudError, Sweep, sweep_of
 from prior_sg.services.ingest.core.options import ReadOptions
 from prior_sg.services.ingest.core.poses import PoseError, rigid
 from prior_sg.services.ingest.core.ros.transforms import Track
@@ -44,7 +44,6 @@ from prior_sg.services.ingest.sources.tables import read_json, stamps_ns
 NAME = "lidar"
 CLOUDS, DESCRIBED = "lidar", "lidar.json"
 LOOKS = f"{CLOUDS}/ with a cloud per sweep, {DESCRIBED} and a list of poses with stamps (lidar)"
-EDGE_NS = 100_000_000  # a last sweep may end so long after the last pose
 
 
 def fits(path: Path) -> bool:

@@ -9,7 +9,7 @@ from functools import partial
 
 import numpy as np
 
-from prior_sg.services.ingest.core.clouds.sweep import CloudError, Sweep, sweep_of
+from prior_sg.services.ingest.core.clouds.sweep import EDGE_NS, CloudError, Sweep, sweep_of
 from prior_sg.services.ingest.core.options import ReadOptions
 from prior_sg.services.ingest.core.poses import Convention, PoseError
 from prior_sg.services.ingest.core.ros.clouds import columns_of_message
@@ -32,8 +32,6 @@ from prior_sg.services.ingest.sources.ros.bag import Bag, Index
 from prior_sg.services.ingest.sources.ros.foreign import ForeignBag
 from prior_sg.services.ingest.sources.ros.pictures import color_camera
 from prior_sg.services.ingest.sources.ros.recorded import Recorded
-
-EDGE_NS = 100_000_000  # a last sweep may end so long after the last pose
 
 
 def load(name: str, bag: Bag | ForeignBag, topics: list[Topic], choice: Chosen, options: ReadOptions) -> Found:

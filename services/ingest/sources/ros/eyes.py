@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from prior_sg.services.ingest.core.clouds.sweep import EDGE_NS
 from prior_sg.services.ingest.core.clouds.views import VIEW
 from prior_sg.services.ingest.core.options import ALL_CAMERAS, ReadOptions
 from prior_sg.services.ingest.core.poses import Convention
@@ -31,7 +32,6 @@ from prior_sg.services.ingest.core.ros.topics import (
 from prior_sg.services.ingest.core.ros.transforms import Stamped, TransformTree
 from prior_sg.services.ingest.sources.base import MILLIMETRE, Camera, Found, FrameError, Images, SourceError
 from prior_sg.services.ingest.sources.clouds.live import Around, Drawn, Shower, period_ns
-from prior_sg.services.ingest.sources.clouds.ros import EDGE_NS
 from prior_sg.services.ingest.sources.clouds.swept import used_views
 from prior_sg.services.ingest.sources.normalise import Samples, beside, prepare
 from prior_sg.services.ingest.sources.normaliser import UNUSABLE, Normaliser
