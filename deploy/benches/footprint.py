@@ -150,13 +150,26 @@ def standing() -> Look:
 
 
 def start_bench(source: Path) -> tuple[dict, dict]:
-    """Seconds from the command until the first of each kind of message; then the run is interrupted."""
+    """Seconds from the command until the first of each kind of message, and of processors until the region, which other
+    work on the machine changes less; then the run is interrupted.
+    """
     with _running(source) as (process, seen, began_s):
         while "region" not in seen.first_s:
             if process.poll() is not None or time.time() - began_s > TIMEOUT_S:
                 raise RuntimeError(f"no region came within {time.time() - began_s:.0f} s")
             time.sleep(LOOK_S)
-        return _times(seen, began_s), {"source": source.name}
+        worked_s = _worked_s(psutil.Process(process.pid))
+        return _times(seen, began_s) | {"processor_s": worked_s}, {"source": source.name}
+
+
+def _worked_s(command: psutil.Process) -> float:
+    """Processor time so far of the command and all below it."""
+    worked_s = 0.0
+    for process in (command, *command.children(recursive=True)):
+        with contextlib.suppress(psutil.Error):
+            times = process.cpu_times()
+            worked_s += times.user + times.system
+    return worked_s
 
 
 def _times(seen: Seen, began_s: float) -> dict[str, float]:
