@@ -23,7 +23,7 @@ test: $(VENV)/installed-dev
 test-long: $(VENV)/installed-dev
 	PSG_TEST_LONG=1 $(BIN)/python -m pytest tests/test_hosts.py tests/test_exchange.py tests/test_encoder_swap.py \
 		tests/test_ros_robot.py tests/chaos tests/services/ingest/test_ros_live_robots.py tests/deploy/keys \
-		tests/deploy/evaluation tests/deploy/running/test_fleet_demo.py \
+		tests/deploy/evaluation tests/deploy/running/test_fleet_demo.py tests/deploy/running/test_warm.py \
 		tests/services/feature_pyramid/test_detectors.py tests/endurance
 
 # Shares of the cores that tests run; measuring makes them half as slow again.
@@ -33,10 +33,9 @@ coverage: $(VENV)/installed-dev
 	$(BIN)/coverage combine --quiet
 	$(BIN)/coverage report --include='services/**/*.py,schemas/*.py' --omit='services/*/service.py,services/runtime/**'
 
-# Tests that compile most inner loops.
+# Inner loops of the services, which one process compiles for all tests.
 loops: $(VENV)/installed-dev
-	$(BIN)/python -m pytest tests/services/segmenter/test_region_cost.py tests/test_pipeline.py \
-		-k 'could_not_use or neighbours' --timeout 900
+	$(BIN)/prior-sg warm
 
 # A real language model of 1.5 B parameters behind a server on loopback: 1.1 GB into ~/.cache/prior-sg/models, once, and
 # skipped where it cannot be had. One thread writes about three tokens a second: take half an hour.
@@ -82,6 +81,7 @@ FORGET_LOOPS := find schemas services deploy -name '*.nb[ci]' -delete
 $(VENV)/installed: pyproject.toml constraints.txt | $(BIN)/pip
 	$(INSTALL) -e '.[encode,dsg,fast-cut,view]'
 	$(FORGET_LOOPS)
+	$(BIN)/prior-sg warm
 	touch $@
 
 # Holds all of the other. Bytecode is written for what is used, when it is used.

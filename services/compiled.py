@@ -1,17 +1,24 @@
-"""Inner loops compiled by numba, kept on disk between processes wherever something can be written."""
+"""Inner loops compiled by numba, kept on disk between processes wherever something can be written.
 
+numba and LLVM take 70 MB and most of a second to load. So a process has them from its first call of a loop on, not from
+its start.
+"""
+
+import functools
 import logging
 import os
 from collections.abc import Callable
+from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, TypeVar
-
-import numba
+from typing import Any, TypeVar, cast
 
 from prior_sg.services.folders import temporary_cache
 
 F = TypeVar("F", bound=Callable)
 log = logging.getLogger(__name__)
+
+if find_spec("numba") is None:  # told at the start, not at the first input
+    raise ModuleNotFoundError("No module named 'numba'", name="numba")
 
 
 def compiled(**options: Any) -> Callable[[F], F]:
@@ -20,22 +27,68 @@ def compiled(**options: Any) -> Callable[[F], F]:
     What is compiled is kept beside the code, in the user's cache, or in a temporary folder; where none of them can be
     written, every process compiles anew.
     """
+    return lambda function: cast(F, Loop(function, options))
 
-    def decorate(function: F) -> F:
+
+class Loop:
+    """One function to be compiled. Compiled code may call it, too."""
+
+    def __init__(self, function: Callable, options: dict[str, Any]) -> None:
+        functools.update_wrapper(self, function)
+        self._function, self._options = function, options
+
+    def __call__(self, *arguments: Any, **named: Any) -> Any:
+        """Call what was compiled for arguments of these types; the first time it is compiled, or read from the disk."""
+        return self._dispatcher(*arguments, **named)
+
+    @functools.cached_property
+    def _dispatcher(self) -> Any:
+        """What numba makes of the function."""
         try:
-            return _kept(function, options)
+            return _kept(self._function, self._options)
         except RuntimeError:  # neither beside the code nor in the user's cache
             _keep_in_temporary_folder()
         try:
-            return _kept(function, options)
+            return _kept(self._function, self._options)
         except RuntimeError:
-            return numba.njit(nogil=True, **options)(function)
+            return _numba().njit(nogil=True, **self._options)(self._function)
 
-    return decorate
+    def met(self) -> tuple[int, int]:
+        """For how many argument types it was compiled in this process, and for how many that was read from the disk."""
+        if "_dispatcher" not in vars(self):
+            return 0, 0
+        found = self._dispatcher.stats
+        return sum(found.cache_misses.values()), sum(found.cache_hits.values())
+
+    # What numba asks of a function that another loop calls: its type, and, for one to be inlined, options and code.
+
+    @property
+    def _numba_type_(self) -> Any:
+        return self._dispatcher._numba_type_
+
+    @property
+    def targetoptions(self) -> dict[str, Any]:
+        """As they were given."""
+        options: dict[str, Any] = self._dispatcher.targetoptions
+        return options
+
+    @property
+    def py_func(self) -> Callable:
+        """The function as it is written."""
+        return self._function
 
 
-def _kept(function: F, options: dict[str, Any]) -> F:
-    return numba.njit(cache=True, nogil=True, **options)(function)
+@functools.cache
+def _numba() -> Any:
+    """The package, loaded when it is first needed."""
+    import numba
+
+    return numba
+
+
+def _kept(function: Callable, options: dict[str, Any]) -> Callable:
+    kept: Callable = _numba().njit(cache=True, nogil=True, **options)(function)
+    return kept
 
 
 def _keep_in_temporary_folder() -> None:
@@ -46,7 +99,7 @@ def _keep_in_temporary_folder() -> None:
         folder: Path | None = temporary_cache("compiled")
     except OSError:
         folder = None
-    os.environ["NUMBA_CACHE_DIR"] = vars(numba.config)["CACHE_DIR"] = str(folder or os.devnull)
+    os.environ["NUMBA_CACHE_DIR"] = vars(_numba().config)["CACHE_DIR"] = str(folder or os.devnull)
     where = f"it is kept in {folder}" if folder else "every process compiles anew, which takes a minute"
     log.warning(
         "compiled code can be kept neither beside the program nor in the user's cache: %s; "

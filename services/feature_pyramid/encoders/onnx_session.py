@@ -4,7 +4,7 @@ import hashlib
 import logging
 import os
 from collections.abc import Callable
-from functools import cache
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +34,21 @@ class Session:
     def __call__(self, *arrays: np.ndarray) -> np.ndarray:
         """The first output; inputs in the network's own order."""
         return self._session.run(None, dict(zip(self.inputs, arrays, strict=True)))[0]
+
+
+class AtFirstCall:
+    """The same, loaded when it is first called: for what may never be needed, or hours later."""
+
+    def __init__(self, path: Path, threads: int, device: str = "cpu") -> None:
+        self._made_of = path, threads, device
+
+    @cached_property
+    def _session(self) -> Session:
+        return Session(*self._made_of)
+
+    def __call__(self, *arrays: np.ndarray) -> np.ndarray:
+        """The first output; inputs in the network's own order."""
+        return self._session(*arrays)
 
 
 def threads_of(threads: int) -> int:

@@ -5,7 +5,7 @@ of the former place at its centre, else of the nearest that would merge with it.
 """
 
 import numpy as np
-from scipy.spatial import cKDTree
+import scipy
 
 from prior_sg.schemas.places import PlaceDelta
 from prior_sg.schemas.scene import Scene
@@ -48,7 +48,8 @@ def matched(legacy: Legacy, positions_m: np.ndarray, reach_m: float) -> dict[int
     if not (len(legacy.ids) and len(positions_m)):
         return {}
     count = min(CANDIDATES, len(legacy.ids))
-    distances_m, at = cKDTree(legacy.positions_m).query(positions_m, k=count, distance_upper_bound=reach_m)
+    tree = scipy.spatial.cKDTree(legacy.positions_m)
+    distances_m, at = tree.query(positions_m, k=count, distance_upper_bound=reach_m)
     distances_m, at = distances_m.reshape(-1, count), at.reshape(-1, count)
     rows, columns = np.nonzero(np.isfinite(distances_m))
     order = np.lexsort((legacy.ids[at[rows, columns]], distances_m[rows, columns]))

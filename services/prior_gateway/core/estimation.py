@@ -17,7 +17,7 @@ from typing import Any
 
 import msgspec
 import numpy as np
-from scipy.special import betaln
+import scipy
 
 from prior_sg.schemas.priors import Prior, PriorEvidence
 from prior_sg.services.prior_gateway.core.turns import LEAST, MOST
@@ -260,7 +260,7 @@ def strengths(stated: np.ndarray, trials: np.ndarray, hits: np.ndarray, guess: f
     scores = []
     for factor in STRENGTHS:
         alpha, beta = factor * guess * stated, factor * guess * (1 - stated)
-        likely = betaln(alpha + hits, beta + trials - hits) - betaln(alpha, beta)
+        likely = scipy.special.betaln(alpha + hits, beta + trials - hits) - scipy.special.betaln(alpha, beta)
         scores.append(likely.sum(axis=1) - 0.5 * (np.log(factor) / DOUBT) ** 2)
     return guess * np.array(STRENGTHS)[np.argmax(scores, axis=0)], np.max(scores, axis=0)
 

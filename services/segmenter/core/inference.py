@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import msgspec
 import numpy as np
-from scipy.spatial import cKDTree
+import scipy
 
 from prior_sg.services.segmenter.core.appearance import adaptation, information, smoothing, unmixing
 from prior_sg.services.segmenter.core.appearance.label_bias import label_bias
@@ -196,7 +196,8 @@ def see_objects(state: State, view: ObjectView, cfg: Config) -> None:
     """From now on these are the objects of the map; the places near those that are new, changed or gone ask again."""
     changed_m = state.objects.see(view)
     if len(changed_m) and len(state.map.graph.ids):
-        distances_m, _ = cKDTree(changed_m).query(state.map.graph.positions_m, distance_upper_bound=cfg.objects.reach_m)
+        tree = scipy.spatial.cKDTree(changed_m)
+        distances_m, _ = tree.query(state.map.graph.positions_m, distance_upper_bound=cfg.objects.reach_m)
         near = np.isfinite(distances_m)
         state.map.places.doubtful |= near
         state.regions.disturb(state.map.places.regions[near])

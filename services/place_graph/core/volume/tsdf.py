@@ -13,7 +13,7 @@ pose turns out wrong leaves nothing behind. (Unless a voxel's weight reached `ma
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import ndimage
+import scipy
 
 from prior_sg.schemas.frames import Intrinsics
 from prior_sg.services.compiled import compiled
@@ -203,6 +203,6 @@ def _seen(grid: VoxelGrid, points_world: np.ndarray, voxel_m: float) -> np.ndarr
     voxels = np.floor(points_world / voxel_m).astype(np.int64)
     box = Box(voxels.min(axis=0), voxels.max(axis=0) + 1).grown(1)
     label = grid.gather("label", box)
-    near = ndimage.maximum_filter(label == OCCUPIED, size=3)
+    near = scipy.ndimage.maximum_filter(label == OCCUPIED, size=3)
     where = tuple((voxels - box.low).T)
     return np.where(near[where], OCCUPIED, label[where])

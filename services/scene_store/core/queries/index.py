@@ -4,9 +4,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
+import scipy
 
 from prior_sg.schemas.names import same
 from prior_sg.schemas.objects import SceneObject
@@ -22,7 +20,7 @@ MOST_GRAPHS = 8  # by least clearance, kept at a time
 class Ways:
     """Edges of enough clearance as a graph over the rows of places."""
 
-    graph: csr_array  # (place, place) lengths in metres
+    graph: "scipy.sparse.csr_array"  # (place, place) lengths in metres
     component: np.ndarray  # (place,)
     roomy: np.ndarray  # (place,) bool: has the clearance itself
 
@@ -91,9 +89,9 @@ class Index:
         return self.scene.positions_m.astype(np.float64)
 
     @cached_property
-    def tree(self) -> cKDTree:
+    def tree(self) -> "scipy.spatial.cKDTree":
         """Of the places."""
-        return cKDTree(self.points_m, balanced_tree=False, compact_nodes=False)
+        return scipy.spatial.cKDTree(self.points_m, balanced_tree=False, compact_nodes=False)
 
     @cached_property
     def boxes_m(self) -> tuple[np.ndarray, np.ndarray]:
@@ -201,8 +199,9 @@ class Index:
         count = len(self.scene.place_ids)
         a, b = rows[wide].T
         both = (np.concatenate((a, b)), np.concatenate((b, a)))
-        graph = csr_array((np.tile(np.maximum(lengths_m[wide], 1e-9), 2), both), shape=(count, count))
-        return Ways(graph, connected_components(graph, directed=False)[1], self.scene.radii_m >= clearance_m)
+        graph = scipy.sparse.csr_array((np.tile(np.maximum(lengths_m[wide], 1e-9), 2), both), shape=(count, count))
+        pieces = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
+        return Ways(graph, pieces, self.scene.radii_m >= clearance_m)
 
 
 def _rows_by_label(labels: list[str]) -> dict[str, np.ndarray]:

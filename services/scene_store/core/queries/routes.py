@@ -4,8 +4,7 @@ import itertools
 from typing import NamedTuple
 
 import numpy as np
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import dijkstra, minimum_spanning_tree
+import scipy
 
 from prior_sg.schemas.queries import Point, Route, RouteBetween, Spot, Thing, What
 from prior_sg.services.scene_store.core.queries.index import Index, Ways
@@ -50,7 +49,7 @@ def lengths_from(index: Index, start: Spot, clearance_m: float) -> np.ndarray:
     """Metres (place,) from a start to each place, inf = no way. Raises NoSuchSpot."""
     ways = index.ways(clearance_m)
     sources = [end.row for end in _ends(index, start, ways, "start", clearance_m)]
-    lengths_m: np.ndarray = dijkstra(ways.graph, indices=sources, min_only=True)
+    lengths_m: np.ndarray = scipy.sparse.csgraph.dijkstra(ways.graph, indices=sources, min_only=True)
     return lengths_m
 
 
@@ -89,7 +88,7 @@ def _shortest(index: Index, ways: Ways, starts: list[int], goals: list[int]) -> 
     straight_m = np.linalg.norm(index.points_m[sources][:, None] - index.points_m[targets], axis=2).min()
     limit_m = FIRST_LIMIT * straight_m + REACH_M
     while True:  # a way that is found within a limit is the shortest, and what lies beyond it was never looked at
-        lengths_m, before, _ = dijkstra(
+        lengths_m, before, _ = scipy.sparse.csgraph.dijkstra(
             ways.graph, indices=sources, return_predecessors=True, min_only=True, limit=limit_m
         )
         goal = int(targets[lengths_m[targets].argmin()])
@@ -190,10 +189,11 @@ def _widest_m(index: Index, starts: list[int], goals: list[int]) -> float:
     count, clearances_m = len(index.points_m), index.scene.clearances_m.astype(np.float64)
     highest_m = clearances_m.max(initial=0.0) + 1.0
     a, b = rows.T
-    tree = minimum_spanning_tree(csr_array((highest_m - clearances_m, (a, b)), shape=(count, count)))
+    graph = scipy.sparse.csr_array((highest_m - clearances_m, (a, b)), shape=(count, count))
+    tree = scipy.sparse.csgraph.minimum_spanning_tree(graph)
     best_m = 0.0
     for start in starts:
-        lengths, before = dijkstra(tree, directed=False, indices=start, return_predecessors=True)
+        lengths, before = scipy.sparse.csgraph.dijkstra(tree, directed=False, indices=start, return_predecessors=True)
         for goal in (one for one in goals if np.isfinite(lengths[one])):
             least_m, row = np.inf, goal
             while before[row] >= 0:

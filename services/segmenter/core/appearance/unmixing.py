@@ -12,7 +12,7 @@ Reconstruction sharpens errors as it sharpens looks, so it counts by what the lo
 
 import msgspec
 import numpy as np
-from scipy import sparse
+import scipy
 
 from prior_sg.services.compiled import compiled
 from prior_sg.services.geometry import inverse
@@ -49,15 +49,15 @@ def sampled(frames: list[Frame]) -> list[Frame]:
     return kept[:: max(-(-len(kept) // FRAMES), 1)]
 
 
-def shown(frames: list[Frame], positions_m: np.ndarray, radii_m: np.ndarray) -> sparse.csr_matrix:
+def shown(frames: list[Frame], positions_m: np.ndarray, radii_m: np.ndarray) -> "scipy.sparse.csr_matrix":
     """Shares (crop, place) of each crop's measured surface that is each place's; places are (place, 3)."""
     positions_m, radii_m = positions_m.astype(np.float64), radii_m.astype(np.float64)
     rows = [_shares(frame, positions_m, radii_m) for frame in frames]
-    return sparse.vstack(rows).tocsr() if rows else sparse.csr_matrix((0, len(radii_m)))
+    return scipy.sparse.vstack(rows).tocsr() if rows else scipy.sparse.csr_matrix((0, len(radii_m)))
 
 
 def unmixed(
-    similarity: np.ndarray, looks: np.ndarray, shares: sparse.csr_matrix, near: Arcs, weights: np.ndarray, *,
+    similarity: np.ndarray, looks: np.ndarray, shares: "scipy.sparse.csr_matrix", near: Arcs, weights: np.ndarray, *,
     cfg: UnmixingConfig,
 ) -> np.ndarray:  # fmt: skip
     """Similarities (place, label) that explain those of the crops, `looks` (crop, label), starting from `similarity`.
@@ -79,7 +79,7 @@ def unmixed(
     return found
 
 
-def _shares(frame: Frame, positions_m: np.ndarray, radii_m: np.ndarray) -> sparse.csr_matrix:
+def _shares(frame: Frame, positions_m: np.ndarray, radii_m: np.ndarray) -> "scipy.sparse.csr_matrix":
     """Shares (crop, place) of one frame."""
     rows, columns = frame.surface_m.shape
     step = max(round((rows * columns / CELLS) ** 0.5), 1)
@@ -99,11 +99,12 @@ def _shares(frame: Frame, positions_m: np.ndarray, radii_m: np.ndarray) -> spars
     reach_m = float(distances_m.max(initial=0.0)) + REACH_M
     places, parts = _nearest(points_m, positions_m, radii_m, world_from_camera[:3, 3].copy(), reach_m)
     cells = np.repeat(np.arange(len(points_m)), NEAREST)
-    held = sparse.csr_matrix((parts.reshape(-1), (cells, places.reshape(-1))), shape=(len(points_m), len(radii_m)))
+    shape = len(points_m), len(radii_m)
+    held = scipy.sparse.csr_matrix((parts.reshape(-1), (cells, places.reshape(-1))), shape=shape)
     offsets_px = np.abs(np.stack((u_px, v_px), axis=1)[None] - frame.centers_px[:, None])
     covers = (offsets_px < frame.sigmas_px[:, None, None]).all(axis=2).astype(np.float64)
     covers /= np.maximum(covers.sum(axis=1, keepdims=True), 1.0)
-    return sparse.csr_matrix(covers) @ held
+    return scipy.sparse.csr_matrix(covers) @ held
 
 
 @compiled()

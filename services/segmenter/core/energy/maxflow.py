@@ -12,8 +12,7 @@ from collections.abc import Callable
 from typing import Literal
 
 import numpy as np
-from scipy import sparse
-from scipy.sparse.csgraph import breadth_first_order, maximum_flow
+import scipy
 
 try:
     import maxflow as library
@@ -61,11 +60,11 @@ def scipy_minimum(cost_0: np.ndarray, cost_1: np.ndarray, edges: np.ndarray, wei
     heads = np.concatenate((fed, np.full(len(drained), sink), edges[:, 1], edges[:, 0]))
     capacities = np.concatenate((lean[fed], -lean[drained], weights, weights))
     capacities = np.rint(np.minimum(capacities, total) * scale).astype(np.int32)
-    graph = sparse.csr_matrix((capacities, (tails, heads)), shape=(count + 2, count + 2))
-    left = (graph - maximum_flow(graph, source, sink).flow).tocsr()
+    graph = scipy.sparse.csr_matrix((capacities, (tails, heads)), shape=(count + 2, count + 2))
+    left = (graph - scipy.sparse.csgraph.maximum_flow(graph, source, sink).flow).tocsr()
     left.data[left.data < 0] = 0
     left.eliminate_zeros()
-    from_source = breadth_first_order(left, source, directed=True, return_predecessors=False)
+    from_source = scipy.sparse.csgraph.breadth_first_order(left, source, directed=True, return_predecessors=False)
     takes_1 = np.ones(count + 2, dtype=bool)
     takes_1[from_source] = False
     return takes_1[:count]

@@ -32,7 +32,7 @@ from prior_sg.services.segmenter.core.energy import swap_moves
 from prior_sg.services.segmenter.core.energy.maxflow import CUTS, MinCut, min_cut_in_use
 from prior_sg.services.segmenter.core.energy.mrf import Field, least_gain
 from prior_sg.services.segmenter.core.energy.trws import empty_messages, lay_down, run_pass, take_up
-from prior_sg.services.segmenter.core.map.arcs import Arcs, arcs_of, ball
+from prior_sg.services.segmenter.core.map.arcs import Arcs, arcs_of, ball, no_arcs
 
 Expired = Callable[[], bool]
 
@@ -72,7 +72,7 @@ class Solver:
         self._cut = CUTS[min_cut_in_use(self.settings.min_cut)]
         self.labels = np.zeros(0, np.int64)
         self._field: Field | None = None
-        self._graph: Arcs = arcs_of(0, np.zeros((0, 2)), np.zeros(0))
+        self._graph: Arcs = no_arcs()
         self._unary = np.zeros((0, 0))
         self._pairwise = np.zeros((0, 0))
         self._work = swap_moves.empty_work(0, 0, 0)

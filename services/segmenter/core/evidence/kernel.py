@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import msgspec
 import numpy as np
-from scipy import ndimage
+import scipy
 
 from prior_sg.schemas.features import Pyramid
 from prior_sg.schemas.frames import Intrinsics
@@ -65,7 +65,7 @@ def fill_holes(surface_m: np.ndarray) -> np.ndarray:
     holes = surface_m <= 0
     if not holes.any() or holes.all():
         return surface_m.copy()
-    rows, columns = ndimage.distance_transform_edt(holes, return_distances=False, return_indices=True)
+    rows, columns = scipy.ndimage.distance_transform_edt(holes, return_distances=False, return_indices=True)
     return surface_m[rows, columns]
 
 

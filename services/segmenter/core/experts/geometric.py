@@ -1,7 +1,7 @@
 """The geometric expert: how well the local inclination fits each region."""
 
 import numpy as np
-from scipy.special import i0e
+import scipy
 
 from prior_sg.services.segmenter.core.experts.context import Context
 
@@ -16,6 +16,6 @@ def geometric(context: Context) -> tuple[np.ndarray, np.ndarray]:
     mean_rad = np.array([region.inclination_mean_rad for region in context.prior.regions])
     kappa = np.array([region.inclination_std_rad for region in context.prior.regions]) ** -2.0
     deviation = np.cos(context.inclination_rad[:, None] - mean_rad)
-    log_density = kappa * (deviation - 1.0) - np.log(i0e(kappa))  # without -log(2 pi), which all share
+    log_density = kappa * (deviation - 1.0) - np.log(scipy.special.i0e(kappa))  # without -log(2 pi), which all share
     log_mass = log_density - np.logaddexp.reduce(log_density, axis=1, keepdims=True)
     return log_mass, context.support * context.anisotropy

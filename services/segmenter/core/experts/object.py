@@ -1,7 +1,7 @@
 """The object expert: which regions the objects near a place belong to."""
 
 import numpy as np
-from scipy.spatial import cKDTree
+import scipy
 
 from prior_sg.schemas.priors import Prior
 from prior_sg.services.segmenter.core.experts.context import Context
@@ -45,6 +45,7 @@ def _near(places_m: np.ndarray, objects_m: np.ndarray, reach_m: float) -> tuple[
     if not (len(places_m) and len(objects_m)):
         none = np.zeros(0, dtype=np.int64)
         return none, none, np.zeros(0)
-    pairs = cKDTree(places_m).sparse_distance_matrix(cKDTree(objects_m), reach_m, output_type="ndarray")
+    of_places, of_objects = scipy.spatial.cKDTree(places_m), scipy.spatial.cKDTree(objects_m)
+    pairs = of_places.sparse_distance_matrix(of_objects, reach_m, output_type="ndarray")
     pairs.sort(order=("i", "j"))
     return pairs["i"], pairs["j"], pairs["v"]

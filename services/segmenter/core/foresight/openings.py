@@ -3,8 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import sparse
-from scipy.sparse.csgraph import connected_components
+import scipy
 
 from prior_sg.schemas.regions import NO_REGION
 from prior_sg.services.segmenter.core.foresight.config import ForesightConfig
@@ -67,5 +66,5 @@ def _merged(
     one, other = pairs.T
     unit = outward_m2 / np.linalg.norm(outward_m2, axis=1, keepdims=True)
     same = ((unit[one] * unit[other]).sum(axis=1) >= aligned) & (regions[rows[one]] == regions[rows[other]])
-    joined = sparse.coo_matrix((np.ones(same.sum(), np.int8), pairs[same].T), shape=(len(rows), len(rows)))
-    return connected_components(joined, directed=False)[1].astype(np.int64)
+    joined = scipy.sparse.coo_matrix((np.ones(same.sum(), np.int8), pairs[same].T), shape=(len(rows), len(rows)))
+    return scipy.sparse.csgraph.connected_components(joined, directed=False)[1].astype(np.int64)

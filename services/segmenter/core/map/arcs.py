@@ -23,6 +23,12 @@ def arcs_of(places: int, edges: np.ndarray, weights: np.ndarray) -> Arcs:
     return Arcs(*_build(places, edges, np.ascontiguousarray(weights, dtype=np.float64)))
 
 
+def no_arcs() -> Arcs:
+    """Of no places; compiles nothing."""
+    none = np.zeros(0, np.int32)
+    return Arcs(np.zeros(1, np.int64), none, np.zeros(0), none, none)
+
+
 @compiled()
 def _build(places, edges, weights):  # noqa: ANN001, ANN202
     """Counting sort; an edge from a place to itself costs nothing (the diagonal is zero) and is left out."""

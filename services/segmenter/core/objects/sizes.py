@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import msgspec
 import numpy as np
-from scipy.spatial import cKDTree
+import scipy
 
 from prior_sg.schemas.priors import ObjectPrior
 from prior_sg.services.segmenter.core.map.received import ReceivedGraph
@@ -91,7 +91,7 @@ def floor_below(points_m: np.ndarray, graph: ReceivedGraph, steps: int) -> np.nd
         for one, other in ((0, 1), (1, 0)):
             np.minimum.at(around_m, graph.edges[:, one], floors_m[graph.edges[:, other]])
         floors_m = around_m
-    return floors_m[cKDTree(graph.positions_m).query(points_m)[1]]
+    return floors_m[scipy.spatial.cKDTree(graph.positions_m).query(points_m)[1]]
 
 
 def log_ratios(boxes: Boxes, objects: Sequence[ObjectPrior], cfg: SizeConfig) -> np.ndarray:

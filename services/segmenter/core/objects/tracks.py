@@ -15,10 +15,7 @@ from dataclasses import dataclass, field
 
 import msgspec
 import numpy as np
-from scipy.optimize import linear_sum_assignment
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
+import scipy
 
 from prior_sg.schemas.codec import copied
 from prior_sg.schemas.objects import Detections
@@ -287,7 +284,7 @@ def _matches(tracks: Tracks, detections: Detections, seen: list[np.ndarray], cfg
             if max(shares) >= cfg.match_overlap and min(shares) >= cfg.match_part:
                 cosine = float(descriptor(track.embeddings) @ detections.embeddings[row].astype(np.float64))
                 scores[row, column] = max(shares) + cfg.descriptor_weight * (1 + cosine) + 1e-9
-    rows, columns = linear_sum_assignment(-scores)
+    rows, columns = scipy.optimize.linear_sum_assignment(-scores)
     pairs = zip(rows.tolist(), columns.tolist(), strict=True)
     return {row: items[column].id for row, column in pairs if scores[row, column] > 0}
 
@@ -338,8 +335,8 @@ def _parts(cells: np.ndarray) -> list[np.ndarray]:
     near = cells[:, None] + AROUND
     at = np.minimum(np.searchsorted(cells, near), len(cells) - 1)
     row, column = np.nonzero(cells[at] == near)
-    links = csr_array((np.ones(len(row), bool), (row, at[row, column])), shape=(len(cells),) * 2)
-    count, labels = connected_components(links, directed=False)
+    links = scipy.sparse.csr_array((np.ones(len(row), bool), (row, at[row, column])), shape=(len(cells),) * 2)
+    count, labels = scipy.sparse.csgraph.connected_components(links, directed=False)
     return sorted((cells[labels == part] for part in range(count)), key=len, reverse=True)
 
 
@@ -350,7 +347,7 @@ def _halves(
 
     Its detections are taken from the archive; every cell of theirs goes with the nearer part.
     """
-    tree = cKDTree(np.concatenate((unpacked(one), unpacked(other))))
+    tree = scipy.spatial.cKDTree(np.concatenate((unpacked(one), unpacked(other))))
     both, shown, halves = 0, [0, 0], (_blank(track), _blank(track))
     views = list(_views(tracks, track, cfg))
     if len(views) < len(track.sources):  # too old for the archive: nobody can say to which part they belong

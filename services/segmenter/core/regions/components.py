@@ -3,9 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
-from scipy import sparse
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import ConvexHull, cKDTree
+import scipy
 
 from prior_sg.schemas.regions import NO_REGION, RegionEvent, Transition
 from prior_sg.services.compiled import compiled
@@ -198,10 +196,10 @@ def _side_by_side(pairs: np.ndarray, middles_m: np.ndarray) -> np.ndarray:
     count = len(pairs)
     if not count:
         return np.zeros(0, dtype=np.int64)
-    near = cKDTree(middles_m).query_pairs(SIDE_BY_SIDE_M, output_type="ndarray")
+    near = scipy.spatial.cKDTree(middles_m).query_pairs(SIDE_BY_SIDE_M, output_type="ndarray")
     near = near[(pairs[near[:, 0]] == pairs[near[:, 1]]).all(axis=1)]
-    graph = sparse.coo_matrix((np.ones(len(near), dtype=np.int8), near.T), shape=(count, count))
-    return connected_components(graph, directed=False)[1]
+    graph = scipy.sparse.coo_matrix((np.ones(len(near), dtype=np.int8), near.T), shape=(count, count))
+    return scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
 
 
 def members(
@@ -216,7 +214,7 @@ def members(
     inside = np.flatnonzero(((objects.positions_m >= low_m) & (objects.positions_m <= high_m)).all(axis=1))
     around = ((positions_m >= low_m - OBJECT_REACH_M) & (positions_m <= high_m + OBJECT_REACH_M)).all(axis=1)
     places = np.flatnonzero(around)
-    distances_m, nearest = cKDTree(positions_m[places]).query(
+    distances_m, nearest = scipy.spatial.cKDTree(positions_m[places]).query(
         objects.positions_m[inside], distance_upper_bound=OBJECT_REACH_M
     )
     found: dict[int, list[int]] = {}
@@ -232,7 +230,7 @@ def hull_m(positions_m: np.ndarray, radii_m: np.ndarray) -> list[tuple[float, fl
     corners = np.stack((np.cos(angles), np.sin(angles)), axis=1) / np.cos(np.pi / HULL_CORNERS)
     radii_m = np.maximum(radii_m, 0.01)  # a hull needs an area
     points = (positions_m[:, None, :2] + radii_m[:, None, None] * corners).reshape(-1, 2).astype(np.float64)
-    outline = points[ConvexHull(points).vertices]
+    outline = points[scipy.spatial.ConvexHull(points).vertices]
     return [(round(x, 2), round(y, 2)) for x, y in outline.tolist()]
 
 

@@ -1,7 +1,7 @@
 """What the regions of a map hold (pure)."""
 
 import numpy as np
-from scipy.spatial import cKDTree
+import scipy
 
 from prior_sg.schemas.regions import NO_REGION
 from prior_sg.services.segmenter.core.experts.context import ObjectView
@@ -18,7 +18,7 @@ def held(view: ObjectView, positions_m: np.ndarray, regions: np.ndarray, ids: np
     """
     found = np.zeros((len(ids), view.concepts.shape[1]))
     if len(view.ids):
-        distances_m, nearest = cKDTree(positions_m).query(view.positions_m)
+        distances_m, nearest = scipy.spatial.cKDTree(positions_m).query(view.positions_m)
         region = regions[nearest]
         inside = np.flatnonzero((distances_m <= OBJECT_REACH_M) & np.isin(region, ids))
         words = view.answers[inside, None] * view.concepts[inside]
@@ -32,7 +32,7 @@ def held_around(view: ObjectView, positions_m: np.ndarray, regions: np.ndarray) 
     found = np.zeros((len(positions_m), view.concepts.shape[1]))
     if not (len(view.ids) and len(positions_m)):
         return found
-    distances_m, nearest = cKDTree(positions_m).query(view.positions_m)
+    distances_m, nearest = scipy.spatial.cKDTree(positions_m).query(view.positions_m)
     region = np.where(distances_m <= OBJECT_REACH_M, regions[nearest], NO_REGION)
     for item in np.flatnonzero((region != NO_REGION) & (view.words > 0)):
         rows = np.flatnonzero(regions == region[item])
