@@ -126,7 +126,8 @@ def _layers_ms(state: State, config: Config) -> float:
     """What finding all levels takes, on the map as it is."""
     storeys = state.regions.storeys
     assert storeys is not None
-    arguments = (state.regions.known, state.map.places, storeys, state.aim.aligned.levels, config.layers)
+    held, levels = state.map, state.aim.aligned.levels
+    arguments = (state.regions.known, held.graph, held.places, storeys, levels, config.layers)
     LayerMap().renew(*arguments)
     started_s = time.perf_counter()
     for _ in range(TIMED):

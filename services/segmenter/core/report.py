@@ -56,7 +56,7 @@ def _renew_layers(state: State, cfg: Config) -> None:
     regions = state.regions
     assert regions.storeys is not None
     levels = state.aim.aligned.levels
-    state.layers.renew(regions.known, state.map.places, regions.storeys, levels, cfg.layers)
+    state.layers.renew(regions.known, state.map.graph, state.map.places, regions.storeys, levels, cfg.layers)
     for number, region in regions.known.items():
         zone = state.layers.zone_of(number)
         if zone != region.parent:
