@@ -168,7 +168,7 @@ def known(labels, first_id=0, x_m=None, z_m=None, joined=True):
 
 def test_nodes_keep_their_ids_while_regions_come_and_go():
     layers, levels = LayerMap(), {"zone": level("zone", ZONES)}
-    layers.renew(*known([0, 1, 0, 2, 1, 2]), levels, LayersConfig())
+    layers.renew(*known([0, 1, 0, 2, 1, 2]), levels=levels, cfg=LayersConfig())
     assert {key: one.member_ids for key, one in layers.known.items() if key[0] == "zone"} == {
         ("zone", 0): [0, 1, 2],
         ("zone", 1): [3, 4, 5],
@@ -176,7 +176,7 @@ def test_nodes_keep_their_ids_while_regions_come_and_go():
     assert layers.known["zone", 1].label == layers.zone_of(4) == "surgery"
     assert layers.known["floor", 0].members == "zone" and layers.known["floor", 0].member_ids == [0, 1]
     assert layers.known["zone", 0].parent_id == 0 and layers.known["zone", 0].area_m2 == 180
-    layers.renew(*known([1, 0, 2, 1, 2, 2], first_id=1), levels, LayersConfig())  # 0 is gone, 6 is new
+    layers.renew(*known([1, 0, 2, 1, 2, 2], first_id=1), levels=levels, cfg=LayersConfig())  # 0 is gone, 6 is new
     assert layers.known["zone", 1].member_ids == [3, 4, 5, 6] and layers.known["zone", 0].member_ids == [1, 2]
 
 
@@ -187,14 +187,14 @@ APART_M = LayersConfig().join_m + 2 * RADIUS_M  # of centres whose spheres are j
 def test_pieces_without_a_way_are_one_building_where_they_stand_side_by_side(apart_m, count):
     """Three regions that no way joins, as what was seen over a counter or through a window is."""
     layers = LayerMap()
-    layers.renew(*known([0, 1, 2], x_m=apart_m * np.arange(3), joined=False), {}, LayersConfig())
+    layers.renew(*known([0, 1, 2], x_m=apart_m * np.arange(3), joined=False), levels={}, cfg=LayersConfig())
     for name in ("building", "floor"):
         assert sum(level == name for level, _ in layers.known) == count
 
 
 def test_what_stands_above_is_a_floor_of_the_same_building():
     layers = LayerMap()
-    layers.renew(*known([0, 0], x_m=(0, 0), z_m=(0, 1.5), joined=False), {}, LayersConfig())
+    layers.renew(*known([0, 0], x_m=(0, 0), z_m=(0, 1.5), joined=False), levels={}, cfg=LayersConfig())
     assert [one.label for one in layers.known.values()] == ["floor 0", "floor 1", "building"]
 
 
@@ -202,7 +202,7 @@ def test_pieces_side_by_side_are_one_building_only_where_the_prior_takes_them_fo
     outside = level("building", [(0.95, 0.05), (0.9, 0.1), (0.05, 0.95)], names=("building", "outdoors"))
     layers = LayerMap()
     arguments = known([0, 1, 2], x_m=(APART_M - 0.1) * np.arange(3), joined=False)
-    layers.renew(*arguments, {"building": outside}, LayersConfig())
+    layers.renew(*arguments, levels={"building": outside}, cfg=LayersConfig())
     assert [(one.label, one.member_ids) for one in layers.known.values() if one.level == "building"] == [
         ("building", [0]),
         ("outdoors", [1]),
@@ -214,7 +214,7 @@ def test_pieces_side_by_side_are_one_building_only_where_the_prior_takes_them_fo
 def test_zones_do_not_go_through_walls():
     layers = LayerMap()
     arguments = known([0, 0], x_m=(0, APART_M - 0.1), joined=False)
-    layers.renew(*arguments, {"zone": level("zone", ZONES)}, LayersConfig())
+    layers.renew(*arguments, levels={"zone": level("zone", ZONES)}, cfg=LayersConfig())
     assert [one.level for one in layers.known.values()].count("zone") == 2
     assert [one.level for one in layers.known.values()].count("building") == 1
 
@@ -240,10 +240,10 @@ def test_nearest_regions_of_pieces_are_found_as_by_looking_at_all_pairs():
 
 def test_a_successor_goes_on_with_the_ids():
     former, levels = LayerMap(), {"zone": level("zone", ZONES)}
-    former.renew(*known([0, 0, 2, 2, 2]), levels, LayersConfig())
+    former.renew(*known([0, 0, 2, 2, 2]), levels=levels, cfg=LayersConfig())
     successor = LayerMap()
     successor.inherit(list(former.known.values()), {"zone": 9})
-    successor.renew(*known([0, 2, 2, 2, 0, 0, 0], first_id=1), levels, LayersConfig())
+    successor.renew(*known([0, 2, 2, 2, 0, 0, 0], first_id=1), levels=levels, cfg=LayersConfig())
     assert sorted(number for name, number in successor.known if name == "zone") == [0, 1, 9]
 
 

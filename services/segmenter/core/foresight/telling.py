@@ -22,7 +22,7 @@ def foresight(openings: Openings, regions: Mapping[int, Region], prior: Prior, c
     areas_m2 = np.array([regions[region].area_m2 for region in openings.regions.tolist()])
     views = Views(openings.beliefs, openings.widths_m, areas_m2)
     foreseen = beyond(views, expected(prior, found, cfg), cfg)
-    missing = foreseen.missing()
+    missing = foreseen.missing
     return Foresight(
         openings=[
             _opening(openings, row, foreseen=foreseen, prior=prior, found=found, cfg=cfg)
@@ -33,7 +33,6 @@ def foresight(openings: Openings, regions: Mapping[int, Region], prior: Prior, c
             for label in np.argsort(-missing, kind="stable").tolist()
             if missing[label] >= cfg.least_told
         ],
-        steps=cfg.steps,
         look_m=cfg.look_m,
         elsewhere_m=cfg.elsewhere_m,
     )

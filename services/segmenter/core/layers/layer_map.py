@@ -44,6 +44,7 @@ class LayerMap:
         graph: ReceivedGraph,
         places: Places,
         storeys: Storeys,
+        *,
         levels: Mapping[str, LevelInForce],
         cfg: LayersConfig,
     ) -> None:

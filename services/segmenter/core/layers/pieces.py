@@ -13,9 +13,7 @@ from prior_sg.services.segmenter.core.regions.components import numbered
 NEAREST = 4  # places of another piece that are looked at from each place
 
 
-def near_regions(
-    graph: ReceivedGraph, rows: np.ndarray, edges: np.ndarray, count: int, join_m: float
-) -> np.ndarray:
+def near_regions(graph: ReceivedGraph, rows: np.ndarray, edges: np.ndarray, count: int, join_m: float) -> np.ndarray:
     """Pairs (n, 2) of regions of different pieces, smaller first, where the free space of these pieces is nearest.
 
     `rows` (place,) is the region of each place, of `count`; `edges` (contact, 2) join regions that a way leads
