@@ -9,6 +9,7 @@ import pytest
 from prior_sg.deploy.evaluation.foresight.explorer import Explorer, Plan, crossings
 from prior_sg.deploy.evaluation.foresight.fitting import fitted
 from prior_sg.deploy.evaluation.foresight.loops import FAR
+from prior_sg.deploy.evaluation.foresight.mapped import behind, covered, ground_of
 from prior_sg.deploy.evaluation.foresight.predictors import PREDICTORS
 from prior_sg.deploy.evaluation.foresight.scores import chance_figures, figures, judge, search_figures
 from prior_sg.deploy.evaluation.foresight.searches import POLICIES, Quest, metres
@@ -17,6 +18,8 @@ from prior_sg.deploy.evaluation.worlds.ways import CELL_M, LEVELS, ways_of
 from prior_sg.services.segmenter.core.foresight.beyond import Views, beyond
 from prior_sg.services.segmenter.core.foresight.config import ForesightConfig
 from prior_sg.services.segmenter.core.foresight.expectation import Found, expected
+from prior_sg.services.segmenter.core.foresight.openings import Openings
+from prior_sg.services.segmenter.core.map.received import ReceivedGraph
 from tests.help.world import prior
 
 LABELS = ["hall", "bath", "kitchen"]
@@ -195,6 +198,39 @@ def test_what_begins_behind_a_door_is_met_behind_that_door_alone():
     met = [set(explorer.met(nodes).tolist()) - {0} for nodes in frontiers.nodes]
     assert set().union(*(one for one, side in zip(met, east, strict=True) if side)) == {2}
     assert set().union(*(one for one, side in zip(met, east, strict=True) if not side)) == {1}
+
+
+def opening_of(x_m, direction, width_m=1.0):
+    """An opening of the product's at the middle of the plan's length, at the height of a place."""
+    position_m = np.array([[x_m, ROOM / 2 * CELL_M, 1.2]])
+    return Openings(
+        place_ids=np.array([0]),
+        positions_m=position_m,
+        beyond_m=position_m + np.array([direction, 0, 0]) * (1.0 + ForesightConfig().beyond_m),
+        widths_m=np.array([width_m]),
+        regions=np.array([0]),
+        beliefs=np.eye(3)[:1],
+    )
+
+
+def test_behind_the_products_openings_lies_what_its_places_do_not_cover():
+    """One sphere in the middle of the hall; it looks east through a door, or at the seen hall's own rest."""
+    ground = ground_of(PLAN, home_trial().prior)
+    middle_m = PLAN.position_m(np.array([HALL]))[0]
+    sphere = ReceivedGraph(np.array([0]), np.array([[*middle_m[:2], 1.2]]), np.array([1.0]))
+    known = covered(ground, sphere)
+    assert set(PLAN.regions[known]) == {0} and 0.6 < known.sum() * CELL_M**2 / (np.pi * 1.4**2) < 1.05
+    new = np.array([False, True, True])
+    east = opening_of(middle_m[0] + 0.4, 1.0)
+    assert [one.tolist() for one in behind(east, ground, known, new, ForesightConfig())] == [
+        [SAME],
+        [[False, True, True]],  # around the sphere one comes to the west, too
+    ]
+    known |= PLAN.regions == 0
+    outcomes, met = behind(opening_of(middle_m[0] + 1.0, 1.0), ground, known, new, ForesightConfig())
+    assert outcomes.tolist() == [2] and met.tolist() == [[False, False, True]]
+    blind = opening_of(middle_m[0] - 1.5, 1.0)  # it ends within the hall
+    assert not behind(blind, ground, known, new, ForesightConfig())[1].any()
 
 
 def test_chances_are_judged_against_how_often_things_happen():
