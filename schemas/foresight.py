@@ -3,6 +3,7 @@
 from prior_sg.schemas.codec import Part
 
 Point = tuple[float, float, float]  # world, metres
+REACH_M = 6.0  # of way behind an opening that `within` tells of
 
 
 class ForeseenLabel(Part, frozen=True, kw_only=True):
@@ -10,7 +11,7 @@ class ForeseenLabel(Part, frozen=True, kw_only=True):
 
     label: str
     next: float  # probability that the very next region behind the opening is another one, with this label
-    within: float  # that such a region is met within the steps of the foresight
+    within: float  # that such a region begins within REACH_M behind the opening
     adjacency: float = 0.0  # why: P(ri <-> rj) of the prior with the label of the region that the opening belongs to
     existence: float = 0.0  # P(r | E0)
     found: int = 0  # regions of this label that the map holds
@@ -42,6 +43,6 @@ class Foresight(Part, frozen=True, kw_only=True):
 
     openings: list[Opening] = []
     missing: list[MissingLabel] = []  # the most probable first
-    steps: int = 0  # regions behind an opening that `within` reaches
+    steps: int = 0  # regions behind an opening that `within` reached before REACH_M was its limit; 0 since
     look_m: float = 0.0  # what is walked behind an opening to see what is there
     elsewhere_m: float = 0.0  # what is walked to find what is behind none of the openings

@@ -350,7 +350,7 @@ class Prospect(Part, frozen=True, kw_only=True):
     """One opening as a place to look behind."""
 
     opening: Opening
-    probability: float  # that such a region is met behind it, within the steps of the foresight
+    probability: float  # that such a region begins behind it, within REACH_M of schemas/foresight.py
     expected_m: float  # metres until one is found if this opening comes first; a score, as sure as the probabilities
     way_m: float  # to the opening
 

@@ -119,6 +119,13 @@ def start() -> tuple[dict, dict]:
     return start_bench(SAMPLE)
 
 
+def fleet() -> tuple[dict, dict]:
+    """Many light robots on one bus; see `prior_sg.deploy.benches.fleet`."""
+    from prior_sg.deploy.benches.fleet import fleet_bench  # needs what evaluation needs
+
+    return fleet_bench()
+
+
 def hydra() -> tuple[dict, dict]:
     """The bridge to Hydra; see `prior_sg.deploy.benches.hydra`."""
     from prior_sg.deploy.benches.hydra import hydra_bench  # needs the extra `hydra`
@@ -180,6 +187,7 @@ LONG: dict[str, Callable[[float], tuple[dict, dict]]] = {  # no part of `all`; t
     "levels": lambda seconds: levels(),  # many minutes
     "exchange": lambda seconds: exchanged(),  # nine runs of the sample at half its pace
     "foresight": lambda seconds: foresight(),  # worlds of every kind: long
+    "fleet": lambda seconds: fleet(),  # processes of its own, for minutes
     "view": lambda seconds: view(),  # needs an extra and a browser
     "hydra": lambda seconds: hydra(),  # needs an extra
     "merge": lambda seconds: merge(),  # maps dozens of homes, which it keeps

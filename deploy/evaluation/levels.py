@@ -126,9 +126,10 @@ def _layers_ms(state: State, config: Config) -> float:
     """What finding all levels takes, on the map as it is."""
     storeys = state.regions.storeys
     assert storeys is not None
-    arguments = (state.regions.known, state.map.places, storeys, state.aim.aligned.levels, config.layers)
-    LayerMap().renew(*arguments)
+    held, levels = state.map, state.aim.aligned.levels
+    ground = state.regions.known, held.graph, held.places, storeys
+    LayerMap().renew(*ground, levels=levels, cfg=config.layers)
     started_s = time.perf_counter()
     for _ in range(TIMED):
-        LayerMap().renew(*arguments)
+        LayerMap().renew(*ground, levels=levels, cfg=config.layers)
     return 1e3 * (time.perf_counter() - started_s) / TIMED

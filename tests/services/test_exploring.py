@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from prior_sg.services.exploring import DETOUR, expected_metres, hedged_metres
+from prior_sg.services.exploring import DETOUR, chances_per_metre, expected_metres
 
 
 def metres_in_order(order, distances_m, points_m, chances):
@@ -46,11 +46,13 @@ def test_a_near_opening_is_passed_by_where_a_far_one_is_surer():
     assert expected_metres(distances_m, points_m, np.array([0.5, 0.5]), 3.0, 40.0).argmin() == 0
 
 
-def test_who_hedges_passes_by_what_is_near_for_less_rarely():
-    distances_m, points_m, chances = np.array([1.0, 5.6]), np.array([[1.0, 0, 0], [-5.6, 0, 0]]), np.array([0.3, 0.9])
-    assert expected_metres(distances_m, points_m, chances, 1.0, 40.0).argmin() == 1
-    assert hedged_metres(distances_m, points_m, chances, 1.0, 40.0).argmin() == 0
-    assert hedged_metres(np.array([5.0, 5.6]), points_m, chances, 1.0, 40.0).argmin() == 1
+def test_the_chance_by_metre_counts_the_look_behind():
+    found = chances_per_metre(np.array([1.0, 5.0, np.inf]), np.array([0.2, 0.9, 1.0]), 1.0)
+    assert found == pytest.approx([0.1, 0.15, 0.0])
+
+
+def test_what_has_no_chance_comes_by_its_way_alone():
+    assert chances_per_metre(np.array([9.0, 4.0]), np.zeros(2), 1.0).argmax() == 1
 
 
 def test_what_cannot_be_reached_is_never_first():

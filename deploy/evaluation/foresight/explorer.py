@@ -16,6 +16,7 @@ from prior_sg.deploy.evaluation.worlds.plan import NOTHING
 from prior_sg.deploy.evaluation.worlds.walk import NARROW_CELLS
 from prior_sg.deploy.evaluation.worlds.ways import CELL_M, NONE, STEP_M, Ways, ways_of
 from prior_sg.deploy.evaluation.worlds.world import World
+from prior_sg.schemas.foresight import REACH_M
 from prior_sg.schemas.regions import NO_REGION
 
 EYE_M = 1.4
@@ -24,6 +25,8 @@ RANGE_M = {False: 5.0, True: 15.0}  # of sight, indoors and outdoors: as far as 
 LOOK_EVERY_CELLS = 6  # on the way
 LEAST_CELLS = 3  # of a frontier; smaller ones are cracks
 BEYOND_CELLS = 20  # what an opening reveals first: walkable cells at most so far from it
+REACH_CELLS = round(REACH_M / CELL_M)
+MET_M2 = 0.5  # of a region within reach: it begins there
 ABOVE_M = 0.05  # the floor, where a surface is asked which region it is in
 BORDER_CELLS = 4  # as thick a border may be, in a doorway
 
@@ -127,6 +130,14 @@ class Explorer:
         held = plan.regions[first]
         held = held[held != NO_REGION]
         return int(np.bincount(held).argmax()) if len(held) else NO_REGION
+
+    def met(self, nodes: np.ndarray) -> np.ndarray:
+        """Indices of the true regions of which something to stand on begins within REACH_M behind a frontier."""
+        plan = self.plan
+        reached = loops.beyond(plan.heights, plan.clearance, self.known, nodes, REACH_CELLS, plan.step)
+        held = plan.regions[reached]
+        counts = np.bincount(held[held != NO_REGION], minlength=len(plan.labels))
+        return np.flatnonzero(counts * CELL_M**2 >= MET_M2)
 
     def walk(self, before: np.ndarray, target: int, until: np.ndarray) -> None:
         """Walk towards a node, looking around on the way, until there or until nothing is unseen beside `until`."""

@@ -1,11 +1,13 @@
 """Weights of foresight, fitted to what openings of worlds revealed; run as a module, it prints them.
 
-Both parts of the model are logistic, so that each has one best fit: whether the same region goes on, and which other
-one comes, where a region is taken for what it most likely is. Every world counts alike.
+All parts of the model are logistic, so that each has one best fit: whether the same region goes on, which other one
+comes, where a region is taken for what it most likely is, what begins within some metres, and, given that, what is
+missing. Every world counts alike.
 """
 
+import argparse
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import msgspec
 import numpy as np
@@ -15,14 +17,25 @@ from scipy.special import expit, log_softmax
 from prior_sg.deploy.evaluation.foresight.trials import SAME, Moment, moments, trial
 from prior_sg.deploy.evaluation.worlds import KINDS
 from prior_sg.schemas.priors import Prior
-from prior_sg.services.segmenter.core.foresight.beyond import same_features
+from prior_sg.services.segmenter.core.foresight.beyond import (
+    beyond,
+    missing_features,
+    missing_weights,
+    same_features,
+    within_features,
+    within_weights,
+)
 from prior_sg.services.segmenter.core.foresight.config import ForesightConfig
 from prior_sg.services.segmenter.core.foresight.expectation import expected, features
 
 TUNED = range(0, 30)  # seeds that constants are chosen on
 RIDGE = 1e-2  # of the mean log-likelihood, around what is thought without worlds:
+LOOSE = 1e-4  # the same of chances by opening and label, which are thousands of events a world
 THOUGHT = (1.0, 1.0, -1.0, -1.0, 0.0, 0.5, 0.5)  # weights of another region's label
+WITHIN = [name for name in ForesightConfig.__struct_fields__ if name.startswith("within_")]
+MISSING = [name for name in ForesightConfig.__struct_fields__ if name.startswith("missing_")]
 Walk = tuple[Sequence[Moment], Prior]
+Read = TypeVar("Read")  # what the model reads of one world
 
 
 class Rows(NamedTuple):
@@ -32,17 +45,24 @@ class Rows(NamedTuple):
     goes_on: np.ndarray  # (event,) bool
     other: np.ndarray  # (event of another region, label, feature)
     came: np.ndarray  # (event of another region,) label
+    within: np.ndarray  # (event and label, feature)
+    met: np.ndarray  # (event and label,) bool
 
 
 def fitted(walks: Sequence[Walk], cfg: ForesightConfig = ForesightConfig()) -> ForesightConfig:
     """The settings that make what was revealed likeliest."""
     rows = [_rows(*walk, cfg) for walk in walks if any(len(moment.outcomes) for moment in walk[0])]
-    same = _least(_same_loss, rows, np.zeros(rows[0].same.shape[1]))
+    same = _least(lambda weights, one: _loss(weights, one.same, one.goes_on), rows, np.zeros(rows[0].same.shape[1]))
+    within = _least(lambda weights, one: _loss(weights, one.within, one.met), rows, within_weights(cfg), LOOSE)
     other = _least(_other_loss, [one for one in rows if len(one.came)], np.array(THOUGHT))
     adjacency, existence, again, once, often, count, met = np.round(other, 2).tolist()
     *by_width, by_area, by_spread = np.round(same, 2).tolist()
+    cfg = msgspec.structs.replace(cfg, **dict(zip(WITHIN, np.round(within, 2).tolist(), strict=True)))
+    left = [_left(*walk, cfg) for walk in walks]
+    missing = _least(lambda weights, one: _loss(weights, *one), left, missing_weights(cfg), LOOSE)
     return msgspec.structs.replace(
         cfg,
+        **dict(zip(MISSING, np.round(missing, 2).tolist(), strict=True)),
         same_by_width=tuple(by_width),
         same_by_area=by_area,
         same_by_spread=by_spread,
@@ -59,17 +79,36 @@ def fitted(walks: Sequence[Walk], cfg: ForesightConfig = ForesightConfig()) -> F
 def _rows(walk: Sequence[Moment], prior: Prior, cfg: ForesightConfig) -> Rows:
     kept = [moment for moment in walk if len(moment.outcomes)]
     came = np.concatenate([moment.outcomes for moment in kept])
-    same = [same_features(moment.views, expected(prior, moment.found, cfg).spread, cfg) for moment in kept]
+    chains = [expected(prior, moment.found, cfg) for moment in kept]
+    same = [same_features(moment.views, chain.spread, cfg) for moment, chain in zip(kept, chains, strict=True)]
     other = [features(prior, moment.found)[moment.views.beliefs.argmax(axis=1)] for moment in kept]
+    within = [within_features(moment.views, chain) for moment, chain in zip(kept, chains, strict=True)]
     changes = came != SAME
-    return Rows(np.concatenate(same), ~changes, np.concatenate(other)[changes], came[changes])
+    return Rows(
+        np.concatenate(same),
+        ~changes,
+        np.concatenate(other)[changes],
+        came[changes],
+        np.concatenate([one.reshape(-1, one.shape[2]) for one in within]),
+        np.concatenate([moment.met.reshape(-1) for moment in kept]),
+    )
 
 
-def _same_loss(weights: np.ndarray, one: Rows) -> tuple[float, np.ndarray]:
-    """Mean negative log-likelihood of one world, and its gradient."""
-    sign = np.where(one.goes_on, 1.0, -1.0)
-    logit = sign * (one.same @ weights)
-    return float(np.logaddexp(0, -logit).mean()), -((sign * expit(-logit)) @ one.same) / len(logit)
+def _left(walk: Sequence[Moment], prior: Prior, cfg: ForesightConfig) -> tuple[np.ndarray, np.ndarray]:
+    """What the model reads of each label at each moment (moment and label, feature), and whether one is missing."""
+    kept = [moment for moment in walk if len(moment.outcomes)]
+    rows = []
+    for moment in kept:
+        chain = expected(prior, moment.found, cfg)
+        rows.append(missing_features(beyond(moment.views, chain, cfg).within, chain))
+    return np.concatenate(rows), np.concatenate([moment.left for moment in kept])
+
+
+def _loss(weights: np.ndarray, rows: np.ndarray, true: np.ndarray) -> tuple[float, np.ndarray]:
+    """Mean negative log-likelihood of what is true (event,) or not, and its gradient."""
+    sign = np.where(true, 1.0, -1.0)
+    logit = sign * (rows @ weights)
+    return float(np.logaddexp(0, -logit).mean()), -((sign * expit(-logit)) @ rows) / len(logit)
 
 
 def _other_loss(weights: np.ndarray, one: Rows) -> tuple[float, np.ndarray]:
@@ -80,12 +119,15 @@ def _other_loss(weights: np.ndarray, one: Rows) -> tuple[float, np.ndarray]:
 
 
 def _least(
-    loss: Callable[[np.ndarray, Rows], tuple[float, np.ndarray]], rows: Sequence[Rows], around: np.ndarray
+    loss: Callable[[np.ndarray, Read], tuple[float, np.ndarray]],
+    rows: Sequence[Read],
+    around: np.ndarray,
+    ridge: float = RIDGE,
 ) -> np.ndarray:
     def whole(weights: np.ndarray) -> tuple[float, np.ndarray]:
         values, slopes = zip(*(loss(weights, one) for one in rows), strict=True)
         off = weights - around
-        return float(np.mean(values)) + RIDGE * float(off @ off), np.mean(slopes, axis=0) + 2 * RIDGE * off
+        return float(np.mean(values)) + ridge * float(off @ off), np.mean(slopes, axis=0) + 2 * ridge * off
 
     found: np.ndarray = minimize(whole, around, jac=True, method="L-BFGS-B").x
     return found
@@ -93,9 +135,13 @@ def _least(
 
 def main() -> None:
     """Fit over all kinds, and print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--kinds", default=",".join(KINDS))
+    parser.add_argument("--seeds", type=int, default=len(TUNED), help="the first so many of those that are for tuning")
+    given = parser.parse_args()
     walks = []
-    for kind in KINDS:
-        for seed in TUNED:
+    for kind in given.kinds.split(","):
+        for seed in TUNED[: given.seeds]:
             one = trial(kind, seed)
             walks.append((list(moments(one)), one.prior))
     print(fitted(walks))

@@ -89,21 +89,24 @@ def figures(worlds: Sequence[Judged]) -> dict[str, float]:
     }
 
 
-def missing_figures(worlds: Sequence[tuple[Sequence[Moment], Prior]], cfg: ForesightConfig) -> dict[str, float]:
-    """Calibration of what is said to be missing, and its Brier score, over labels none of which has been found yet."""
-    said, came = [], []
+def chance_figures(worlds: Sequence[tuple[Sequence[Moment], Prior]], cfg: ForesightConfig) -> dict[str, float]:
+    """Calibration and Brier score of what is said to begin behind each opening, and to be missing; `rate` is the score
+    of whoever knows nothing but how often that happens."""
+    within: list[tuple[np.ndarray, np.ndarray]] = []
+    missing: list[tuple[np.ndarray, np.ndarray]] = []
     for moments, prior in worlds:
         for moment in moments:
             if len(moment.outcomes):
-                chances = beyond(moment.views, expected(prior, moment.found, cfg), cfg).missing()
-                said.append(chances[~moment.seen])
-                came.append(moment.left[~moment.seen])
-    chance, there = np.concatenate(said), np.concatenate(came).astype(float)
-    return {
-        "missing_ece": calibration_error(np.minimum(chance, 1.0), there),
-        "missing_brier": float(((chance - there) ** 2).mean()),
-        "missing_brier_rate": float(((there.mean() - there) ** 2).mean()),
-    }
+                said = beyond(moment.views, expected(prior, moment.found, cfg), cfg)
+                within.append((said.within.reshape(-1), moment.met.reshape(-1)))
+                missing.append((said.missing, moment.left))
+    found = {}
+    for name, pairs in (("within", within), ("missing", missing)):
+        chance, there = (np.concatenate(column).astype(float) for column in zip(*pairs, strict=True))
+        found[f"{name}_ece"] = calibration_error(chance, there)
+        found[f"{name}_brier"] = float(((chance - there) ** 2).mean())
+        found[f"{name}_brier_rate"] = float(((there.mean() - there) ** 2).mean())
+    return found
 
 
 def search_figures(walked_m: Mapping[str, Sequence[float]]) -> dict[str, float]:

@@ -8,7 +8,7 @@ import numpy as np
 from prior_sg.deploy.evaluation.foresight.explorer import Explorer, Frontiers
 from prior_sg.deploy.evaluation.foresight.trials import FOUND_M2, MOST_DECISIONS, Trial, go
 from prior_sg.deploy.evaluation.worlds.ways import CELL_M
-from prior_sg.services.exploring import hedged_metres
+from prior_sg.services.exploring import chances_per_metre
 from prior_sg.services.segmenter.core.foresight.beyond import beyond
 from prior_sg.services.segmenter.core.foresight.config import ForesightConfig
 from prior_sg.services.segmenter.core.foresight.expectation import expected
@@ -42,19 +42,13 @@ Policy = Callable[[Sight], int]
 
 
 def ours(sight: Sight) -> int:
-    """The least metres by the product's score."""
+    """The largest chance by metre, as the product tells planners."""
     one, cfg = sight.quest.trial, sight.cfg
     expectation = expected(one.prior, one.found(sight.explorer, sight.seen_m2), cfg)
     origins = one.origins(sight.explorer, sight.frontiers, sight.seen_m2)
     foreseen = beyond(one.views(sight.frontiers, origins, sight.seen_m2), expectation, cfg)
-    metres = hedged_metres(
-        sight.frontiers.steps * CELL_M / STRAIGHT,
-        sight.frontiers.centers_m,
-        foreseen.within[:, sight.quest.goal],
-        cfg.look_m,
-        cfg.elsewhere_m,
-    )
-    return int(metres.argmin())
+    ways_m = sight.frontiers.steps * CELL_M / STRAIGHT
+    return int(chances_per_metre(ways_m, foreseen.within[:, sight.quest.goal], cfg.look_m).argmax())
 
 
 POLICIES: dict[str, Policy] = {

@@ -86,8 +86,8 @@ class Moment:
     views: Views
     found: Found
     outcomes: np.ndarray  # (opening,) SAME or the label of another region
+    met: np.ndarray  # (opening, label) bool: such a region, not found yet, begins within REACH_M
     left: np.ndarray  # (label,) bool: one more region of it is to be found
-    seen: np.ndarray  # (label,) bool: one has been found
 
 
 @lru_cache(32)
@@ -125,6 +125,7 @@ def trial(kind: str, seed: int, errors: float = ERRORS) -> Trial:
 def moments(one: Trial) -> Iterator[Moment]:
     """An exploration, always to the nearest frontier, until nothing is left."""
     explorer = Explorer(one.plan, int(one.random(1).choice(one.starts)))
+    walkable = np.isin(np.arange(len(one.labels)), one.plan.regions[one.starts])
     for _ in range(MOST_DECISIONS):
         cost, before = explorer.reach()
         frontiers = explorer.frontiers(cost)
@@ -138,14 +139,17 @@ def moments(one: Trial) -> Iterator[Moment]:
         kept = np.flatnonzero(known & (one.labels[np.maximum(revealed, 0)] >= 0))
         views = one.views(frontiers, origins, seen_m2)
         count = len(one.prior.regions)
-        there = np.bincount(one.labels[one.labels >= 0], minlength=count)
-        here = np.bincount(one.labels[(seen_m2 >= FOUND_M2) & (one.labels >= 0)], minlength=count)
+        new = (seen_m2 < FOUND_M2) & (one.labels >= 0) & walkable
+        met = np.zeros((len(kept), count), bool)
+        for row, at in enumerate(kept.tolist()):
+            regions = explorer.met(frontiers.nodes[at])
+            met[row, one.labels[regions[new[regions]]]] = True
         yield Moment(
             Views(views.beliefs[kept], views.widths_m[kept], views.areas_m2[kept]),
             one.found(explorer, seen_m2),
             outcomes[kept],
-            there > here,
-            here > 0,
+            met,
+            np.bincount(one.labels[new], minlength=count) > 0,
         )
         at = int(frontiers.steps.argmin())
         go(explorer, before, frontiers, at)

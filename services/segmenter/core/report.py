@@ -55,8 +55,9 @@ def _renew_layers(state: State, cfg: Config) -> None:
     """Find the levels above the regions again, and name each region's zone."""
     regions = state.regions
     assert regions.storeys is not None
+    graph, places = state.map.graph, state.map.places
     levels = state.aim.aligned.levels
-    state.layers.renew(regions.known, state.map.places, regions.storeys, levels, cfg.layers)
+    state.layers.renew(regions.known, graph, places, regions.storeys, levels=levels, cfg=cfg.layers)
     for number, region in regions.known.items():
         zone = state.layers.zone_of(number)
         if zone != region.parent:

@@ -1,5 +1,7 @@
 """The light explorer on a plan made by hand, scores on events made by hand, and fitting of what is known."""
 
+from dataclasses import replace
+
 import msgspec
 import numpy as np
 import pytest
@@ -7,14 +9,17 @@ import pytest
 from prior_sg.deploy.evaluation.foresight.explorer import Explorer, Plan, crossings
 from prior_sg.deploy.evaluation.foresight.fitting import fitted
 from prior_sg.deploy.evaluation.foresight.loops import FAR
+from prior_sg.deploy.evaluation.foresight.mapped import behind, covered, ground_of
 from prior_sg.deploy.evaluation.foresight.predictors import PREDICTORS
-from prior_sg.deploy.evaluation.foresight.scores import figures, judge, search_figures
+from prior_sg.deploy.evaluation.foresight.scores import chance_figures, figures, judge, search_figures
 from prior_sg.deploy.evaluation.foresight.searches import POLICIES, Quest, metres
 from prior_sg.deploy.evaluation.foresight.trials import SAME, Moment, Trial, go
 from prior_sg.deploy.evaluation.worlds.ways import CELL_M, LEVELS, ways_of
-from prior_sg.services.segmenter.core.foresight.beyond import Views
+from prior_sg.services.segmenter.core.foresight.beyond import Views, beyond
 from prior_sg.services.segmenter.core.foresight.config import ForesightConfig
 from prior_sg.services.segmenter.core.foresight.expectation import Found, expected
+from prior_sg.services.segmenter.core.foresight.openings import Openings
+from prior_sg.services.segmenter.core.map.received import ReceivedGraph
 from tests.help.world import prior
 
 LABELS = ["hall", "bath", "kitchen"]
@@ -109,13 +114,17 @@ def test_every_policy_finds_what_is_there(policy):
     assert 4 < walked_m < 40
 
 
-def moment(outcomes, widths_m=None, label=0):
+def moment(outcomes, widths_m=None, label=0, met=None, left=None):
     count = len(outcomes)
     views = Views(
         np.tile(np.eye(3)[label], (count, 1)), np.full(count, 0.9) if widths_m is None else widths_m, np.ones(count)
     )
     return Moment(
-        views, Found(np.array([1.0, 0, 0]), np.zeros((3, 3))), np.array(outcomes), np.ones(3, bool), np.zeros(3, bool)
+        views,
+        Found(np.array([1.0, 0, 0]), np.zeros((3, 3))),
+        np.array(outcomes),
+        np.zeros((count, 3), bool) if met is None else met,
+        np.ones(3, bool) if left is None else left,
     )
 
 
@@ -141,21 +150,32 @@ def test_savings_are_paired():
 
 def test_fitting_finds_the_weights_that_made_the_events():
     """Outcomes drawn from the model with known weights give these back."""
-    rng, cfg = np.random.default_rng(4), ForesightConfig()
+    rng, drawn, cfg = np.random.default_rng(4), np.random.default_rng(5), ForesightConfig()
     matrix = np.array([[1, 0.9, 0.1], [0.9, 1, 0.3], [0.1, 0.3, 1]], np.float32)
     the_prior = prior(LABELS, adjacency=matrix)
     true = msgspec.structs.replace(
-        cfg, adjacency=1.5, found_once=-2.0, again=-1.0, same_by_width=(0, 0, -2.0, 0, 0, 0, 3.0)
+        cfg,
+        adjacency=1.5,
+        found_once=-2.0,
+        again=-1.0,
+        same_by_width=(0, 0, -2.0, 0, 0, 0, 3.0),
+        within_bias=1.0,
+        within_width=1.5,
+        within_once=-2.0,
+        missing_sum=2.0,
+        missing_once=-1.0,
     )
     walk = []
     for _ in range(600):
         counts = rng.integers(0, 2, 3).astype(float)
         at, widths_m = int(rng.integers(3)), rng.choice([0.9, 5.0], 4)
         bare = moment([0] * 4, widths_m, at)
-        bare = Moment(bare.views, Found(counts, np.zeros((3, 3))), bare.outcomes, bare.left, bare.seen)
+        bare = replace(bare, found=Found(counts, np.zeros((3, 3))))
         given = PREDICTORS["ours"](bare, the_prior, true)
         outcomes = [int(rng.choice(4, p=row)) - 1 for row in given]
-        walk.append(Moment(bare.views, bare.found, np.array(outcomes), bare.left, bare.seen))
+        said = beyond(bare.views, expected(the_prior, bare.found, true), true)
+        met, left = drawn.random(said.within.shape) < said.within, drawn.random(3) < said.missing
+        walk.append(replace(bare, outcomes=np.array(outcomes), met=met, left=left))
     found = fitted([(walk, the_prior)], cfg)
     chain, wanted = (
         expected(the_prior, Found(np.array([1.0, 0, 1]), np.zeros((3, 3))), one).next for one in (found, true)
@@ -164,3 +184,58 @@ def test_fitting_finds_the_weights_that_made_the_events():
     same = [PREDICTORS["ours"](moment([0], np.array([width])), the_prior, found)[0, 0] for width in (0.9, 5.0)]
     wanted_same = [PREDICTORS["ours"](moment([0], np.array([width])), the_prior, true)[0, 0] for width in (0.9, 5.0)]
     assert same == pytest.approx(wanted_same, abs=0.1)  # drawn to one half by the ridge
+    seen = moment([0, 0], np.array([0.9, 5.0]))
+    said, wanted_said = (beyond(seen.views, expected(the_prior, seen.found, one), one) for one in (found, true))
+    np.testing.assert_allclose(said.within, wanted_said.within, atol=0.06)
+    np.testing.assert_allclose(said.missing, wanted_said.missing, atol=0.1)
+
+
+def test_what_begins_behind_a_door_is_met_behind_that_door_alone():
+    explorer = Explorer(PLAN, HALL)
+    explorer.known |= PLAN.regions == 0  # the hall has been seen whole
+    frontiers = explorer.frontiers(explorer.reach()[0])
+    east = frontiers.centers_m[:, 0] > PLAN.position_m(np.array([HALL]))[0, 0]
+    met = [set(explorer.met(nodes).tolist()) - {0} for nodes in frontiers.nodes]
+    assert set().union(*(one for one, side in zip(met, east, strict=True) if side)) == {2}
+    assert set().union(*(one for one, side in zip(met, east, strict=True) if not side)) == {1}
+
+
+def opening_of(x_m, direction, width_m=1.0):
+    """An opening of the product's at the middle of the plan's length, at the height of a place."""
+    position_m = np.array([[x_m, ROOM / 2 * CELL_M, 1.2]])
+    return Openings(
+        place_ids=np.array([0]),
+        positions_m=position_m,
+        beyond_m=position_m + np.array([direction, 0, 0]) * (1.0 + ForesightConfig().beyond_m),
+        widths_m=np.array([width_m]),
+        regions=np.array([0]),
+        beliefs=np.eye(3)[:1],
+    )
+
+
+def test_behind_the_products_openings_lies_what_its_places_do_not_cover():
+    """One sphere in the middle of the hall; it looks east through a door, or at the seen hall's own rest."""
+    ground = ground_of(PLAN, home_trial().prior)
+    middle_m = PLAN.position_m(np.array([HALL]))[0]
+    sphere = ReceivedGraph(np.array([0]), np.array([[*middle_m[:2], 1.2]]), np.array([1.0]))
+    known = covered(ground, sphere)
+    assert set(PLAN.regions[known]) == {0} and 0.6 < known.sum() * CELL_M**2 / (np.pi * 1.4**2) < 1.05
+    new = np.array([False, True, True])
+    east = opening_of(middle_m[0] + 0.4, 1.0)
+    assert [one.tolist() for one in behind(east, ground, known, new, ForesightConfig())] == [
+        [SAME],
+        [[False, True, True]],  # around the sphere one comes to the west, too
+    ]
+    known |= PLAN.regions == 0
+    outcomes, met = behind(opening_of(middle_m[0] + 1.0, 1.0), ground, known, new, ForesightConfig())
+    assert outcomes.tolist() == [2] and met.tolist() == [[False, False, True]]
+    blind = opening_of(middle_m[0] - 1.5, 1.0)  # it ends within the hall
+    assert not behind(blind, ground, known, new, ForesightConfig())[1].any()
+
+
+def test_chances_are_judged_against_how_often_things_happen():
+    walk = [moment([SAME], met=np.array([[False, True, False]]), left=np.array([False, True, False]))] * 4
+    told = chance_figures([(walk, home_trial().prior)], ForesightConfig())
+    assert told["within_brier_rate"] == told["missing_brier_rate"] == pytest.approx(2 / 9)
+    said = beyond(walk[0].views, expected(home_trial().prior, walk[0].found, ForesightConfig()), ForesightConfig())
+    assert told["within_brier"] == pytest.approx(((said.within[0] - [0, 1, 0]) ** 2).mean())

@@ -11,6 +11,7 @@ from prior_sg.schemas.priors import Prior
 from prior_sg.schemas.regions import Region, Transition
 from prior_sg.services.segmenter.core.layers.alignment import AlignmentConfig, Members
 from prior_sg.services.segmenter.core.layers.layer_map import LayerMap
+from prior_sg.services.segmenter.core.layers.pieces import near_regions
 from prior_sg.services.segmenter.core.layers.stacking import LayersConfig, LevelInForce, layers_of
 from prior_sg.services.segmenter.core.layers.storeys import StoreyConfig, Storeys, split, storeys_of
 from prior_sg.services.segmenter.core.map.received import ReceivedGraph
@@ -20,6 +21,7 @@ from tests.help.examples import PRIOR
 
 CFG = StoreyConfig()
 STOREY_M = 3.0
+RADIUS_M = 0.4  # of places in `known`
 
 
 def storey(z_m, side=8):
@@ -133,15 +135,18 @@ def test_no_region_has_no_level():
     assert layers_of(none, np.zeros(0, np.int64), {"zone": level("zone", ZONES)}, AlignmentConfig()) == []
 
 
-def known(labels, first_id=0):
-    """Regions of one place each in a row, 60 m2, an open way between neighbours; and the table of their places."""
+def known(labels, first_id=0, x_m=None, z_m=None, joined=True):
+    """Regions of one place each in a row, 60 m2, an open way between neighbours; their graph, and the table of their
+    places."""
     ids = [first_id + row for row in range(len(labels))]
+    x_m = np.arange(len(labels)) if x_m is None else np.array(x_m)
+    z_m = np.zeros(len(labels)) if z_m is None else np.array(z_m)
     regions = {}
     for row, number in enumerate(ids):
         ways = [
             Transition(region=other, edge=(0, 1), position_m=(0, 0, 0), clearance_m=1.0, door=False)
             for other in (number - 1, number + 1)
-            if other in ids
+            if other in ids and joined
         ]
         regions[number] = Region(
             id=number,
@@ -154,15 +159,16 @@ def known(labels, first_id=0):
         )
     places = dataclasses.replace(Places.none(), regions=np.array(ids), posteriors=ROOMS[labels].astype(np.float32))
     count = len(labels)
-    ground = Storeys(
-        np.zeros(1), np.zeros(count, np.int64), np.ones(count, bool), np.zeros(count, bool), np.ones(count)
-    )
-    return regions, places, ground
+    floors_m, storey = np.unique(z_m, return_inverse=True)
+    ground = Storeys(floors_m, storey, np.ones(count, bool), np.zeros(count, bool), np.ones(count))
+    positions_m = np.stack((x_m, 0.0 * x_m, z_m), axis=1)
+    graph = ReceivedGraph(np.arange(count), positions_m, np.full(count, RADIUS_M))
+    return regions, graph, places, ground
 
 
 def test_nodes_keep_their_ids_while_regions_come_and_go():
     layers, levels = LayerMap(), {"zone": level("zone", ZONES)}
-    layers.renew(*known([0, 1, 0, 2, 1, 2]), levels, LayersConfig())
+    layers.renew(*known([0, 1, 0, 2, 1, 2]), levels=levels, cfg=LayersConfig())
     assert {key: one.member_ids for key, one in layers.known.items() if key[0] == "zone"} == {
         ("zone", 0): [0, 1, 2],
         ("zone", 1): [3, 4, 5],
@@ -170,16 +176,74 @@ def test_nodes_keep_their_ids_while_regions_come_and_go():
     assert layers.known["zone", 1].label == layers.zone_of(4) == "surgery"
     assert layers.known["floor", 0].members == "zone" and layers.known["floor", 0].member_ids == [0, 1]
     assert layers.known["zone", 0].parent_id == 0 and layers.known["zone", 0].area_m2 == 180
-    layers.renew(*known([1, 0, 2, 1, 2, 2], first_id=1), levels, LayersConfig())  # 0 is gone, 6 is new
+    layers.renew(*known([1, 0, 2, 1, 2, 2], first_id=1), levels=levels, cfg=LayersConfig())  # 0 is gone, 6 is new
     assert layers.known["zone", 1].member_ids == [3, 4, 5, 6] and layers.known["zone", 0].member_ids == [1, 2]
+
+
+APART_M = LayersConfig().join_m + 2 * RADIUS_M  # of centres whose spheres are just near enough
+
+
+@pytest.mark.parametrize(("apart_m", "count"), [(APART_M - 0.1, 1), (APART_M + 0.1, 3)])
+def test_pieces_without_a_way_are_one_building_where_they_stand_side_by_side(apart_m, count):
+    """Three regions that no way joins, as what was seen over a counter or through a window is."""
+    layers = LayerMap()
+    layers.renew(*known([0, 1, 2], x_m=apart_m * np.arange(3), joined=False), levels={}, cfg=LayersConfig())
+    for name in ("building", "floor"):
+        assert sum(level == name for level, _ in layers.known) == count
+
+
+def test_what_stands_above_is_a_floor_of_the_same_building():
+    layers = LayerMap()
+    layers.renew(*known([0, 0], x_m=(0, 0), z_m=(0, 1.5), joined=False), levels={}, cfg=LayersConfig())
+    assert [one.label for one in layers.known.values()] == ["floor 0", "floor 1", "building"]
+
+
+def test_pieces_side_by_side_are_one_building_only_where_the_prior_takes_them_for_one():
+    outside = level("building", [(0.95, 0.05), (0.9, 0.1), (0.05, 0.95)], names=("building", "outdoors"))
+    layers = LayerMap()
+    arguments = known([0, 1, 2], x_m=(APART_M - 0.1) * np.arange(3), joined=False)
+    layers.renew(*arguments, levels={"building": outside}, cfg=LayersConfig())
+    assert [(one.label, one.member_ids) for one in layers.known.values() if one.level == "building"] == [
+        ("building", [0]),
+        ("outdoors", [1]),
+    ]
+    floors = [one for one in layers.known.values() if one.level == "floor"]
+    assert [one.member_ids for one in floors] == [[0, 1], [2]]
+
+
+def test_zones_do_not_go_through_walls():
+    layers = LayerMap()
+    arguments = known([0, 0], x_m=(0, APART_M - 0.1), joined=False)
+    layers.renew(*arguments, levels={"zone": level("zone", ZONES)}, cfg=LayersConfig())
+    assert [one.level for one in layers.known.values()].count("zone") == 2
+    assert [one.level for one in layers.known.values()].count("building") == 1
+
+
+def test_nearest_regions_of_pieces_are_found_as_by_looking_at_all_pairs():
+    rng = np.random.default_rng(5)
+    for _ in range(30):
+        count, places = 5, 60
+        rows = np.sort(np.concatenate((np.arange(count), rng.integers(0, count, places - count))))
+        positions_m = rng.uniform(-1, 1, (places, 3)) + 3.0 * rng.uniform(-1, 1, (count, 3))[rows]
+        graph = ReceivedGraph(np.arange(places), positions_m, np.full(places, 0.2))
+        edges = np.array([(0, 1), (2, 3)])
+        piece = np.array([0, 0, 1, 1, 2])[rows]
+        apart_m = np.linalg.norm(positions_m[:, None] - positions_m, axis=2) - 0.4
+        wanted = []
+        for one, other in ((0, 1), (0, 2), (1, 2)):
+            between = np.where((piece[:, None] == one) & (piece == other), apart_m, np.inf)
+            if between.min() <= 1.0:
+                first, second = np.unravel_index(between.argmin(), between.shape)
+                wanted.append(sorted((int(rows[first]), int(rows[second]))))
+        assert near_regions(graph, rows, edges, count, 1.0).tolist() == sorted(wanted)
 
 
 def test_a_successor_goes_on_with_the_ids():
     former, levels = LayerMap(), {"zone": level("zone", ZONES)}
-    former.renew(*known([0, 0, 2, 2, 2]), levels, LayersConfig())
+    former.renew(*known([0, 0, 2, 2, 2]), levels=levels, cfg=LayersConfig())
     successor = LayerMap()
     successor.inherit(list(former.known.values()), {"zone": 9})
-    successor.renew(*known([0, 2, 2, 2, 0, 0, 0], first_id=1), levels, LayersConfig())
+    successor.renew(*known([0, 2, 2, 2, 0, 0, 0], first_id=1), levels=levels, cfg=LayersConfig())
     assert sorted(number for name, number in successor.known if name == "zone") == [0, 1, 9]
 
 

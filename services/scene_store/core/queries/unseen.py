@@ -5,7 +5,7 @@ import numpy as np
 from prior_sg.schemas.foresight import Foresight, Opening
 from prior_sg.schemas.names import same
 from prior_sg.schemas.queries import Missing, Outlook, Prospect, RouteBetween, Spot, WhatIsMissing, WhereToLook
-from prior_sg.services.exploring import expected_metres, hedged_metres
+from prior_sg.services.exploring import chances_per_metre, expected_metres
 from prior_sg.services.scene_store.core.queries.index import Index
 from prior_sg.services.scene_store.core.queries.labels import AFTER_A_TASK, nearest_labels
 from prior_sg.services.scene_store.core.queries.routes import NoSuchSpot, lengths_from, route
@@ -51,16 +51,17 @@ def _prospects(
     foresight: Foresight, held: list[Opening], ways_m: np.ndarray, chances: np.ndarray, points_m: np.ndarray
 ) -> list[Prospect]:
     likely = np.flatnonzero((chances > 0) & np.isfinite(ways_m))
-    asked = (ways_m[likely], points_m[likely], chances[likely], foresight.look_m, foresight.elsewhere_m)
-    metres, choice = expected_metres(*asked), hedged_metres(*asked)
+    ways_m, points_m, chances = ways_m[likely], points_m[likely], chances[likely]
+    metres = expected_metres(ways_m, points_m, chances, foresight.look_m, foresight.elsewhere_m)
+    worth = chances_per_metre(ways_m, chances, foresight.look_m)
     return [
         Prospect(
             opening=held[likely[at]],
-            probability=float(chances[likely[at]]),
+            probability=float(chances[at]),
             expected_m=round(float(metres[at]), DIGITS),
-            way_m=round(float(ways_m[likely[at]]), DIGITS),
+            way_m=round(float(ways_m[at]), DIGITS),
         )
-        for at in np.argsort(choice, kind="stable").tolist()
+        for at in np.argsort(-worth, kind="stable").tolist()
     ]
 
 

@@ -4,8 +4,8 @@ import msgspec
 
 
 class ForesightConfig(msgspec.Struct, frozen=True, kw_only=True):
-    """How openings, adjacency, existence and what was found make a distribution. Weights are those of a logistic model,
-    fitted on 35 generated worlds of all kinds, seeds 0 to 3."""
+    """How openings, adjacency, existence and what was found make a distribution. Weights are those of logistic models,
+    fitted on generated worlds (`deploy/evaluation/foresight/fitting.py`)."""
 
     enabled: bool = True
     steep: float = 0.7  # openings whose direction rises or falls more (sine) lead to ceilings and floors
@@ -18,21 +18,38 @@ class ForesightConfig(msgspec.Struct, frozen=True, kw_only=True):
 
     # That the same region goes on: logit by width of the opening, and by what was seen of the region.
     widths_m: tuple[float, ...] = (0.6, 0.8, 1.1, 1.6, 2.5, 4.0)  # where the classes of width begin, after the first
-    same_by_width: tuple[float, ...] = (0.18, -0.01, -0.3, 0.21, 0.24, 0.39, 0.54)
-    same_by_area: float = 0.73  # by log(1 + seen area of the region / m2)
-    same_by_spread: float = -0.79  # by log of the mean number of other regions that touch one of its label
+    same_by_width: tuple[float, ...] = (0.09, -0.18, -0.15, 0.32, 0.16, 0.53, 0.47)
+    same_by_area: float = 0.8  # by log(1 + seen area of the region / m2)
+    same_by_spread: float = -1.0  # by log of the mean number of other regions that touch one of its label
 
     # Which other region: log-odds.
-    adjacency: float = 0.29  # by log P(ri <-> rj)
-    existence: float = 1.26  # by log P(r)
-    again: float = -1.47  # another region of the very same label, in place of its adjacency with itself
-    found_once: float = -0.92
-    found_often: float = -0.24  # twice or more ...
-    found_count: float = 0.47  # ... and by log of the number
-    met: float = 0.57  # by log(1 + number of such borders in this map)
+    adjacency: float = 0.33  # by log P(ri <-> rj)
+    existence: float = 1.28  # by log P(r)
+    again: float = -1.3  # another region of the very same label, in place of its adjacency with itself
+    found_once: float = -0.87
+    found_often: float = -0.25  # twice or more ...
+    found_count: float = 0.37  # ... and by log of the number
+    met: float = 0.47  # by log(1 + number of such borders in this map)
 
-    steps: int = 3  # regions ahead
-    onward: float = 0.6  # chance that a region beyond leads on, times how many of the others are likely to touch it
+    # That a region of a label begins within REACH_M behind an opening: logit.
+    within_bias: float = 0.84
+    within_width: float = 0.17  # by log of the opening's width / m
+    within_area: float = -0.14  # by log(1 + seen area of the region it opens from / m2)
+    within_spread: float = 1.25  # by log of the mean number of other regions that touch one of its label
+    within_openings: float = -0.32  # by log of how many openings the map has
+    within_adjacency: float = 0.42  # by log P(ri <-> rj)
+    within_existence: float = 1.49  # by log P(r)
+    within_again: float = -2.5  # by the belief that the region it opens from has that label
+    within_once: float = -1.16  # such a region has been found ...
+    within_often: float = -0.29  # ... or several
+
+    # That one more region of a label is behind any of the openings: logit.
+    missing_bias: float = 1.06
+    missing_sum: float = 0.86  # by log of the sum of the chances of all openings
+    missing_existence: float = 0.11  # by log P(r)
+    missing_once: float = -0.46
+    missing_often: float = -0.43
+
     look_m: float = 1.0  # walked behind an opening to see what is there
     elsewhere_m: float = 40.0  # to what lies behind none of the openings
     told_change: float = 0.05  # smaller changes of a probability are no news

@@ -42,24 +42,13 @@ class Found:
 
 @dataclass(frozen=True)
 class Expectation:
-    """The chain of regions: where one comes from each label, and how far that leads."""
+    """What comes after each label, and what is told of the labels themselves."""
 
     next: np.ndarray  # (label, label) rows sum to one: another region, the one before given
     spread: np.ndarray  # (label,) mean number of other labels' regions that touch one, by the prior
-
-    def leads(self, onward: float) -> np.ndarray:
-        """Chance (label,) that a region leads on: `onward` times its spread over the mean. Closets do not."""
-        return np.minimum(onward * self.spread / max(float(self.spread.mean()), FLOOR), 1.0)
-
-    def ahead(self, steps: int, onward: float) -> np.ndarray:
-        """Chance (label, label) that a region of r is met within so many regions after leaving one of i."""
-        count, leads = len(self.next), self.leads(onward)
-        met = self.next.copy()
-        elsewhere = ~np.eye(count, dtype=bool)
-        for _ in range(steps - 1):
-            # r itself, else through any other region k that leads on
-            met = self.next + self.next @ (leads[:, None] * met * elsewhere)
-        return np.minimum(met, 1.0)
+    adjacency: np.ndarray  # (label, label) of the prior
+    existence: np.ndarray  # (label,) of the prior
+    found: np.ndarray  # (label,) regions of it that the map holds
 
 
 def features(prior: Prior, found: Found) -> np.ndarray:
@@ -95,4 +84,10 @@ def expected(prior: Prior, found: Found, cfg: ForesightConfig) -> Expectation:
     existence = np.array([region.existence for region in prior.regions])
     beside = prior.adjacency.astype(np.float64) * existence
     np.fill_diagonal(beside, 0.0)
-    return Expectation(odds / odds.sum(axis=1, keepdims=True), len(existence) * beside.sum(axis=1))
+    return Expectation(
+        next=odds / odds.sum(axis=1, keepdims=True),
+        spread=len(existence) * beside.sum(axis=1),
+        adjacency=prior.adjacency.astype(np.float64),
+        existence=existence,
+        found=found.regions,
+    )

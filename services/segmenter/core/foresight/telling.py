@@ -18,11 +18,9 @@ DIGITS = 3
 def foresight(openings: Openings, regions: Mapping[int, Region], prior: Prior, cfg: ForesightConfig) -> Foresight:
     """What lies beyond the openings of a map with these regions."""
     names = [region.name for region in prior.regions]
-    found = Found.of(regions.values(), names, cfg.least_places)
-    areas_m2 = np.array([regions[region].area_m2 for region in openings.regions.tolist()])
-    views = Views(openings.beliefs, openings.widths_m, areas_m2)
-    foreseen = beyond(views, expected(prior, found, cfg), cfg)
-    missing = foreseen.missing()
+    found = found_in(regions, prior, cfg)
+    foreseen = beyond(views_of(openings, regions), expected(prior, found, cfg), cfg)
+    missing = foreseen.missing
     return Foresight(
         openings=[
             _opening(openings, row, foreseen=foreseen, prior=prior, found=found, cfg=cfg)
@@ -33,10 +31,20 @@ def foresight(openings: Openings, regions: Mapping[int, Region], prior: Prior, c
             for label in np.argsort(-missing, kind="stable").tolist()
             if missing[label] >= cfg.least_told
         ],
-        steps=cfg.steps,
         look_m=cfg.look_m,
         elsewhere_m=cfg.elsewhere_m,
     )
+
+
+def found_in(regions: Mapping[int, Region], prior: Prior, cfg: ForesightConfig) -> Found:
+    """What a map with these regions holds of a prior."""
+    return Found.of(regions.values(), [region.name for region in prior.regions], cfg.least_places)
+
+
+def views_of(openings: Openings, regions: Mapping[int, Region]) -> Views:
+    """What the openings tell of what is behind them."""
+    areas_m2 = np.array([regions[region].area_m2 for region in openings.regions.tolist()])
+    return Views(openings.beliefs, openings.widths_m, areas_m2)
 
 
 def differs(told: Foresight | None, now: Foresight, cfg: ForesightConfig) -> bool:

@@ -49,7 +49,7 @@ class Members(NamedTuple):
     areas_m2: np.ndarray  # (member,)
     beliefs: np.ndarray  # (member, entry below)
     edges: np.ndarray  # (contact, 2) rows, smaller first
-    ways: np.ndarray  # (contact,) how wide the ways across are together; 1 = one wide one
+    ways: np.ndarray  # (contact,) how wide the ways across are together; 1 = one wide one, 0 = they only stand near
 
 
 class Aligned(NamedTuple):

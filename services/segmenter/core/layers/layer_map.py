@@ -11,8 +11,10 @@ import numpy as np
 from prior_sg.schemas.levels import LEVELS, NO_NODE, LevelName, LevelNode, regions_in
 from prior_sg.schemas.regions import NO_REGION, Region
 from prior_sg.services.segmenter.core.layers.alignment import Members
+from prior_sg.services.segmenter.core.layers.pieces import near_regions
 from prior_sg.services.segmenter.core.layers.stacking import Layer, LayersConfig, LevelInForce, layers_of
 from prior_sg.services.segmenter.core.layers.storeys import Storeys
+from prior_sg.services.segmenter.core.map.received import ReceivedGraph
 from prior_sg.services.segmenter.core.map.table import Places
 from prior_sg.services.segmenter.core.regions.components import track
 
@@ -39,16 +41,17 @@ class LayerMap:
     def renew(
         self,
         regions: Mapping[int, Region],
+        graph: ReceivedGraph,
         places: Places,
         storeys: Storeys,
+        *,
         levels: Mapping[str, LevelInForce],
         cfg: LayersConfig,
     ) -> None:
         """Find all levels of these regions."""
         listed = [region for _, region in sorted(regions.items()) if region.place_count]
-        layers = layers_of(
-            _members(listed, places, cfg.alignment.way_m), _storeys(listed, places, storeys), levels, cfg.alignment
-        )
+        members = _members(listed, graph, places, cfg)
+        layers = layers_of(members, _storeys(listed, places, storeys), levels, cfg.alignment)
         counts = np.minimum([region.place_count for region in listed], MOST_COUNTED).astype(np.int64)
         former, self.node_of, ids = self.node_of, {}, {}
         for layer in layers:
@@ -69,8 +72,9 @@ class LayerMap:
         return "" if node is None else self.known["zone", node].label
 
 
-def _members(regions: list[Region], places: Places, way_m: float) -> Members:
+def _members(regions: list[Region], graph: ReceivedGraph, places: Places, cfg: LayersConfig) -> Members:
     """Regions as members of the level above: mean beliefs of their places, and the ways between them."""
+    way_m = cfg.alignment.way_m
     row = {region.id: number for number, region in enumerate(regions)}
     ways: dict[tuple[int, int], float] = {}
     for region in regions:
@@ -78,12 +82,14 @@ def _members(regions: list[Region], places: Places, way_m: float) -> Members:
             if region.id < way.region and way.region in row:
                 pair = row[region.id], row[way.region]
                 ways[pair] = ways.get(pair, 0.0) + min(way.clearance_m / way_m, 1.0)
-    edges = sorted(ways)
+    rows = _rows(regions, places)
+    known = np.array(sorted(ways), np.int64).reshape(-1, 2)
+    near = near_regions(graph, rows, known, len(regions), cfg.join_m)
     return Members(
         areas_m2=np.array([region.area_m2 for region in regions]),
-        beliefs=_means(places.posteriors.astype(np.float64), _rows(regions, places), len(regions)),
-        edges=np.array(edges, np.int64).reshape(-1, 2),
-        ways=np.array([ways[pair] for pair in edges]),
+        beliefs=_means(places.posteriors.astype(np.float64), rows, len(regions)),
+        edges=np.concatenate((known, near)),
+        ways=np.concatenate(([ways[pair] for pair in sorted(ways)], np.zeros(len(near)))),
     )
 
 

@@ -1,8 +1,8 @@
 """From regions to all levels above them, one upon the other (pure).
 
-Zones follow the prior and never span storeys. A building is a connected part of the map that the prior takes for one
-thing, such as indoors or outdoors; where it names no such level, a connected part. A floor is what a building has on
-one storey. Districts follow the prior.
+Zones follow the prior and never span storeys. A building is a part of the map that hangs together, by ways or because
+its pieces stand side by side (`pieces`), and that the prior takes for one thing, such as indoors or outdoors; where it
+names no such level, all that hangs together. A floor is what a building has on one storey. Districts follow the prior.
 """
 
 from collections.abc import Mapping
@@ -22,6 +22,11 @@ class LayersConfig(msgspec.Struct, frozen=True, kw_only=True):
 
     storeys: StoreyConfig = msgspec.field(default_factory=StoreyConfig)
     alignment: AlignmentConfig = msgspec.field(default_factory=AlignmentConfig)
+    join_m: float = 1.0  # from the free space of one piece of a map to another's, through walls or a slab: one building
+
+    def __post_init__(self) -> None:
+        if self.join_m < 0:
+            raise ValueError("join_m is negative")
 
 
 class LevelInForce(NamedTuple):
@@ -79,8 +84,8 @@ def _aligned(
 
 
 def _within(members: Members, storeys: np.ndarray) -> Members:
-    """The same without contacts between storeys."""
-    same = storeys[members.edges[:, 0]] == storeys[members.edges[:, 1]]
+    """The same without contacts between storeys, or through walls."""
+    same = (storeys[members.edges[:, 0]] == storeys[members.edges[:, 1]]) & (members.ways > 0)
     return members._replace(edges=members.edges[same], ways=members.ways[same])
 
 

@@ -1,0 +1,54 @@
+"""Pieces of a map that no known way joins, and which of them stand side by side all the same (pure).
+
+What was seen through a window, over a counter or from another storey is a piece of its own until somebody walks there.
+Spheres of free space end at walls, so two pieces on both sides of a wall or a slab lie as far apart as that is thick.
+"""
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from prior_sg.services.segmenter.core.map.received import ReceivedGraph
+from prior_sg.services.segmenter.core.regions.components import numbered
+
+NEAREST = 4  # places of another piece that are looked at from each place
+
+
+def near_regions(graph: ReceivedGraph, rows: np.ndarray, edges: np.ndarray, count: int, join_m: float) -> np.ndarray:
+    """Pairs (n, 2) of regions of different pieces, smaller first, where the free space of these pieces is nearest.
+
+    `rows` (place,) is the region of each place, of `count`; `edges` (contact, 2) join regions that a way leads
+    between. Pieces whose nearest spheres are more than `join_m` apart are not joined.
+    """
+    piece = numbered(np.zeros(count, np.int64), edges)
+    if not piece.any():
+        return np.zeros((0, 2), np.int64)
+    of_place = piece[rows]
+    members = sorted((np.flatnonzero(of_place == one) for one in np.unique(of_place).tolist()), key=len)
+    trees = [cKDTree(graph.positions_m[one]) for one in members]
+    pairs = []
+    for number, small in enumerate(members):
+        for tree, large in zip(trees[number + 1 :], members[number + 1 :], strict=True):
+            nearest = _nearest(graph, small, large, tree, join_m)
+            if nearest is not None:
+                pairs.append(sorted((int(rows[nearest[0]]), int(rows[nearest[1]]))))
+    return np.array(sorted(pairs), np.int64).reshape(-1, 2)
+
+
+def _nearest(
+    graph: ReceivedGraph, small: np.ndarray, large: np.ndarray, tree: cKDTree, join_m: float
+) -> tuple[int, int] | None:
+    """The places of two pieces whose spheres are nearest, unless these are more than `join_m` apart."""
+    points_m, radii_m = graph.positions_m, graph.radii_m
+    reach_m = float(radii_m[small].max() + radii_m[large].max()) + join_m
+    low_m, high_m = tree.mins - reach_m, tree.maxes + reach_m
+    small = small[((points_m[small] >= low_m) & (points_m[small] <= high_m)).all(axis=1)]
+    if not len(small):
+        return None
+    k = min(NEAREST, len(large))
+    apart_m, at = tree.query(points_m[small], k=[*range(1, k + 1)], distance_upper_bound=reach_m)
+    found = large[np.minimum(at, len(large) - 1)]
+    gaps_m = apart_m - radii_m[small][:, None] - radii_m[found]
+    first, second = np.unravel_index(int(gaps_m.argmin()), gaps_m.shape)
+    if gaps_m[first, second] > join_m:
+        return None
+    return int(small[first]), int(found[first, second])
