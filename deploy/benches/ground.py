@@ -31,6 +31,7 @@ CELL_M = 0.1
 FLAT_M = 0.06  # of the floor: what a depth image shows within is of it
 LOW_M = 0.25  # lower objects are driven over: rugs
 STAIR_M = 0.3  # above and below all floors
+TOP = np.array((0.5, 0.5, 1.0))  # of a voxel
 RANGE_M = 5.0  # farther measurements are not mapped either
 
 
@@ -62,7 +63,7 @@ def measured(path: str, name: WorldName | None, settings: dict[str, Any]) -> dic
     truth = _of_world(world, points_m) if world else _of_sequence(read_objects(Path(path)), points_m)
     state, voxel_m = runner.state, runner.cfg.voxel_m
     pieces = [piece for i, piece in state.graph.pieces.items() if i in state.ledger.places]
-    tops_m = [(piece.voxels + (0.5, 0.5, 1.0)) * voxel_m for piece in pieces]
+    tops_m = [(piece.voxels + TOP) * voxel_m for piece in pieces]
     tree = cKDTree(truth.every_m)
     true = [tree.query(top_m, p=np.inf)[0] <= max(NEAR_M, 0.75 * voxel_m) for top_m in tops_m]
     covered = cKDTree(np.concatenate(tops_m)).query(truth.seen_m, p=np.inf)[0] <= max(NEAR_M, 0.75 * voxel_m)

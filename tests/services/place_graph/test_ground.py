@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from prior_sg.services.place_graph import service
-from prior_sg.services.place_graph.core import ground, publishing
+from prior_sg.services.place_graph.core import ground, publishing, terrain
 from prior_sg.services.place_graph.core.config import Config
 from prior_sg.services.place_graph.core.volume.grid import BLOCK, FREE, OCCUPIED, UNOBSERVED, Block, Box, VoxelGrid
 from prior_sg.services.runtime.service import Identity
@@ -24,7 +24,7 @@ def hall(width: int = 48, depth: int = 48, floor: int = 3, height: int = 32) -> 
 
 
 def ground_of(label: np.ndarray) -> np.ndarray:
-    return ground.ground_voxels(label, RULES.clearance, RULES.step, RULES.slope)
+    return terrain.ground_voxels(label, RULES.clearance, RULES.step, RULES.slope)
 
 
 def test_ground_needs_free_height_and_gentle_slopes():
@@ -46,7 +46,7 @@ def test_parts_are_joined_by_small_steps_only():
     label[24:36, :, 4:6] = OCCUPIED  # a step of 2
     label[36:, :, 4:12] = OCCUPIED  # a step of 6
     found = ground_of(label) | (label == OCCUPIED) & (np.roll(label, -1, axis=2) == FREE)
-    parts, count = ground.connected(found, RULES.step)
+    parts, count = terrain.connected(found, RULES.step)
     assert count == 2
     assert parts[5, 5, 3] == parts[30, 5, 5] != parts[40, 5, 11]
 
