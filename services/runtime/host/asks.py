@@ -4,7 +4,6 @@ import asyncio
 import logging
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 from prior_sg.schemas.codec import Message, encode
@@ -31,11 +30,14 @@ async def answer_to(bus: Bus, key: str, request: bytes, timeout_s: float) -> Ans
     loop = asyncio.get_running_loop()
     answered: asyncio.Future[Answer] = loop.create_future()
 
-    def receive(answer: Answer) -> None:
+    def settle(answer: Answer) -> None:
         if not answered.done():
             answered.set_result(answer)
 
-    await asyncio.to_thread(bus.call, key, request, timeout_s, partial(loop.call_soon_threadsafe, receive))
+    def receive(answer: Answer) -> None:
+        loop.call_soon_threadsafe(settle, answer)
+
+    await asyncio.to_thread(bus.call, key, request, timeout_s, receive)
     return await answered
 
 
