@@ -142,6 +142,8 @@ class Voyage:
                 if not differs or late_s > LATE_S:
                     break
                 time.sleep(0.5)
+            if differs:
+                (self.system.folder / f"unequal-{number}.msgpack").write_bytes(encode(scene))
             problems += [*differs, *self.watch.lost()[:3]]
             self._before = point, scene
         except (TimeoutError, BusError) as error:
