@@ -138,7 +138,7 @@ def main() -> int:
     mode = ModeNow(mode_file(folder, service))
     if (file := mode().faketime) and "LD_PRELOAD" not in os.environ:
         told = {"LD_PRELOAD": LIBRARY, "FAKETIME_TIMESTAMP_FILE": file, "FAKETIME_CACHE_DURATION": "1"}
-        clock = {"FAKETIME_DONT_FAKE_MONOTONIC": "1", "DONT_FAKE_MONOTONIC": "1"}
+        clock = {"FAKETIME_DONT_FAKE_MONOTONIC": "1", "DONT_FAKE_MONOTONIC": "1", "NO_FAKE_STAT": "1"}
         os.execve(
             sys.executable, [sys.executable, "-P", "-m", "tests.chaos.serve", *sys.argv[1:]], os.environ | told | clock
         )

@@ -142,6 +142,8 @@ class Voyage:
                 if not differs or late_s > LATE_S:
                     break
                 time.sleep(0.5)
+            if differs:
+                (self.system.folder / f"unequal-{number}.msgpack").write_bytes(encode(scene))
             problems += [*differs, *self.watch.lost()[:3]]
             self._before = point, scene
         except (TimeoutError, BusError) as error:
@@ -200,7 +202,7 @@ class Voyage:
         while len(recovered_s) < len(phase) and time.monotonic() < end_s and not self.system.failed:
             self._flow()
             for plan, (at_s, frames) in tuple(over.items()):
-                if plan not in recovered_s and self.watch.follows(min(frames, self.stream.frames - 1), at_s):
+                if plan not in recovered_s and self._follows(min(frames, self.stream.frames - 1), at_s):
                     recovered_s[plan] = time.monotonic() - at_s
             time.sleep(0.02)
         for thread in threads:
@@ -217,6 +219,11 @@ class Voyage:
             )
             for plan in phase
         ]
+
+    def _follows(self, frame: int, since_s: float) -> bool:
+        """Whether the system has moved on to a frame after a moment; at the stream's end nothing need move."""
+        at_end = self._gate >= self.stream.frames
+        return self.watch.follows(frame, since_s) or (at_end and not self.watch.quiet(self._gate))
 
     _flowed_s = 0.0
 
