@@ -94,7 +94,7 @@ def _mapped(source: Source, settings: dict[str, Any]) -> tuple[Runner, np.ndarra
 
 def _points_m(keyframe: Keyframe, range_m: float) -> np.ndarray:
     depth_m = images.depth_of(keyframe, images.MAX_PRINCIPAL_OFFSET)
-    v, u = (grid[::2, ::2].ravel() for grid in np.indices(depth_m.shape))
+    v, u = np.indices(depth_m.shape)[:, ::2, ::2].reshape(2, -1)
     z = depth_m[v, u]
     k, good = keyframe.intrinsics, (z > 0) & (z < range_m)
     points_camera_m = np.stack(((u - k.cx_px) / k.fx_px * z, (v - k.cy_px) / k.fy_px * z, z), axis=1)[good]
