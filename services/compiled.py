@@ -27,11 +27,17 @@ def compiled(**options: Any) -> Callable[[F], F]:
     What is compiled is kept beside the code, in the user's cache, or in a temporary folder; where none of them can be
     written, every process compiles anew.
     """
-    return lambda function: cast(F, Loop(function, options))
+
+    def decorate(function: F) -> F:
+        return cast(F, Loop(function, options))
+
+    return decorate
 
 
 class Loop:
     """One function to be compiled. Compiled code may call it, too."""
+
+    __name__: str
 
     def __init__(self, function: Callable, options: dict[str, Any]) -> None:
         functools.update_wrapper(self, function)

@@ -109,7 +109,7 @@ def summed(start: Look, looks: list[Look]) -> dict[str, float]:
     whole = [found for found in looks if set(found) >= {*NAMES, COMMAND}]
     if not whole:
         raise RuntimeError("the services never stood together")
-    figures = {}
+    figures: dict[str, float] = {}
     for name in (*NAMES, COMMAND):
         of = [found[name] for found in whole]
         for when, found in {"start": start.get(name), "end": of[-1], "most": max(of)}.items():

@@ -40,6 +40,7 @@ from prior_sg.services.place_graph.core.volume.grid import (
     Box,
     VoxelGrid,
 )
+from prior_sg.services.place_graph.core.volume.tsdf import dilated
 from prior_sg.services.refusals import NotYet
 from prior_sg.services.registry import BY_NAME
 from prior_sg.services.runtime.config import resolve
@@ -365,6 +366,14 @@ def test_diagram_of_two_walls_is_the_plane_between_them():
 
 
 # Map.
+
+
+@pytest.mark.parametrize("shape", [(5, 7, 3), (1, 4, 2)])
+def test_a_mask_grows_by_one_voxel_in_all_directions(shape):
+    mask = np.random.default_rng(0).random(shape) < 0.1
+    before = mask.copy()
+    np.testing.assert_array_equal(dilated(mask), ndimage.maximum_filter(mask, size=3))
+    np.testing.assert_array_equal(mask, before)
 
 
 def test_one_ray_frees_voxels_before_the_surface_and_leaves_those_behind_unobserved():

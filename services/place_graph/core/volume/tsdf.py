@@ -13,7 +13,6 @@ pose turns out wrong leaves nothing behind. (Unless a voxel's weight reached `ma
 from dataclasses import dataclass
 
 import numpy as np
-import scipy
 
 from prior_sg.schemas.frames import Intrinsics
 from prior_sg.services.compiled import compiled
@@ -198,11 +197,22 @@ def contradiction(grid: VoxelGrid, view: View, fusion: Fusion, samples: int = 48
     return float(wrong.sum() / known.sum()) if known.mean() > SHARE_KNOWN else 0.0
 
 
+def dilated(mask: np.ndarray) -> np.ndarray:
+    """The mask (x, y, z) grown by one voxel in all directions, corners included."""
+    for axis in range(mask.ndim):
+        along = np.moveaxis(mask, axis, 0)
+        grown = along.copy()
+        grown[1:] |= along[:-1]
+        grown[:-1] |= along[1:]
+        mask = np.moveaxis(grown, 0, axis)
+    return mask
+
+
 def _seen(grid: VoxelGrid, points_world: np.ndarray, voxel_m: float) -> np.ndarray:
     """What the map holds around each point (n, 3): an obstacle if one is within a voxel, else the point's own label."""
     voxels = np.floor(points_world / voxel_m).astype(np.int64)
     box = Box(voxels.min(axis=0), voxels.max(axis=0) + 1).grown(1)
     label = grid.gather("label", box)
-    near = scipy.ndimage.maximum_filter(label == OCCUPIED, size=3)
+    near = dilated(label == OCCUPIED)
     where = tuple((voxels - box.low).T)
     return np.where(near[where], OCCUPIED, label[where])
