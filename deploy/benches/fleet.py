@@ -12,7 +12,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -36,7 +36,7 @@ RATE_HZ = 1.0  # keyframes of each robot
 SECONDS = 25.0
 START_S = 120.0
 SETTLE_S = 5.0  # for what still comes after the last keyframe
-NAME = "fleet"
+NAME = "merged"
 DELTAS = (PLACE_DELTA, REGION_DELTA, OBJECT_DELTA)
 Step = list[tuple[Topic, Message]]
 
@@ -203,7 +203,7 @@ def _processes(endpoint: str, names: Sequence[str], folder: Path) -> Iterator[di
             ending.callback(_end, started[name])
             if name == "router":
                 _until_open(endpoint)
-        _until_alive(endpoint, {"scene_store", "fleet"})
+        _until_alive(endpoint, started, folder)
         yield {name: psutil.Process(one.pid) for name, one in started.items()}
 
 
@@ -229,11 +229,13 @@ def _until_open(endpoint: str) -> None:
             time.sleep(0.2)
 
 
-def _until_alive(endpoint: str, services: set[str]) -> None:
-    """Wait until these services are on the bus."""
+def _until_alive(endpoint: str, started: Mapping[str, subprocess.Popen], folder: Path) -> None:
+    """Wait until store and bridge are on the bus. Raises BusError where a process ends, or is too slow."""
     end_s = time.monotonic() + START_S
     with BusClient(ZenohBus(endpoint)) as client:
-        while services - set(client.alive().values()):
-            if time.monotonic() > end_s:
-                raise BusError(f"{', '.join(sorted(services))}: not all came up within {START_S:.0f} s")
+        while {"scene_store", "fleet"} - set(client.alive().values()):
+            ended = [name for name, process in started.items() if process.poll() is not None]
+            if ended or time.monotonic() > end_s:
+                said = "".join((folder / f"{name}.log").read_text()[-500:] for name in ended)
+                raise BusError(f"store and bridge did not come up within {START_S:.0f} s {said}")
             time.sleep(0.2)
