@@ -89,7 +89,8 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
     places: Literal["3d", "2d"] = "3d"  # free-space spheres; or ellipses on the ground, for large or unbounded spaces
 
     # Map.
-    voxel_m: float = 0.1  # side of a voxel, of the map and of the Voronoi diagram; Hydra's diagram has 0.2
+    voxel_m: float = 0.1  # side of a voxel of the map
+    field_voxels: int = 1  # voxels of the map along one side of a voxel of distances and diagram: 1, 2 or 4
     truncation_m: float = 0.3  # the signed distance is clipped here, and nothing is fused farther behind a surface
     surface_voxels: float = 0.5  # a voxel whose signed distance is below this many voxels is an obstacle
     min_range_m: float = 0.2  # nearer measurements are the robot itself or noise
@@ -149,7 +150,9 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
     def __post_init__(self) -> None:
         if not 0 < self.voxel_m <= min(self.truncation_m, self.compression_distance_m):
             raise ValueError("voxel_m must be positive and at most truncation_m and compression_distance_m")
-        if not self.max_distance_m / self.voxel_m <= MAX_FIELD_VOXELS:
+        if self.field_voxels not in {1, 2, 4} or self.graph_voxel_m > self.compression_distance_m:
+            raise ValueError("field_voxels must be 1, 2 or 4, and that many voxels at most compression_distance_m")
+        if not self.voxels(self.max_distance_m) <= MAX_FIELD_VOXELS:
             raise ValueError(f"max_distance_m may be at most {MAX_FIELD_VOXELS} voxels")
         if not 0 <= self.min_range_m < self.max_range_m:
             raise ValueError("min_range_m must be at least 0 and below max_range_m")
@@ -158,7 +161,17 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
 
     def voxels(self, length_m: float) -> float:
         """A length in voxels."""
-        return length_m / self.voxel_m
+        return length_m / self.graph_voxel_m
+
+    @property
+    def coarseness(self) -> int:
+        """Voxels of the map along one side of a voxel of the graph; ground is divided in the map itself."""
+        return self.field_voxels if self.places == "3d" else 1
+
+    @property
+    def graph_voxel_m(self) -> float:
+        """Side of a voxel of distances, diagram and graph."""
+        return self.voxel_m * self.coarseness
 
     @property
     def fusion(self) -> tsdf.Fusion:
@@ -217,7 +230,7 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
             slope=self.surface_max_slope,
             piece=self.voxels(self.pure_final_place_size_m),
             points=self.min_final_place_points,
-            cluster=round(self.min_cluster_area_m2 / self.voxel_m**2),
+            cluster=round(self.min_cluster_area_m2 / self.graph_voxel_m**2),
             overlap=self.voxels(self.place_overlap_threshold_m),
             rise=self.voxels(self.place_max_neighbor_z_diff_m),
         )
@@ -230,7 +243,7 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
     @property
     def cell_voxels(self) -> int:
         """Voxels along one side of a compression cell."""
-        return max(1, round(self.compression_distance_m / self.voxel_m))
+        return max(1, round(self.compression_distance_m / self.graph_voxel_m))
 
 
 def preset(name: str, **settings: Any) -> Config:

@@ -29,7 +29,7 @@ def inherit(state: State, cfg: Config) -> None:
         return
     own_ids = sorted(graph.places)
     voxels = np.array([graph.places[i].voxel for i in own_ids], np.float64).reshape(-1, 3)
-    found = matched(legacy, (voxels + 0.5) * cfg.voxel_m, graph.rules.merge * cfg.voxel_m)
+    found = matched(legacy, (voxels + 0.5) * cfg.graph_voxel_m, graph.rules.merge * cfg.graph_voxel_m)
     next_id = max(legacy.next_id, graph.next_id)
     number = {}
     for row, own_id in enumerate(own_ids):
