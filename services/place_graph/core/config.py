@@ -8,7 +8,7 @@ from prior_sg.services.images import MAX_PRINCIPAL_OFFSET
 from prior_sg.services.place_graph.core.ground import GroundRules
 from prior_sg.services.place_graph.core.skeleton.distance import FieldRules
 from prior_sg.services.place_graph.core.skeleton.graph import GraphRules
-from prior_sg.services.place_graph.core.skeleton.places import ExtractionRules
+from prior_sg.services.place_graph.core.skeleton.places import ExtractionRules, Policy
 from prior_sg.services.place_graph.core.trajectory import Bounds
 from prior_sg.services.place_graph.core.volume import tsdf
 
@@ -37,6 +37,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "jump_slack_m": 3.0,
     },
     "hydra": {
+        "merge_policy": "basis_points",
         "voxel_m": 0.2,
         "max_distance_m": 2.0,
         "min_diff_m": 0.001,
@@ -50,6 +51,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "add_freespace_edges": False,
     },
     "habitat": {
+        "merge_policy": "basis_points",
         "voxel_m": 0.2,
         "max_distance_m": 4.5,
         "min_diff_m": 0.1,
@@ -67,6 +69,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "add_freespace_edges": False,
     },
     "clio": {
+        "merge_policy": "basis_points",
         "truncation_m": 0.25,
         "min_diff_m": 0.1,
         "voronoi_min_distance_m": 0.4,
@@ -115,8 +118,10 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
     compression_distance_m: float = 1.0  # side of the cells that become one place each
     min_node_distance_m: float = 0.4  # smallest radius of a place
     min_edge_distance_m: float = 0.2  # smallest clearance of an edge between touching places
-    node_merge_distance_m: float = 0.5  # touching places nearer than this become one ...
-    merge_policy: Literal["basis_points", "distance"] = "basis_points"  # ... the one with more of these
+    node_merge_distance_m: float = 0.5  # touching places nearer than this become one
+    # Where in its cell a place stands and which of two it becomes: the middle of the cell's part of the diagram, of the
+    # larger part; or Hydra's voxel with most basis points, or of the greatest distance.
+    merge_policy: Policy = "middle"
     add_overlap_edges: bool = False  # join spheres that overlap
     overlap_num_neighbors_to_check: int = 4  # nearest places looked at
     overlap_min_clearance_m: float = 0.4  # smallest radius of the lens two spheres share
@@ -203,7 +208,7 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
             cell=self.cell_voxels,
             min_radius=self.voxels(self.min_node_distance_m),
             merge=self.voxels(self.node_merge_distance_m),
-            widest=self.merge_policy == "distance",
+            policy=self.merge_policy,
         )
 
     @property

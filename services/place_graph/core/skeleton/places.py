@@ -1,7 +1,11 @@
-"""From GVD voxels to places: compression cells, representatives, merging (Hydra, `graph_extractor`; pure)."""
+"""From GVD voxels to places: compression cells, representatives, merging (Hydra, `graph_extractor`; pure).
+
+Hydra's representative is the voxel with most basis points, a count that changes with every shift of the grid. The
+voxel in the middle of its group stays: a group that wins or loses a voxel at its edge has nearly the same middle.
+"""
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -9,12 +13,16 @@ from prior_sg.services.compiled import compiled
 from prior_sg.services.place_graph.core.skeleton.distance import STEPS
 from prior_sg.services.place_graph.core.volume.grid import Box, VoxelGrid
 
+SHIFT_UNITS = 16
+Policy = Literal["middle", "basis_points", "distance"]
+
 
 @dataclass(frozen=True)
 class Extraction:
     """Places of one box, in the order of their voxels. A group is a connected set of GVD voxels in one cell."""
 
     voxels: np.ndarray  # (place, 3) int64, world voxel index of the representative
+    shifts: np.ndarray  # (place, 3) int64, from the centre of that voxel to the place, SHIFT_UNITS to a voxel
     d2: np.ndarray  # (place,) int64, squared voxels to the nearest obstacle
     basis: np.ndarray  # (place,) int64
     touching: np.ndarray  # (pair, 2) int64, places whose voxels touch, smaller first, sorted
@@ -44,7 +52,9 @@ class ExtractionRules(NamedTuple):
     cell: int  # side of a compression cell
     min_radius: float  # smallest radius of a place
     merge: float  # touching places nearer than this are one ...
-    widest: bool = False  # ... the widest, instead of the one with most basis points
+    # ... that of the larger group. And a group's place is its middle; or, as in Hydra, the voxel with most basis points
+    # or the widest, which absorbs as well.
+    policy: Policy = "middle"
 
 
 def extract(grid: VoxelGrid, box: Box, rules: ExtractionRules) -> Extraction:
@@ -54,17 +64,27 @@ def extract(grid: VoxelGrid, box: Box, rules: ExtractionRules) -> Extraction:
     members = _member_voxels(basis, d2, rules.min_radius**2)
     labels = np.full(basis.shape, -1, np.int32)
     groups = _grow_groups(members, labels, box.low, rules.cell)
-    local, group_d2, group_basis = _representatives(members, labels, d2, basis, groups)
+    sizes = np.bincount(labels[tuple(members.T)], minlength=groups)
+    if rules.policy == "middle":
+        chosen, shifts = _middles(members, labels, sizes)
+    else:
+        chosen, shifts = _bests(members, labels, d2, basis, groups), np.zeros((groups, 3), np.int64)
+    local = members[chosen]
+    group_d2, group_basis = d2[tuple(local.T)].astype(np.int64), basis[tuple(local.T)].astype(np.int64)
+    ranks = {
+        "middle": (sizes, group_d2),
+        "basis_points": (group_basis, group_d2),
+        "distance": (group_d2, group_basis),
+    }
     pairs = _unique_pairs(_touching(members, labels))
-    first, second = (group_d2, group_basis) if rules.widest else (group_basis, group_d2)
-    root = _merge(local, first, second, pairs, rules.merge**2)
+    root = _merge(local, *ranks[rules.policy], pairs, rules.merge**2)
     kept = np.flatnonzero(root == np.arange(groups))
     index = np.full(groups, -1, np.int64)
     index[kept] = np.arange(len(kept))
     place_of = index[root] if groups else index
     labels[tuple(members.T)] = place_of[labels[tuple(members.T)]]
     touching = _unique_pairs(place_of[pairs])
-    return Extraction(local[kept] + box.low, group_d2[kept], group_basis[kept], touching, labels, box)
+    return Extraction(local[kept] + box.low, shifts[kept], group_d2[kept], group_basis[kept], touching, labels, box)
 
 
 def _member_voxels(basis: np.ndarray, d2: np.ndarray, min_d2: float) -> np.ndarray:
@@ -111,15 +131,27 @@ def _grow_groups(members, labels, low, cell_voxels):  # noqa: ANN001, ANN202
     return groups
 
 
-def _representatives(
-    members: np.ndarray, labels: np.ndarray, d2: np.ndarray, basis: np.ndarray, groups: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Per group the voxel with most basis points, then the widest, then the first: voxel, squared distance, basis."""
+def _bests(members: np.ndarray, labels: np.ndarray, d2: np.ndarray, basis: np.ndarray, groups: int) -> np.ndarray:
+    """Per group the index (groups,) of the member with most basis points, then the widest, then the first."""
     where = tuple(members.T)
-    member_d2, member_basis, group = d2[where].astype(np.int64), basis[where].astype(np.int64), labels[where]
-    order = np.lexsort((np.arange(len(members)), -member_d2, -member_basis, group))
-    first = order[np.searchsorted(group[order], np.arange(groups))]
-    return members[first], member_d2[first], member_basis[first]
+    group = labels[where]
+    order = np.lexsort((np.arange(len(members)), -d2[where].astype(np.int64), -basis[where].astype(np.int64), group))
+    return np.asarray(order[np.searchsorted(group[order], np.arange(groups))])
+
+
+def _middles(members: np.ndarray, labels: np.ndarray, sizes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Per group the index (groups,) of the member nearest to the mean of all, and where in its voxel that mean lies.
+
+    The second (groups, 3) is at most half a voxel on each axis, in SHIFT_UNITS. In whole numbers, hence exact.
+    """
+    group = labels[tuple(members.T)]
+    sums = np.zeros((len(sizes), 3), np.int64)
+    np.add.at(sums, group, members)
+    apart2 = ((members * sizes[group, None] - sums[group]) ** 2).sum(axis=1)
+    order = np.lexsort((np.arange(len(members)), apart2, group))
+    chosen = order[np.searchsorted(group[order], np.arange(len(sizes)))]
+    shifts = (sums - members[chosen] * sizes[:, None]) * SHIFT_UNITS // np.maximum(sizes, 1)[:, None]
+    return chosen, np.clip(shifts, -SHIFT_UNITS // 2, SHIFT_UNITS // 2)
 
 
 @compiled()

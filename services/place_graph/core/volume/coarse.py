@@ -17,7 +17,7 @@ def renew_labels(fine: VoxelGrid, coarse: VoxelGrid, changed: np.ndarray, scale:
     """
     found: list[np.ndarray] = []
     listed = np.empty(((BLOCK // scale) ** 3, 3), np.int64)
-    for x, y, z in np.unique(np.floor_divide(changed, BLOCK), axis=0).tolist():
+    for x, y, z in _blocks_of(changed):
         label = fine.gather("label", Box(np.array((x, y, z)) * BLOCK, np.array((x + 1, y + 1, z + 1)) * BLOCK))
         key = (x // scale, y // scale, z // scale)
         block = coarse.block(key)
@@ -31,9 +31,13 @@ def renew_labels(fine: VoxelGrid, coarse: VoxelGrid, changed: np.ndarray, scale:
     return np.concatenate(found) if found else np.empty((0, 3), np.int64)
 
 
-def coarse_box(fine: Box, scale: int) -> Box:
-    """Coarse voxels that meet a box of fine ones."""
-    return Box(fine.low // scale, -(-fine.high // scale))
+def _blocks_of(voxels: np.ndarray) -> list[list[int]]:
+    """Blocks that hold the voxels (n, 3), once each, ascending; voxels come block by block."""
+    keys = voxels // BLOCK
+    first = np.ones(len(keys), np.bool_)
+    first[1:] = (keys[1:] != keys[:-1]).any(axis=1)
+    found: list[list[int]] = np.unique(keys[first], axis=0).tolist()
+    return found
 
 
 @compiled()

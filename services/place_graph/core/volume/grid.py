@@ -101,7 +101,7 @@ class VoxelGrid:
 
     def block(self, key: BlockKey) -> Block | None:
         """A block, opened if it was compressed; None if there is none."""
-        data = self._packed.pop(key, None)
+        data = self._packed.pop(key, None) if self._packed else None
         if data is not None:
             self.packed_bytes -= len(data)
             self.blocks[key] = self._opened(data)
