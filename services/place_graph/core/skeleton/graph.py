@@ -17,7 +17,7 @@ class Place(NamedTuple):
     """One place: the voxel at its centre, squared distance (voxels) to the nearest obstacle, basis points."""
 
     voxel: Voxel
-    d2: int
+    d2: float
     basis: int
     shift: Voxel = (0, 0, 0)  # from the voxel's centre to the place's, SHIFT_UNITS to a voxel
 
@@ -147,7 +147,7 @@ class PlaceGraph:
                 id_of[index], self._next_id = self._next_id, self._next_id + 1
             x, y, z = extraction.voxels[index].tolist()
             i, j, k = extraction.shifts[index].tolist()
-            place = Place((x, y, z), int(extraction.d2[index]), int(extraction.basis[index]), (i, j, k))
+            place = Place((x, y, z), float(extraction.d2[index]), int(extraction.basis[index]), (i, j, k))
             if self.places.get(id_of[index]) != place:
                 changes.touched.add(id_of[index])
                 self._put(id_of[index], place)

@@ -11,7 +11,7 @@ import numpy as np
 
 from prior_sg.services.compiled import compiled
 from prior_sg.services.place_graph.core.skeleton.distance import STEPS
-from prior_sg.services.place_graph.core.volume.grid import Box, VoxelGrid
+from prior_sg.services.place_graph.core.volume.grid import FAR_D2, UNKNOWN_D2, Box, VoxelGrid
 
 SHIFT_UNITS = 16
 Policy = Literal["middle", "basis_points", "distance"]
@@ -23,7 +23,7 @@ class Extraction:
 
     voxels: np.ndarray  # (place, 3) int64, world voxel index of the representative
     shifts: np.ndarray  # (place, 3) int64, from the centre of that voxel to the place, SHIFT_UNITS to a voxel
-    d2: np.ndarray  # (place,) int64, squared voxels to the nearest obstacle
+    d2: np.ndarray  # (place,) float64, squared voxels to the nearest obstacle, exact
     basis: np.ndarray  # (place,) int64
     touching: np.ndarray  # (pair, 2) int64, places whose voxels touch, smaller first, sorted
     members: np.ndarray  # window of int32: place index of a member voxel, -1 elsewhere
@@ -60,7 +60,7 @@ class ExtractionRules(NamedTuple):
 def extract(grid: VoxelGrid, box: Box, rules: ExtractionRules) -> Extraction:
     """Places of all cells inside `box`, which must consist of whole cells; the grid's GVD must be up to date."""
     basis = grid.gather("basis", box)
-    d2 = grid.gather("d2", box)
+    d2 = grid.gather("d2", box, UNKNOWN_D2)
     members = _member_voxels(basis, d2, rules.min_radius**2)
     labels = np.full(basis.shape, -1, np.int32)
     groups = _grow_groups(members, labels, box.low, rules.cell)
@@ -84,7 +84,11 @@ def extract(grid: VoxelGrid, box: Box, rules: ExtractionRules) -> Extraction:
     place_of = index[root] if groups else index
     labels[tuple(members.T)] = place_of[labels[tuple(members.T)]]
     touching = _unique_pairs(place_of[pairs])
-    return Extraction(local[kept] + box.low, shifts[kept], group_d2[kept], group_basis[kept], touching, labels, box)
+    local, shifts = local[kept], shifts[kept]
+    clear_d2 = _clearances(d2, grid.gather("offset", box), local, shifts)
+    narrow = clear_d2 < rules.min_radius**2  # between voxels it may be: such a place stays on its voxel
+    shifts[narrow], clear_d2[narrow] = 0, group_d2[kept][narrow]
+    return Extraction(local + box.low, shifts, clear_d2, group_basis[kept], touching, labels, box)
 
 
 def _member_voxels(basis: np.ndarray, d2: np.ndarray, min_d2: float) -> np.ndarray:
@@ -152,6 +156,31 @@ def _middles(members: np.ndarray, labels: np.ndarray, sizes: np.ndarray) -> tupl
     chosen = order[np.searchsorted(group[order], np.arange(len(sizes)))]
     shifts = (sums - members[chosen] * sizes[:, None]) * SHIFT_UNITS // np.maximum(sizes, 1)[:, None]
     return chosen, np.clip(shifts, -SHIFT_UNITS // 2, SHIFT_UNITS // 2)
+
+
+@compiled()
+def _clearances(d2, offset, voxels, shifts):  # noqa: ANN001, ANN202
+    """Squared distance (place,) in voxels from each place, off its voxel (n, 3) by its shift, to the nearest obstacle.
+
+    Of the obstacles that its voxel and the neighbours of it are nearest to.
+    """
+    found = np.empty(len(voxels), np.float64)
+    for n in range(len(voxels)):
+        best = np.int64(1 << 40)
+        for dx in (-1, 0, 1):
+            for dy in (-1, 0, 1):
+                for dz in (-1, 0, 1):
+                    a, b, c = voxels[n, 0] + dx, voxels[n, 1] + dy, voxels[n, 2] + dz
+                    if a < 0 or b < 0 or c < 0 or a >= d2.shape[0] or b >= d2.shape[1] or c >= d2.shape[2]:
+                        continue
+                    if d2[a, b, c] < 0 or d2[a, b, c] == FAR_D2:
+                        continue
+                    x = (np.int64(offset[a, b, c, 0]) - dx) * SHIFT_UNITS + shifts[n, 0]
+                    y = (np.int64(offset[a, b, c, 1]) - dy) * SHIFT_UNITS + shifts[n, 1]
+                    z = (np.int64(offset[a, b, c, 2]) - dz) * SHIFT_UNITS + shifts[n, 2]
+                    best = min(best, x * x + y * y + z * z)
+        found[n] = best / SHIFT_UNITS**2
+    return found
 
 
 @compiled()
