@@ -58,6 +58,11 @@ class State:
     origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of the world, as the newest keyframe says
 
     @property
+    def map_bytes(self) -> int:
+        """Memory of all voxels."""
+        return self.grid.size_bytes + (self.field.size_bytes if self.field is not self.grid else 0)
+
+    @property
     def silent(self) -> bool:
         """Whether readers keep what they have."""
         return self.stands_by or self.incomplete
