@@ -149,12 +149,13 @@ class VoxelGrid:
     def forget(self, box: Box) -> None:
         """Nothing inside `box` was ever observed; blocks that hold nothing else are gone."""
         for name in self.names:
-            self.scatter(name, box, np.broadcast_to(getattr(_EMPTY, name)[0, 0, 0], (*box.shape, *getattr(_EMPTY, name).shape[3:])))
+            sample = getattr(_EMPTY, name)
+            self.scatter(name, box, np.full((*box.shape, *sample.shape[3:]), sample[0, 0, 0], sample.dtype))
         low, high = box.low // BLOCK, -(-box.high // BLOCK)
-        for key in np.stack(np.meshgrid(*map(np.arange, low, high), indexing="ij"), axis=-1).reshape(-1, 3).tolist():
-            block = self.block(tuple(key))
+        for x, y, z in np.stack(np.meshgrid(*map(np.arange, low, high), indexing="ij"), axis=-1).reshape(-1, 3).tolist():
+            block = self.block((x, y, z))
             if block is not None and not block.label.any():
-                del self.blocks[tuple(key)]
+                del self.blocks[x, y, z]
 
     def voxels_with(self, label: int) -> np.ndarray:
         """Indices (n, 3) of all voxels with this label, in ascending order."""
