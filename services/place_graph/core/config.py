@@ -18,6 +18,7 @@ MAX_FIELD_VOXELS = 120  # offsets to the nearest obstacle are kept in 8 bits
 # `habitat`, `uhumans2` and `clio` those of its configurations of that name; their diagrams have voxels of 0.2 m.
 PRESETS: dict[str, dict[str, Any]] = {
     "indoor": {},
+    "mixed": {"field_voxels": 2, "merge_policy": "middle"},
     "outdoor": {
         "voxel_m": 0.2,
         "truncation_m": 0.6,
@@ -37,7 +38,6 @@ PRESETS: dict[str, dict[str, Any]] = {
         "jump_slack_m": 3.0,
     },
     "hydra": {
-        "merge_policy": "basis_points",
         "voxel_m": 0.2,
         "max_distance_m": 2.0,
         "min_diff_m": 0.001,
@@ -51,7 +51,6 @@ PRESETS: dict[str, dict[str, Any]] = {
         "add_freespace_edges": False,
     },
     "habitat": {
-        "merge_policy": "basis_points",
         "voxel_m": 0.2,
         "max_distance_m": 4.5,
         "min_diff_m": 0.1,
@@ -69,7 +68,6 @@ PRESETS: dict[str, dict[str, Any]] = {
         "add_freespace_edges": False,
     },
     "clio": {
-        "merge_policy": "basis_points",
         "truncation_m": 0.25,
         "min_diff_m": 0.1,
         "voronoi_min_distance_m": 0.4,
@@ -88,7 +86,7 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
 
     PRESETS: ClassVar[dict[str, dict[str, Any]]] = PRESETS
 
-    preset: Literal["indoor", "outdoor", "hydra", "habitat", "uhumans2", "clio"] = "indoor"  # other settings win
+    preset: Literal["indoor", "mixed", "outdoor", "hydra", "habitat", "uhumans2", "clio"] = "indoor"  # other settings win
     places: Literal["3d", "2d"] = "3d"  # free-space spheres; or ellipses on the ground, for large or unbounded spaces
 
     # Map.
@@ -119,9 +117,9 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
     min_node_distance_m: float = 0.4  # smallest radius of a place
     min_edge_distance_m: float = 0.2  # smallest clearance of an edge between touching places
     node_merge_distance_m: float = 0.5  # touching places nearer than this become one
-    # Where in its cell a place stands and which of two it becomes: the middle of the cell's part of the diagram, of the
-    # larger part; or Hydra's voxel with most basis points, or of the greatest distance.
-    merge_policy: Policy = "middle"
+    # Where in its cell a place stands, and which of two absorbs the other: Hydra's voxel with most basis points, or that
+    # of the greatest distance; or the middle of the cell's part of the diagram, of the larger part.
+    merge_policy: Policy = "basis_points"
     add_overlap_edges: bool = False  # join spheres that overlap
     overlap_num_neighbors_to_check: int = 4  # nearest places looked at
     overlap_min_clearance_m: float = 0.4  # smallest radius of the lens two spheres share

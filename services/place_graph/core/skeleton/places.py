@@ -1,7 +1,7 @@
 """From GVD voxels to places: compression cells, representatives, merging (Hydra, `graph_extractor`; pure).
 
 Hydra's representative is the voxel with most basis points, a count that changes with every shift of the grid. The
-voxel in the middle of its group stays: a group that wins or loses a voxel at its edge has nearly the same middle.
+middle of the group stays: a group that wins or loses a voxel at its edge has nearly the same middle.
 """
 
 from dataclasses import dataclass
@@ -54,7 +54,7 @@ class ExtractionRules(NamedTuple):
     merge: float  # touching places nearer than this are one ...
     # ... that of the larger group. And a group's place is its middle; or, as in Hydra, the voxel with most basis points
     # or the widest, which absorbs as well.
-    policy: Policy = "middle"
+    policy: Policy = "basis_points"
 
 
 def extract(grid: VoxelGrid, box: Box, rules: ExtractionRules) -> Extraction:
@@ -84,10 +84,9 @@ def extract(grid: VoxelGrid, box: Box, rules: ExtractionRules) -> Extraction:
     place_of = index[root] if groups else index
     labels[tuple(members.T)] = place_of[labels[tuple(members.T)]]
     touching = _unique_pairs(place_of[pairs])
-    local, shifts = local[kept], shifts[kept]
-    clear_d2 = _clearances(d2, grid.gather("offset", box), local, shifts)
-    narrow = clear_d2 < rules.min_radius**2  # between voxels it may be: such a place stays on its voxel
-    shifts[narrow], clear_d2[narrow] = 0, group_d2[kept][narrow]
+    local, shifts, clear_d2 = local[kept], shifts[kept], group_d2[kept].astype(np.float64)
+    if shifts.any():
+        _between_voxels(d2, grid.gather("offset", box), local, shifts, clear_d2, rules.min_radius**2)
     return Extraction(local + box.low, shifts, clear_d2, group_basis[kept], touching, labels, box)
 
 
@@ -159,12 +158,11 @@ def _middles(members: np.ndarray, labels: np.ndarray, sizes: np.ndarray) -> tupl
 
 
 @compiled()
-def _clearances(d2, offset, voxels, shifts):  # noqa: ANN001, ANN202
-    """Squared distance (place,) in voxels from each place, off its voxel (n, 3) by its shift, to the nearest obstacle.
+def _between_voxels(d2, offset, voxels, shifts, clear_d2, least_d2):  # noqa: ANN001, ANN202, PLR0917
+    """Set the squared distance (place,) of places off their voxels (n, 3) by `shifts` to the nearest obstacle.
 
-    Of the obstacles that its voxel and the neighbours of it are nearest to.
+    Of the obstacles that a voxel and its neighbours are nearest to. A place with too little room stays on its voxel.
     """
-    found = np.empty(len(voxels), np.float64)
     for n in range(len(voxels)):
         best = np.int64(1 << 40)
         for dx in (-1, 0, 1):
@@ -179,8 +177,10 @@ def _clearances(d2, offset, voxels, shifts):  # noqa: ANN001, ANN202
                     y = (np.int64(offset[a, b, c, 1]) - dy) * SHIFT_UNITS + shifts[n, 1]
                     z = (np.int64(offset[a, b, c, 2]) - dz) * SHIFT_UNITS + shifts[n, 2]
                     best = min(best, x * x + y * y + z * z)
-        found[n] = best / SHIFT_UNITS**2
-    return found
+        if best >= least_d2 * SHIFT_UNITS**2:
+            clear_d2[n] = best / SHIFT_UNITS**2
+        else:
+            shifts[n] = 0
 
 
 @compiled()
