@@ -81,8 +81,8 @@ def measured(walk: Walk, cfg: Config) -> dict[str, float]:
     order = np.random.default_rng(7).permutation(len(walk.keyframes))
     fearless = msgspec.structs.replace(cfg, max_speed_m_s=0.0)  # in another order every pose jumps
     reordered = places_of([walk.keyframes[row] for row in order], fearless)
-    halves = [walk.keyframes[::2], walk.keyframes[1::2]]
-    one, other = (places_of(each, cfg) for each in ((walk.keyframes, walk.other) if walk.other else halves))
+    one = maps[0] if walk.other else places_of(walk.keyframes[::2], cfg)
+    other = places_of(walk.other or walk.keyframes[1::2], cfg)
     return {
         "keyframes": float(len(walk.keyframes)),
         "places": float(np.mean([len(each.radii_m) for each in maps])),

@@ -86,7 +86,8 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
 
     PRESETS: ClassVar[dict[str, dict[str, Any]]] = PRESETS
 
-    preset: Literal["indoor", "mixed", "outdoor", "hydra", "habitat", "uhumans2", "clio"] = "indoor"  # other settings win
+    # Other settings win.
+    preset: Literal["indoor", "mixed", "outdoor", "hydra", "habitat", "uhumans2", "clio"] = "indoor"
     places: Literal["3d", "2d"] = "3d"  # free-space spheres; or ellipses on the ground, for large or unbounded spaces
 
     # Map.
@@ -117,8 +118,8 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
     min_node_distance_m: float = 0.4  # smallest radius of a place
     min_edge_distance_m: float = 0.2  # smallest clearance of an edge between touching places
     node_merge_distance_m: float = 0.5  # touching places nearer than this become one
-    # Where in its cell a place stands, and which of two absorbs the other: Hydra's voxel with most basis points, or that
-    # of the greatest distance; or the middle of the cell's part of the diagram, of the larger part.
+    # Where in its cell a place stands, and which of two absorbs the other: Hydra's voxel with most basis points, or
+    # that of the greatest distance; or the middle of the cell's part of the diagram, of the larger part.
     merge_policy: Policy = "basis_points"
     add_overlap_edges: bool = False  # join spheres that overlap
     overlap_num_neighbors_to_check: int = 4  # nearest places looked at

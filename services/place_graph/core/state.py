@@ -26,7 +26,8 @@ class Legacy:
     ids: np.ndarray  # (place,)
     positions_m: np.ndarray  # (place, 3)
     next_id: int  # none has had it or a higher one
-    frame_ids: frozenset[int] = dataclasses.field(default_factory=frozenset)  # keyframes in that map, as far as it is told
+    # Keyframes in that map, as far as it is told.
+    frame_ids: frozenset[int] = dataclasses.field(default_factory=frozenset)
 
 
 @dataclass
@@ -42,7 +43,8 @@ class State:
     field: VoxelGrid  # distances and diagram; the same grid, or a coarser one
     ledger: PlaceLedger = dataclasses.field(default_factory=PlaceLedger)
     trajectory: Trajectory = dataclasses.field(default_factory=Trajectory)
-    cameras_m: dict[int, tuple[float, float, float]] = dataclasses.field(default_factory=dict)  # by frame id, of those fused
+    # By frame id, of those fused.
+    cameras_m: dict[int, tuple[float, float, float]] = dataclasses.field(default_factory=dict)
     seen: set[int] = dataclasses.field(default_factory=set)  # frame ids of all keyframes, also the refused
     corrections: PoseCorrections = dataclasses.field(default_factory=PoseCorrections)
     refused: dict[int, str] = dataclasses.field(default_factory=dict)  # why keyframes could not be used, by frame id

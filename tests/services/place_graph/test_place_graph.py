@@ -910,7 +910,8 @@ def test_presets_are_defaults_that_other_settings_change(name):
 
 
 def test_config_refuses_what_cannot_work():
-    for bad in ({"voxel_m": 0.0}, {"voxel_m": 0.5}, {"field_voxels": 3}, {"max_distance_m": 13.0}, {"min_range_m": 6.0}):
+    bads = ({"voxel_m": 0.0}, {"voxel_m": 0.5}, {"field_voxels": 3}, {"max_distance_m": 13.0}, {"min_range_m": 6.0})
+    for bad in bads:
         with pytest.raises(ValueError):
             Config(**bad)
 

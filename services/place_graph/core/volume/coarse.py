@@ -1,7 +1,8 @@
 """Labels of a coarser grid, for distances and the diagram, from those of the map (pure).
 
-A coarse voxel is an obstacle if any of its voxels is one, so that a wall stays a wall wherever the grid lies; it is free
-if at least half of them are; else it was not observed. A block is renewed as a whole, so labels depend on the map only.
+A coarse voxel is an obstacle if any of its voxels is one, so that a wall stays a wall wherever the grid lies; it is
+free if at least half of them are; else it was not observed. A block is renewed as a whole, so labels depend on the map
+only.
 """
 
 import numpy as np

@@ -4,6 +4,7 @@ Blocks lie open near the camera. Those left behind are compressed, and opened ag
 the map does not change by it. When even the compressed blocks exceed the bound, the oldest are dropped for good.
 """
 
+import itertools
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -151,8 +152,8 @@ class VoxelGrid:
         for name in self.names:
             sample = getattr(_EMPTY, name)
             self.scatter(name, box, np.full((*box.shape, *sample.shape[3:]), sample[0, 0, 0], sample.dtype))
-        low, high = box.low // BLOCK, -(-box.high // BLOCK)
-        for x, y, z in np.stack(np.meshgrid(*map(np.arange, low, high), indexing="ij"), axis=-1).reshape(-1, 3).tolist():
+        ends = zip((box.low // BLOCK).tolist(), (-(-box.high // BLOCK)).tolist(), strict=True)
+        for x, y, z in itertools.product(*(range(low, high) for low, high in ends)):
             block = self.block((x, y, z))
             if block is not None and not block.label.any():
                 del self.blocks[x, y, z]
