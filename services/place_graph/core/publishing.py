@@ -43,9 +43,10 @@ def publish(
 
 
 def snapshot(state: State, cfg: Config) -> PlaceDelta:
-    """Everything published so far as one delta, ids ascending, at the last revision."""
+    """Everything published so far as one delta, ids ascending, at the last revision; it follows from all keyframes so
+    far, of which an older one may have come last, from an archive."""
     return place_delta(
-        _heading(state)._replace(snapshot=True),
+        _heading(state)._replace(snapshot=True, frame_id=max(state.seen, default=-1)),
         state.ledger.snapshot(cfg.graph_voxel_m),
         state.openings.snapshot(cfg.graph_voxel_m),
         _shapes(state, state.ledger.places, cfg),

@@ -995,6 +995,7 @@ def test_a_successor_tells_nothing_until_it_has_caught_up_and_then_everything():
     runner.answers[ARCHIVE] = page_of
     [(topic, delta)] = runner.feed(page_of(runner.asks[0].request))
     assert topic is PLACE_DELTA and delta.snapshot and delta.epoch == 2
+    assert delta.frame_id == ROOM_WALK[5].frame_id  # the newest, though an older one came last
     assert sorted(delta.past_frame_ids.tolist()) == [frame.frame_id for frame in ROOM_WALK[:6]]
     assert len(delta.place_ids) >= 0.8 * len(told.places)
     assert len(runner.feed(*ROOM_WALK[6:7])) == 1

@@ -20,6 +20,7 @@ from prior_sg.services.segmenter.core.config import Config
 from prior_sg.services.segmenter.core.experts.context import ObjectView
 from prior_sg.services.segmenter.core.objects import names as naming
 from prior_sg.services.segmenter.core.objects import tracks as objects
+from prior_sg.services.segmenter.core.objects.object_map import ObjectMap
 from prior_sg.services.segmenter.service import SERVICE
 from tests.help.world import CAMERA, DIM, ROBOT, SPACE, look, place_delta, place_grid, prior, task, text
 
@@ -268,6 +269,37 @@ def test_a_renewal_in_slices_with_new_frames_between_equals_one_in_one_go():
     assert not objects.outdated(sliced, SPACE) and sliced.items.keys() == whole.items.keys() == before.keys()
     for number, track in whole.items.items():
         assert (sliced.items[number].cells == track.cells).all() and sliced.items[number].sources == track.sources
+
+
+def late(frames, cfg=CFG):
+    """A map of objects that heard the third of some frames last, and then nothing any more."""
+    objects_of_map = ObjectMap(objects.Tracks(space=SPACE))
+    for frame in [*frames[:2], *frames[3:], frames[2]]:
+        objects_of_map.observe(frame, cfg)
+    return objects_of_map
+
+
+def test_frames_that_came_late_are_put_in_their_place_when_no_more_come():
+    poses = walk(8)
+    # a bed of which the third look alone shows both halves, and a post that only the first saw
+    frames = [
+        sight(i, pose, [BED, OVEN] if i == 2 else [(BED[0], BED[1] - (0, 0.9, 0), 1)]) for i, pose in enumerate(poses)
+    ]
+    straight, crooked = seen(frames), late(frames)
+    order = [sorted(track.sources) for track in crooked.tracks.items.values()]
+    assert crooked.renew(SPACE, False, CFG) and order == [sorted(t.sources) for t in crooked.tracks.items.values()]
+    assert crooked.renew(SPACE, True, CFG)
+    for number, track in straight.items.items():
+        again = crooked.tracks.items[number]
+        assert all((one == other).all() for one, other in zip(track.embeddings, again.embeddings, strict=True))
+        assert (again.cells == track.cells).all() and again.sources == track.sources
+    assert straight.items.keys() == crooked.tracks.items.keys() and not crooked.tracks.disordered
+
+
+def test_what_an_archive_has_lost_is_not_taken_from_the_objects_for_the_sake_of_order():
+    cfg = objects.TrackingConfig(archive_frames=4)
+    crooked = late([sight(i, pose, [BED]) for i, pose in enumerate(walk(8))], cfg)
+    assert crooked.renew(SPACE, True, cfg) and crooked.tracks.items[0].frames == 8
 
 
 def test_corrections_at_every_tick_do_not_keep_the_objects_as_they_were():

@@ -32,7 +32,7 @@ class ObjectMap:
         return (detections.space, detections.detector, detections.frame_id) in self.tracks.archive
 
     def sort(self) -> None:
-        """Associate all detections afresh, in the order of their frames."""
+        """Associate all detections afresh if they did not come in the order of their frames."""
         tracks.in_order(self.tracks)
 
     def outdated(self, space: str) -> bool:
@@ -60,7 +60,10 @@ class ObjectMap:
         self.tracks.changed = True
 
     def renew(self, space: str, rests: bool, cfg: TrackingConfig) -> bool:
-        """Go on with associating afresh where that is due; whether the objects are those of the space."""
+        """Go on with associating afresh where that is due, which for those that came late is when no more come; whether
+        the objects are those of the space."""
+        if rests:
+            tracks.in_order(self.tracks)
         if tracks.outdated(self.tracks, space):
             tracks.renew(self.tracks, space, cfg.renew_frames_at_rest if rests else cfg.renew_frames, cfg)
         return self.tracks.space == space

@@ -111,6 +111,9 @@ class Tracks:
     next_id: int = 0
     merged: list[tuple[int, int]] = field(default_factory=list)  # (gone, into) since they were last told
     moved: bool = False  # a pose in the archive was corrected since `renewal` began
+    newest: tuple[int, str] = (-1, "")  # frame id and detector of what was associated last, in the order of frames
+    disordered: bool = False  # something older than that was associated after it
+    forgetful: bool = False  # detections have left the archive
     renewal: "Renewal | None" = None
     changed: bool = False  # since they were last told
 
@@ -133,6 +136,11 @@ def observe(tracks: Tracks, detections: Detections, cfg: TrackingConfig) -> bool
     tracks.archive[key] = kept = copied(detections)
     if len(tracks.archive) > cfg.archive_frames:
         del tracks.archive[next(iter(tracks.archive))]
+        tracks.forgetful = True
+    if detections.space == (tracks.space if tracks.renewal is None else tracks.renewal.fresh.space):
+        place = (detections.frame_id, detections.detector)
+        tracks.disordered |= place < tracks.newest
+        tracks.newest = max(place, tracks.newest)
     if tracks.renewal is not None and detections.space == tracks.renewal.fresh.space:
         tracks.renewal.waiting.append(key)
     elif detections.space == tracks.space and not tracks.moved:
@@ -157,9 +165,17 @@ def renumber(tracks: Tracks, number: Mapping[int, int], next_id: int) -> None:
 
 
 def in_order(tracks: Tracks) -> None:
-    """Detections came in any order: they are to be associated afresh in that of their frames."""
-    tracks.archive = dict(sorted(tracks.archive.items(), key=lambda kept: kept[0][2]))
-    tracks.moved = True
+    """Detections that came late, or from several workers, are to be associated afresh in the order of their frames:
+    what the objects are does not depend on the way. Not so once some are lost, of which objects would know less."""
+    if tracks.disordered and not tracks.forgetful:
+        tracks.archive = dict(sorted(tracks.archive.items(), key=lambda kept: _place(kept[0])))
+        tracks.moved, tracks.disordered = True, False
+
+
+def _place(key: tuple[str, str, int]) -> tuple[int, str]:
+    """Where a key of the archive stands in the order of frames."""
+    _, detector, frame_id = key
+    return frame_id, detector
 
 
 def outdated(tracks: Tracks, space: str) -> bool:
@@ -168,14 +184,15 @@ def outdated(tracks: Tracks, space: str) -> bool:
 
 
 def renew(tracks: Tracks, space: str, frames: int, cfg: TrackingConfig) -> None:
-    """Associate stored detections of a space afresh, those of at most so many frames at a time, oldest first.
+    """Associate stored detections of a space afresh, in the order of frames, those of at most so many at a time.
 
     With the last of them the objects change over; ids last by the detections that objects share. Poses corrected
     meanwhile begin another renewal afterwards, so that frequent corrections do not keep the objects from changing.
     """
     if tracks.renewal is None or tracks.renewal.fresh.space != space:
-        keys = deque(key for key in tracks.archive if key[0] == space)
-        tracks.renewal, tracks.moved = Renewal(Tracks(space=space, archive=tracks.archive), keys), False
+        keys = sorted((key for key in tracks.archive if key[0] == space), key=_place)
+        tracks.renewal = Renewal(Tracks(space=space, archive=tracks.archive), deque(keys))
+        tracks.newest, tracks.moved, tracks.disordered = _place(keys[-1]) if keys else (-1, ""), False, False
     fresh, waiting = tracks.renewal.fresh, tracks.renewal.waiting
     for _ in range(min(frames, len(waiting))):
         detections = tracks.archive.get(waiting.popleft())
