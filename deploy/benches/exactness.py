@@ -58,7 +58,7 @@ class Walk(NamedTuple):
 
 def exactness_bench(paths: Sequence[Path], presets: Sequence[str]) -> tuple[dict[str, float], dict[str, Any]]:
     """The table of the given recordings and worlds, a row for each and each preset of the place graph."""
-    metrics = {}
+    metrics: dict[str, float] = {}
     for path in paths:
         walk, name = walk_of(path), str(path) if str(path).startswith(WORLD) else path.name
         for preset in presets:
