@@ -4,7 +4,8 @@ import os
 import platform
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 from prior_sg.deploy.benches import features as bench_features
@@ -12,6 +13,7 @@ from prior_sg.deploy.benches import segmenter
 from prior_sg.deploy.benches.bus import bus_bench
 from prior_sg.deploy.benches.crashes import crashes
 from prior_sg.deploy.benches.encoder_swap import encoder_swap
+from prior_sg.deploy.benches.exactness import exactness_bench
 from prior_sg.deploy.benches.footprint import memory_bench, start_bench
 from prior_sg.deploy.benches.kernel import kernel
 from prior_sg.deploy.benches.learning import learning_bench
@@ -194,7 +196,13 @@ LONG: dict[str, Callable[[float], tuple[dict, dict]]] = {  # no part of `all`; t
 }
 
 
-def run(name: str, seconds: float) -> dict[str, Any]:
-    """One measurement as the object that `--json` prints; `seconds` are those of the attacked pool."""
-    metrics, settings = LONG[name](seconds) if name in LONG else BENCHES[name]()
+def run(name: str, seconds: float, paths: Sequence[Path] = (), presets: Sequence[str] = ()) -> dict[str, Any]:
+    """One measurement as the object that `--json` prints; `seconds` are those of the attacked pool.
+
+    With `paths`, `places` is the table of those recordings and worlds, made with these presets of the place graph.
+    """
+    if name == "places" and paths:
+        metrics, settings = exactness_bench(paths, presets)
+    else:
+        metrics, settings = LONG[name](seconds) if name in LONG else BENCHES[name]()
     return {"bench": name, "metrics": metrics, "machine": machine(), "settings": settings}

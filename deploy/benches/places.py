@@ -105,5 +105,5 @@ def _growth(keyframes: list[Keyframe]) -> dict[str, float]:
         "growth_total": float(many.sum() / few.sum()),
         "growth_places_small": float(sizes[0]),
         "growth_places_large": float(sizes[-1]),
-        "map_mb_at_10000": runner.state.grid.size_bytes / 1e6,
+        "map_mb_at_10000": runner.state.map_bytes / 1e6,
     }

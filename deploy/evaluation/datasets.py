@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import cv2
 import numpy as np
@@ -14,6 +14,9 @@ from prior_sg.deploy.truth import GroundTruth, TrueObject, read_objects
 from prior_sg.schemas.priors import Prior
 from prior_sg.services.ingest.core.frames import RawFrame
 from prior_sg.services.ingest.sources import Source, open_source
+
+if TYPE_CHECKING:
+    from prior_sg.deploy.evaluation.worlds.walk import Manner
 
 WORLD = "world:"
 SEQUENCE = "sequence"  # the kind of every dataset that is no world
@@ -109,11 +112,11 @@ def named_worlds(text: str) -> list[WorldName]:
     return [WorldName(kind, seed) for seed in dict.fromkeys(chosen)]
 
 
-def world_source(name: WorldName) -> Source:
+def world_source(name: WorldName, walk: "Manner" = "scanner") -> Source:
     """The frames of a world as a recording of it would have them, with depth and a blank colour image."""
     from prior_sg.deploy.evaluation.worlds import views_of, world_of
 
-    world = world_of(name.kind, name.seed)
+    world = world_of(name.kind, name.seed, walk)
     camera = world.intrinsics
 
     def frames() -> Iterator[RawFrame]:

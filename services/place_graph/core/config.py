@@ -8,7 +8,7 @@ from prior_sg.services.images import MAX_PRINCIPAL_OFFSET
 from prior_sg.services.place_graph.core.ground import GroundRules
 from prior_sg.services.place_graph.core.skeleton.distance import FieldRules
 from prior_sg.services.place_graph.core.skeleton.graph import GraphRules
-from prior_sg.services.place_graph.core.skeleton.places import ExtractionRules
+from prior_sg.services.place_graph.core.skeleton.places import ExtractionRules, Policy
 from prior_sg.services.place_graph.core.trajectory import Bounds
 from prior_sg.services.place_graph.core.volume import tsdf
 
@@ -18,6 +18,7 @@ MAX_FIELD_VOXELS = 120  # offsets to the nearest obstacle are kept in 8 bits
 # `habitat`, `uhumans2` and `clio` those of its configurations of that name; their diagrams have voxels of 0.2 m.
 PRESETS: dict[str, dict[str, Any]] = {
     "indoor": {},
+    "mixed": {"field_voxels": 2, "merge_policy": "middle"},
     "outdoor": {
         "voxel_m": 0.2,
         "truncation_m": 0.6,
@@ -85,11 +86,13 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
 
     PRESETS: ClassVar[dict[str, dict[str, Any]]] = PRESETS
 
-    preset: Literal["indoor", "outdoor", "hydra", "habitat", "uhumans2", "clio"] = "indoor"  # other settings win
+    # Other settings win.
+    preset: Literal["indoor", "mixed", "outdoor", "hydra", "habitat", "uhumans2", "clio"] = "indoor"
     places: Literal["3d", "2d"] = "3d"  # free-space spheres; or ellipses on the ground, for large or unbounded spaces
 
     # Map.
-    voxel_m: float = 0.1  # side of a voxel, of the map and of the Voronoi diagram; Hydra's diagram has 0.2
+    voxel_m: float = 0.1  # side of a voxel of the map
+    field_voxels: int = 1  # voxels of the map along one side of a voxel of distances and diagram: 1, 2 or 4
     truncation_m: float = 0.3  # the signed distance is clipped here, and nothing is fused farther behind a surface
     surface_voxels: float = 0.5  # a voxel whose signed distance is below this many voxels is an obstacle
     min_range_m: float = 0.2  # nearer measurements are the robot itself or noise
@@ -114,8 +117,10 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
     compression_distance_m: float = 1.0  # side of the cells that become one place each
     min_node_distance_m: float = 0.4  # smallest radius of a place
     min_edge_distance_m: float = 0.2  # smallest clearance of an edge between touching places
-    node_merge_distance_m: float = 0.5  # touching places nearer than this become one ...
-    merge_policy: Literal["basis_points", "distance"] = "basis_points"  # ... the one with more of these
+    node_merge_distance_m: float = 0.5  # touching places nearer than this become one
+    # Where in its cell a place stands, and which of two absorbs the other: Hydra's voxel with most basis points, or
+    # that of the greatest distance; or the middle of the cell's part of the diagram, of the larger part.
+    merge_policy: Policy = "basis_points"
     add_overlap_edges: bool = False  # join spheres that overlap
     overlap_num_neighbors_to_check: int = 4  # nearest places looked at
     overlap_min_clearance_m: float = 0.4  # smallest radius of the lens two spheres share
@@ -150,7 +155,9 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
     def __post_init__(self) -> None:
         if not 0 < self.voxel_m <= min(self.truncation_m, self.compression_distance_m):
             raise ValueError("voxel_m must be positive and at most truncation_m and compression_distance_m")
-        if not self.max_distance_m / self.voxel_m <= MAX_FIELD_VOXELS:
+        if self.field_voxels not in {1, 2, 4} or self.graph_voxel_m > self.compression_distance_m:
+            raise ValueError("field_voxels must be 1, 2 or 4, and that many voxels at most compression_distance_m")
+        if not self.voxels(self.max_distance_m) <= MAX_FIELD_VOXELS:
             raise ValueError(f"max_distance_m may be at most {MAX_FIELD_VOXELS} voxels")
         if not 0 <= self.min_range_m < self.max_range_m:
             raise ValueError("min_range_m must be at least 0 and below max_range_m")
@@ -159,7 +166,17 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
 
     def voxels(self, length_m: float) -> float:
         """A length in voxels."""
-        return length_m / self.voxel_m
+        return length_m / self.graph_voxel_m
+
+    @property
+    def coarseness(self) -> int:
+        """Voxels of the map along one side of a voxel of the graph; ground is divided in the map itself."""
+        return self.field_voxels if self.places == "3d" else 1
+
+    @property
+    def graph_voxel_m(self) -> float:
+        """Side of a voxel of distances, diagram and graph."""
+        return self.voxel_m * self.coarseness
 
     @property
     def fusion(self) -> tsdf.Fusion:
@@ -191,7 +208,7 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
             cell=self.cell_voxels,
             min_radius=self.voxels(self.min_node_distance_m),
             merge=self.voxels(self.node_merge_distance_m),
-            widest=self.merge_policy == "distance",
+            policy=self.merge_policy,
         )
 
     @property
@@ -218,7 +235,7 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
             slope=self.surface_max_slope,
             piece=self.voxels(self.pure_final_place_size_m),
             points=self.min_final_place_points,
-            cluster=round(self.min_cluster_area_m2 / self.voxel_m**2),
+            cluster=round(self.min_cluster_area_m2 / self.graph_voxel_m**2),
             overlap=self.voxels(self.place_overlap_threshold_m),
             rise=self.voxels(self.place_max_neighbor_z_diff_m),
             furniture=round(self.furniture_max_area_m2 / self.voxel_m**2),
@@ -232,7 +249,7 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
     @property
     def cell_voxels(self) -> int:
         """Voxels along one side of a compression cell."""
-        return max(1, round(self.compression_distance_m / self.voxel_m))
+        return max(1, round(self.compression_distance_m / self.graph_voxel_m))
 
 
 def preset(name: str, **settings: Any) -> Config:

@@ -58,10 +58,17 @@ def move(state: State, kept: Kept, world_from_camera: np.ndarray, cfg: Config) -
 
 def leave_behind(state: State, keyframe: Keyframe, cfg: Config) -> None:
     """Compress what is far from the camera; where even that must be dropped, its places freeze."""
-    center = keyframe.world_from_camera[:3, 3] / cfg.voxel_m
-    for key in state.grid.leave(center, cfg.voxels(cfg.map_window_max_radius_m), cfg.map_mb * 1e6):
+    center_m, radius_m = keyframe.world_from_camera[:3, 3], cfg.map_window_max_radius_m
+    limit_bytes = cfg.map_mb * 1e6
+    if state.field is not state.grid:
+        state.field.leave(center_m / cfg.graph_voxel_m, cfg.voxels(radius_m), np.inf)
+        limit_bytes -= state.field.size_bytes
+    for key in state.grid.leave(center_m / cfg.voxel_m, radius_m / cfg.voxel_m, limit_bytes):
         low = np.array(key, np.int64) * BLOCK
-        state.graph.freeze(Box(low, low + BLOCK))
+        dropped = Box(low // cfg.coarseness, (low + BLOCK) // cfg.coarseness)
+        state.graph.freeze(dropped)
+        if state.field is not state.grid:
+            state.field.forget(dropped)
 
 
 def _fuse_kept(state: State, keyframe: Keyframe, cfg: Config) -> np.ndarray:

@@ -103,15 +103,15 @@ def _differs(known: Place | None, place: Place, voxel_m: float, min_change_m: fl
     """Whether readers must hear of a place: it is new, or moved or resized by more than the smallest change."""
     if known is None or known.basis != place.basis:
         return True
-    moved = max(abs(a - b) for a, b in zip(known.voxel, place.voxel, strict=True)) * voxel_m
+    moved = max(abs(a - b) for a, b in zip(known.center, place.center, strict=True)) * voxel_m
     return moved > min_change_m or abs(known.d2**0.5 - place.d2**0.5) * voxel_m > min_change_m
 
 
 def _place_columns(places: list[tuple[int, Place]], voxel_m: float) -> PlaceColumns:
-    voxels = np.array([p.voxel for _, p in places], np.float64).reshape(-1, 3)
+    centers = np.array([p.center for _, p in places], np.float64).reshape(-1, 3)
     return PlaceColumns(
         place_ids=np.array([i for i, _ in places], np.int64),
-        positions_m=((voxels + 0.5) * voxel_m).astype(np.float32),
+        positions_m=(centers * voxel_m).astype(np.float32),
         radii_m=(np.sqrt([float(p.d2) for _, p in places]) * voxel_m).astype(np.float32),
         basis_points=np.array([p.basis for _, p in places], np.int16),
     )

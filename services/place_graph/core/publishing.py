@@ -28,10 +28,10 @@ def publish(
     `camera_m` is the camera of the keyframe that caused it, `moved_ids` are keyframes whose cameras an update moved.
     """
     state.revision += 1
-    graph = state.ledger.update(state.graph, changes, cfg.voxel_m, cfg.min_component_size, cfg.min_diff_m)
+    graph = state.ledger.update(state.graph, changes, cfg.graph_voxel_m, cfg.min_component_size, cfg.min_diff_m)
     shown, told_ids = state.ledger.places, graph.places.place_ids.tolist()
     looked_at = changes.opened.union(told_ids, graph.gone.place_ids)
-    openings = state.openings.update(looked_at, shown, cfg.voxel_m, cfg.frontier_min_area_m2)
+    openings = state.openings.update(looked_at, shown, cfg.graph_voxel_m, cfg.frontier_min_area_m2)
     state.openings.forget(i for i in changes.touched if i not in state.graph.places)
     return place_delta(
         _heading(state)._replace(stamp_ns=stamp_ns, camera_m=camera_m, event=event),
@@ -47,8 +47,8 @@ def snapshot(state: State, cfg: Config) -> PlaceDelta:
     far, of which an older one may have come last, from an archive."""
     return place_delta(
         _heading(state)._replace(snapshot=True, frame_id=max(state.seen, default=-1)),
-        state.ledger.snapshot(cfg.voxel_m),
-        state.openings.snapshot(cfg.voxel_m),
+        state.ledger.snapshot(cfg.graph_voxel_m),
+        state.openings.snapshot(cfg.graph_voxel_m),
         _shapes(state, state.ledger.places, cfg),
         _cameras(state, sorted(state.cameras_m)),
     )
@@ -65,7 +65,7 @@ def _heading(state: State) -> Heading:
 
 
 def _shapes(state: State, ids: Iterable[int], cfg: Config) -> GroundColumns:
-    return state.graph.shapes(ids, cfg.voxel_m) if isinstance(state.graph, GroundGraph) else no_ground()
+    return state.graph.shapes(ids, cfg.graph_voxel_m) if isinstance(state.graph, GroundGraph) else no_ground()
 
 
 def _cameras(state: State, frame_ids: Sequence[int]) -> CameraColumns:

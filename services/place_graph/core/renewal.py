@@ -7,6 +7,7 @@ from prior_sg.services.place_graph.core.ground import GroundGraph
 from prior_sg.services.place_graph.core.skeleton import distance, places
 from prior_sg.services.place_graph.core.skeleton.graph import Changes, PlaceGraph
 from prior_sg.services.place_graph.core.state import State
+from prior_sg.services.place_graph.core.volume import coarse
 from prior_sg.services.place_graph.core.volume.grid import Box, VoxelGrid
 
 TILE_VOXELS = 128  # side of the windows in which far-flung changes are worked off
@@ -14,18 +15,20 @@ TILE_VOXELS = 128  # side of the windows in which far-flung changes are worked o
 
 def renew(state: State, changed: np.ndarray, cfg: Config) -> Changes:
     """Bring distances, places and edges up to date after the labels of the voxels (n, 3) changed."""
+    if state.field is not state.grid:
+        changed = coarse.renew_labels(state.grid, state.field, changed, cfg.coarseness)
     changes, tiles = Changes(), _tiles(changed)
     if isinstance(state.graph, GroundGraph):
         boxes = [Box(tile.min(axis=0), tile.max(axis=0) + 1) for tile in tiles]
         for box in boxes:
             changes.add(state.graph.renew(state.grid, box))
     else:
-        fields = [distance.refresh(state.grid, tile, cfg.field_rules) for tile in tiles]
+        fields = [distance.refresh(state.field, tile, cfg.field_rules) for tile in tiles]
         boxes = [box for box in fields if box is not None]
         for box in boxes:
-            changes.add(_renewed_places(state.grid, state.graph, box, cfg))
+            changes.add(_renewed_places(state.field, state.graph, box, cfg))
     for box in boxes:
-        changes.opened |= state.openings.renew(state.grid, state.graph, box)
+        changes.opened |= state.openings.renew(state.field, state.graph, box)
     return changes
 
 

@@ -1,6 +1,7 @@
 """All that is known of one robot's map (pure)."""
 
-from dataclasses import dataclass, field
+import dataclasses
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -15,7 +16,7 @@ from prior_sg.services.place_graph.core.ledger import PlaceLedger
 from prior_sg.services.place_graph.core.openings import Openings
 from prior_sg.services.place_graph.core.skeleton.graph import PlaceGraph
 from prior_sg.services.place_graph.core.trajectory import Trajectory
-from prior_sg.services.place_graph.core.volume.grid import VoxelGrid
+from prior_sg.services.place_graph.core.volume.grid import DERIVED, FIELDS, MEASURED, VoxelGrid
 
 
 @dataclass
@@ -25,7 +26,8 @@ class Legacy:
     ids: np.ndarray  # (place,)
     positions_m: np.ndarray  # (place, 3)
     next_id: int  # none has had it or a higher one
-    frame_ids: frozenset[int] = field(default_factory=frozenset)  # keyframes in that map, as far as it is told
+    # Keyframes in that map, as far as it is told.
+    frame_ids: frozenset[int] = dataclasses.field(default_factory=frozenset)
 
 
 @dataclass
@@ -37,13 +39,15 @@ class State:
     graph: PlaceGraph
     archive: DepthArchive
     openings: Openings
-    grid: VoxelGrid = field(default_factory=VoxelGrid)
-    ledger: PlaceLedger = field(default_factory=PlaceLedger)
-    trajectory: Trajectory = field(default_factory=Trajectory)
-    cameras_m: dict[int, tuple[float, float, float]] = field(default_factory=dict)  # by frame id, of those fused
-    seen: set[int] = field(default_factory=set)  # frame ids of all keyframes, also the refused
-    corrections: PoseCorrections = field(default_factory=PoseCorrections)
-    refused: dict[int, str] = field(default_factory=dict)  # why keyframes could not be used, by frame id
+    grid: VoxelGrid  # what was measured
+    field: VoxelGrid  # distances and diagram; the same grid, or a coarser one
+    ledger: PlaceLedger = dataclasses.field(default_factory=PlaceLedger)
+    trajectory: Trajectory = dataclasses.field(default_factory=Trajectory)
+    # By frame id, of those fused.
+    cameras_m: dict[int, tuple[float, float, float]] = dataclasses.field(default_factory=dict)
+    seen: set[int] = dataclasses.field(default_factory=set)  # frame ids of all keyframes, also the refused
+    corrections: PoseCorrections = dataclasses.field(default_factory=PoseCorrections)
+    refused: dict[int, str] = dataclasses.field(default_factory=dict)  # why keyframes could not be used, by frame id
     joined_frame_id: int = 0  # first keyframe heard live; earlier ones come from the archive
     behind: bool = False  # earlier keyframes are still to come from the archive: readers keep what they have
     stands_by: bool = False  # another is in charge: nothing is told
@@ -54,6 +58,11 @@ class State:
     stamp_ns: int = 0
     frame_id: int = -1
     origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of the world, as the newest keyframe says
+
+    @property
+    def map_bytes(self) -> int:
+        """Memory of all voxels."""
+        return self.grid.size_bytes + (self.field.size_bytes if self.field is not self.grid else 0)
 
     @property
     def silent(self) -> bool:
@@ -87,4 +96,7 @@ class State:
 def empty(robot: str, epoch: int, cfg: Config) -> State:
     """A map without observations."""
     graph = GroundGraph(cfg.ground_rules) if cfg.places == "2d" else PlaceGraph(cfg.graph_rules)
-    return State(robot, epoch, graph, DepthArchive(cfg.archive_mb * 1e6), Openings(int(1.5 * cfg.cell_voxels)))
+    grid = VoxelGrid(FIELDS if cfg.places == "3d" and cfg.coarseness == 1 else MEASURED)
+    distances = VoxelGrid(DERIVED) if cfg.coarseness > 1 else grid
+    openings = Openings(int(1.5 * cfg.cell_voxels))
+    return State(robot, epoch, graph, DepthArchive(cfg.archive_mb * 1e6), openings, grid, distances)

@@ -28,8 +28,8 @@ def inherit(state: State, cfg: Config) -> None:
     if legacy is None:
         return
     own_ids = sorted(graph.places)
-    voxels = np.array([graph.places[i].voxel for i in own_ids], np.float64).reshape(-1, 3)
-    found = matched(legacy, (voxels + 0.5) * cfg.voxel_m, graph.rules.merge * cfg.voxel_m)
+    centers = np.array([graph.places[i].center for i in own_ids], np.float64).reshape(-1, 3)
+    found = matched(legacy, centers * cfg.graph_voxel_m, graph.rules.merge * cfg.graph_voxel_m)
     next_id = max(legacy.next_id, graph.next_id)
     number = {}
     for row, own_id in enumerate(own_ids):

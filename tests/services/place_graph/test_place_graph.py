@@ -29,10 +29,13 @@ from prior_sg.services.place_graph.core import openings as frontiers
 from prior_sg.services.place_graph.core import state as core
 from prior_sg.services.place_graph.core.config import PRESETS, Config, preset
 from prior_sg.services.place_graph.core.skeleton import distance, links
+from prior_sg.services.place_graph.core.volume import coarse
 from prior_sg.services.place_graph.core.volume.grid import (
     BLOCK,
+    DERIVED,
     FAR_D2,
     FREE,
+    MEASURED,
     OCCUPIED,
     UNKNOWN_D2,
     UNOBSERVED,
@@ -152,8 +155,8 @@ def two_rooms():
     return state, play(state, TWO_ROOMS_WALK)
 
 
-def ask(state: core.State) -> PlaceDelta:
-    return service.SERVICE.answers[PLACE_SNAPSHOT](state, SnapshotRequest(robot="r"), CFG)
+def ask(state: core.State, cfg: Config = CFG) -> PlaceDelta:
+    return service.SERVICE.answers[PLACE_SNAPSHOT](state, SnapshotRequest(robot="r"), cfg)
 
 
 # What a reader of the stream knows, in the order of application that the schema states.
@@ -206,7 +209,7 @@ def canonical(state: core.State) -> tuple[dict, dict]:
     edges = {
         (places[a].voxel, places[b].voxel): c for a, links_ in state.graph.edges.items() for b, c in links_.items()
     }
-    return {p.voxel: (p.d2, p.basis) for p in places.values()}, edges
+    return {p.voxel: p[1:] for p in places.values()}, edges
 
 
 # Distance field.
@@ -568,6 +571,103 @@ def test_openings_do_not_depend_on_the_order_of_keyframes(two_rooms):
     assert by_position(state) == by_position(two_rooms[0])
 
 
+# A field coarser than the map.
+
+
+MIXED = Config(field_voxels=2)
+
+
+def test_a_coarse_voxel_is_an_obstacle_if_any_of_its_voxels_is_and_free_if_half_of_them_are():
+    fine, field = VoxelGrid(MEASURED), VoxelGrid(DERIVED)
+    block = fine.blank()
+    block.label[0:2, 0:2, 0] = FREE  # 4 of 8
+    block.label[2:4, 0:2, 0:2], block.label[3, 1, 1] = FREE, OCCUPIED
+    block.label[4:6, 0, 0], block.label[4, 1, 0] = FREE, FREE  # 3 of 8
+    fine.insert((-1, 0, 1), block)
+    changed = coarse.renew_labels(fine, field, np.array(((-16, 0, 16), (-13, 1, 17))), 2)
+    assert changed.tolist() == [[-8, 0, 8], [-7, 0, 8]]
+    line = Box(np.array((-8, 0, 8)), np.array((-5, 1, 9)))
+    assert field.gather("label", line).ravel().tolist() == [FREE, OCCUPIED, UNOBSERVED]
+    assert not len(coarse.renew_labels(fine, field, np.array(((-16, 0, 16),)), 2))
+
+
+def test_a_coarser_field_after_each_frame_is_that_of_the_finished_map_in_any_order():
+    state, batch, backwards = start(MIXED), start(MIXED), start(msgspec.structs.replace(MIXED, max_speed_m_s=0.0))
+    deltas = play(state, TWO_ROOMS_WALK, MIXED)
+    play(backwards, TWO_ROOMS_WALK[::-1], msgspec.structs.replace(MIXED, max_speed_m_s=0.0))
+    for frame in TWO_ROOMS_WALK:
+        fusing.fuse(batch, frame, images.depth_of(frame, 0.5), MIXED)
+    renewal.renew(batch, observed(batch.grid), MIXED)
+    assert canonical(state) == canonical(batch) == canonical(backwards)
+    near = msgspec.structs.replace(MIXED, map_window_max_radius_m=1.5)
+    compressed = start(near)
+    assert [encode(d) for d in play(compressed, TWO_ROOMS_WALK, near)] == [encode(d) for d in deltas]
+    assert compressed.grid.packed_bytes > 0 and compressed.field.packed_bytes > 0
+
+
+@pytest.mark.parametrize("offset_m", [0.0, 0.03, 0.05, 0.1, 0.13])
+def test_no_radius_of_a_coarser_field_reaches_through_a_wall_wherever_the_grid_lies(offset_m):
+    state = start(MIXED)
+    play(state, shifted(TWO_ROOMS_WALK, offset_m, 0), MIXED)
+    places = ask(state, MIXED)
+    positions = places.positions_m.astype(float) - (offset_m, 0, 0)
+    gap_m = np.maximum(np.maximum(TWO_ROOMS[:, 0] - positions[:, None], positions[:, None] - TWO_ROOMS[:, 1]), 0)
+    truth_m = np.linalg.norm(gap_m, axis=-1).min(axis=1)
+    assert len(truth_m) >= 8 and parts(places) == 1
+    assert np.abs(places.radii_m - truth_m).max() < 2 * MIXED.graph_voxel_m
+    assert (places.radii_m - truth_m).max() < MIXED.graph_voxel_m
+
+
+def test_memory_of_a_coarser_field_is_bounded_and_what_the_map_dropped_is_gone_from_it_too():
+    small = Config(field_voxels=2, map_window_max_radius_m=6.0, map_mb=2.1, max_speed_m_s=0.0)
+    state, sizes = start(small), []
+    for lap in range(6):
+        play(state, shifted(ROOM_WALK, 12.8 * lap, 100 * lap), small)
+        sizes.append(state.map_bytes)
+    assert max(sizes) <= 2.1e6 and state.graph.frozen
+    assert len(state.field.voxels_with(OCCUPIED)) < 6 * len(voxels_of_one_room(small))
+    told = ask(state, small)
+    assert parts(told) == 6
+    play(state, shifted(ROOM_WALK, 0.0, 1000), small)
+    first = {i for i, x in zip(told.place_ids.tolist(), told.positions_m[:, 0].tolist(), strict=True) if x < 6}
+    again = ask(state, small)
+    now = {i for i, x in zip(again.place_ids.tolist(), again.positions_m[:, 0].tolist(), strict=True) if x < 6}
+    assert len(first & now) >= 0.7 * len(now) and not {i for i in now if i in state.graph.frozen}
+
+
+def voxels_of_one_room(cfg: Config) -> np.ndarray:
+    state = start(cfg)
+    play(state, ROOM_WALK, cfg)
+    return state.field.voxels_with(OCCUPIED)
+
+
+def test_a_pose_update_moves_a_coarser_field():
+    state, true = start(MIXED), start(MIXED)
+    play(true, TWO_ROOMS_WALK, MIXED)
+    wrong = [*TWO_ROOMS_WALK[:10], *shifted(TWO_ROOMS_WALK[10:], 0.4, 10)]
+    play(state, wrong, MIXED)
+    ids = np.array([f.frame_id for f in TWO_ROOMS_WALK[10:]])
+    poses = np.stack([f.world_from_camera for f in TWO_ROOMS_WALK[10:]])
+    update = PoseUpdate(robot="r", epoch=1, revision=0, stamp_ns=10**12, frame_ids=ids, world_from_camera=poses)
+    assert canonical(state) != canonical(true)
+    play(state, [update], MIXED)
+    assert canonical(state) == canonical(true)
+
+
+def test_places_in_the_middle_are_found_again_on_a_shifted_grid():
+    shares = {}
+    for policy in ("middle", "basis_points"):
+        cfg = Config(field_voxels=2, merge_policy=policy)
+        maps = []
+        for offset_m in (0.0, 0.06):
+            state = start(cfg)
+            play(state, shifted(TWO_ROOMS_WALK, offset_m, 0), cfg)
+            maps.append(ask(state, cfg).positions_m - np.array((offset_m, 0, 0)))
+        apart_m = np.linalg.norm(maps[0][:, None] - maps[1][None], axis=-1).min(axis=1)
+        shares[policy] = np.mean(apart_m < 0.15)
+    assert shares["middle"] > 0.7 and shares["middle"] > shares["basis_points"] + 0.1
+
+
 # Bounded memory.
 
 
@@ -819,7 +919,8 @@ def test_presets_are_defaults_that_other_settings_change(name):
 
 
 def test_config_refuses_what_cannot_work():
-    for bad in ({"voxel_m": 0.0}, {"voxel_m": 0.5}, {"max_distance_m": 13.0}, {"min_range_m": 6.0}):
+    bads = ({"voxel_m": 0.0}, {"voxel_m": 0.5}, {"field_voxels": 3}, {"max_distance_m": 13.0}, {"min_range_m": 6.0})
+    for bad in bads:
         with pytest.raises(ValueError):
             Config(**bad)
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from prior_sg.services.place_graph.core.skeleton.links import clear_lines, lenses, line_d2, nearest, thinned
-from prior_sg.services.place_graph.core.skeleton.places import Extraction
+from prior_sg.services.place_graph.core.skeleton.places import SHIFT_UNITS, Extraction
 from prior_sg.services.place_graph.core.volume.grid import UNKNOWN_D2, Box, VoxelGrid
 
 Voxel = tuple[int, int, int]
@@ -17,8 +17,15 @@ class Place(NamedTuple):
     """One place: the voxel at its centre, squared distance (voxels) to the nearest obstacle, basis points."""
 
     voxel: Voxel
-    d2: int
+    d2: float
     basis: int
+    shift: Voxel = (0, 0, 0)  # from the voxel's centre to the place's, SHIFT_UNITS to a voxel
+
+    @property
+    def center(self) -> tuple[float, float, float]:
+        """In voxels, from the corner of the first."""
+        x, y, z = (v + 0.5 + s / SHIFT_UNITS for v, s in zip(self.voxel, self.shift, strict=True))
+        return x, y, z
 
 
 @dataclass(frozen=True)
@@ -76,7 +83,7 @@ class PlaceGraph:
         self.edges: dict[int, dict[int, int]] = {}  # id -> neighbour -> squared clearance (voxels)
         self._touching: dict[int, set[int]] = {}  # ids whose GVD voxels touch
         self.frozen: set[int] = set()  # places whose voxels were dropped: they stay as they were until seen again
-        self._by_cell: dict[Voxel, set[int]] = {}
+        self._columns: dict[tuple[int, int], dict[int, set[int]]] = {}  # cell (x, y) -> its z -> ids
         self._next_id = 0
 
     def update(self, grid: VoxelGrid, extraction: Extraction, region: Box, changed: Box) -> Changes:
@@ -106,7 +113,9 @@ class PlaceGraph:
         self.edges = {number[a]: {number[b]: c for b, c in links.items()} for a, links in self.edges.items()}
         self._touching = {number[a]: {number[b] for b in others} for a, others in self._touching.items()}
         self.frozen = {number[i] for i in self.frozen}
-        self._by_cell = {cell: {number[i] for i in ids} for cell, ids in self._by_cell.items()}
+        for column in self._columns.values():
+            for z, ids in column.items():
+                column[z] = {number[i] for i in ids}
         self._next_id = next_id
 
     def freeze(self, box: Box) -> None:
@@ -137,7 +146,8 @@ class PlaceGraph:
             else:
                 id_of[index], self._next_id = self._next_id, self._next_id + 1
             x, y, z = extraction.voxels[index].tolist()
-            place = Place((x, y, z), int(extraction.d2[index]), int(extraction.basis[index]))
+            i, j, k = extraction.shifts[index].tolist()
+            place = Place((x, y, z), float(extraction.d2[index]), int(extraction.basis[index]), (i, j, k))
             if self.places.get(id_of[index]) != place:
                 changes.touched.add(id_of[index])
                 self._put(id_of[index], place)
@@ -246,14 +256,16 @@ class PlaceGraph:
         found: list[int] = []
         for x in range(int(low[0]), int(high[0])):
             for y in range(int(low[1]), int(high[1])):
-                for z in range(int(low[2]), int(high[2])):
-                    found.extend(self._by_cell.get((x, y, z), ()))
+                for z, ids in self._columns.get((x, y), {}).items():
+                    if low[2] <= z < high[2]:
+                        found.extend(ids)
         return sorted(np.array(found, np.int64)[box.contains(self._voxels(found))].tolist())
 
     def _id_at(self, voxel: np.ndarray) -> int | None:
         """The place with exactly this centre."""
         center = (int(voxel[0]), int(voxel[1]), int(voxel[2]))
-        for place_id in self._by_cell.get(self._cell(center), ()):
+        x, y, z = self._cell(center)
+        for place_id in self._columns.get((x, y), {}).get(z, ()):
             if self.places[place_id].voxel == center:
                 return place_id
         return None
@@ -266,7 +278,8 @@ class PlaceGraph:
         if place_id in self.places:
             self._leave_cell(place_id)
         self.places[place_id] = place
-        self._by_cell.setdefault(self._cell(place.voxel), set()).add(place_id)
+        x, y, z = self._cell(place.voxel)
+        self._columns.setdefault((x, y), {}).setdefault(z, set()).add(place_id)
 
     def _drop(self, place_id: int) -> None:
         self._leave_cell(place_id)
@@ -278,10 +291,13 @@ class PlaceGraph:
             self._touching[other].discard(place_id)
 
     def _leave_cell(self, place_id: int) -> None:
-        cell = self._cell(self.places[place_id].voxel)
-        self._by_cell[cell].discard(place_id)
-        if not self._by_cell[cell]:
-            del self._by_cell[cell]
+        x, y, z = self._cell(self.places[place_id].voxel)
+        column = self._columns[x, y]
+        column[z].discard(place_id)
+        if not column[z]:
+            del column[z]
+        if not column:
+            del self._columns[x, y]
 
 
 def _match(

@@ -1,13 +1,20 @@
-"""From GVD voxels to places: compression cells, representatives, merging (Hydra, `graph_extractor`; pure)."""
+"""From GVD voxels to places: compression cells, representatives, merging (Hydra, `graph_extractor`; pure).
+
+Hydra's representative is the voxel with most basis points, a count that changes with every shift of the grid. The
+middle of the group stays: a group that wins or loses a voxel at its edge has nearly the same middle.
+"""
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
 from prior_sg.services.compiled import compiled
 from prior_sg.services.place_graph.core.skeleton.distance import STEPS
-from prior_sg.services.place_graph.core.volume.grid import Box, VoxelGrid
+from prior_sg.services.place_graph.core.volume.grid import FAR_D2, UNKNOWN_D2, Box, VoxelGrid
+
+SHIFT_UNITS = 16
+Policy = Literal["middle", "basis_points", "distance"]
 
 
 @dataclass(frozen=True)
@@ -15,7 +22,8 @@ class Extraction:
     """Places of one box, in the order of their voxels. A group is a connected set of GVD voxels in one cell."""
 
     voxels: np.ndarray  # (place, 3) int64, world voxel index of the representative
-    d2: np.ndarray  # (place,) int64, squared voxels to the nearest obstacle
+    shifts: np.ndarray  # (place, 3) int64, from the centre of that voxel to the place, SHIFT_UNITS to a voxel
+    d2: np.ndarray  # (place,) float64, squared voxels to the nearest obstacle, exact
     basis: np.ndarray  # (place,) int64
     touching: np.ndarray  # (pair, 2) int64, places whose voxels touch, smaller first, sorted
     members: np.ndarray  # window of int32: place index of a member voxel, -1 elsewhere
@@ -44,27 +52,42 @@ class ExtractionRules(NamedTuple):
     cell: int  # side of a compression cell
     min_radius: float  # smallest radius of a place
     merge: float  # touching places nearer than this are one ...
-    widest: bool = False  # ... the widest, instead of the one with most basis points
+    # ... that of the larger group. And a group's place is its middle; or, as in Hydra, the voxel with most basis points
+    # or the widest, which absorbs as well.
+    policy: Policy = "basis_points"
 
 
 def extract(grid: VoxelGrid, box: Box, rules: ExtractionRules) -> Extraction:
     """Places of all cells inside `box`, which must consist of whole cells; the grid's GVD must be up to date."""
     basis = grid.gather("basis", box)
-    d2 = grid.gather("d2", box)
+    d2 = grid.gather("d2", box, UNKNOWN_D2)
     members = _member_voxels(basis, d2, rules.min_radius**2)
     labels = np.full(basis.shape, -1, np.int32)
     groups = _grow_groups(members, labels, box.low, rules.cell)
-    local, group_d2, group_basis = _representatives(members, labels, d2, basis, groups)
+    sizes = np.bincount(labels[tuple(members.T)], minlength=groups)
+    if rules.policy == "middle":
+        chosen, shifts = _middles(members, labels, sizes)
+    else:
+        chosen, shifts = _bests(members, labels, d2, basis, groups), np.zeros((groups, 3), np.int64)
+    local = members[chosen]
+    group_d2, group_basis = d2[tuple(local.T)].astype(np.int64), basis[tuple(local.T)].astype(np.int64)
+    ranks = {
+        "middle": (sizes, group_d2),
+        "basis_points": (group_basis, group_d2),
+        "distance": (group_d2, group_basis),
+    }
     pairs = _unique_pairs(_touching(members, labels))
-    first, second = (group_d2, group_basis) if rules.widest else (group_basis, group_d2)
-    root = _merge(local, first, second, pairs, rules.merge**2)
+    root = _merge(local, *ranks[rules.policy], pairs, rules.merge**2)
     kept = np.flatnonzero(root == np.arange(groups))
     index = np.full(groups, -1, np.int64)
     index[kept] = np.arange(len(kept))
     place_of = index[root] if groups else index
     labels[tuple(members.T)] = place_of[labels[tuple(members.T)]]
     touching = _unique_pairs(place_of[pairs])
-    return Extraction(local[kept] + box.low, group_d2[kept], group_basis[kept], touching, labels, box)
+    local, shifts, clear_d2 = local[kept], shifts[kept], group_d2[kept].astype(np.float64)
+    if shifts.any():
+        _between_voxels(d2, grid.gather("offset", box), local, shifts, clear_d2, rules.min_radius**2)
+    return Extraction(local + box.low, shifts, clear_d2, group_basis[kept], touching, labels, box)
 
 
 def _member_voxels(basis: np.ndarray, d2: np.ndarray, min_d2: float) -> np.ndarray:
@@ -111,15 +134,53 @@ def _grow_groups(members, labels, low, cell_voxels):  # noqa: ANN001, ANN202
     return groups
 
 
-def _representatives(
-    members: np.ndarray, labels: np.ndarray, d2: np.ndarray, basis: np.ndarray, groups: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Per group the voxel with most basis points, then the widest, then the first: voxel, squared distance, basis."""
+def _bests(members: np.ndarray, labels: np.ndarray, d2: np.ndarray, basis: np.ndarray, groups: int) -> np.ndarray:
+    """Per group the index (groups,) of the member with most basis points, then the widest, then the first."""
     where = tuple(members.T)
-    member_d2, member_basis, group = d2[where].astype(np.int64), basis[where].astype(np.int64), labels[where]
-    order = np.lexsort((np.arange(len(members)), -member_d2, -member_basis, group))
-    first = order[np.searchsorted(group[order], np.arange(groups))]
-    return members[first], member_d2[first], member_basis[first]
+    group = labels[where]
+    order = np.lexsort((np.arange(len(members)), -d2[where].astype(np.int64), -basis[where].astype(np.int64), group))
+    return np.asarray(order[np.searchsorted(group[order], np.arange(groups))])
+
+
+def _middles(members: np.ndarray, labels: np.ndarray, sizes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Per group the index (groups,) of the member nearest to the mean of all, and where in its voxel that mean lies.
+
+    The second (groups, 3) is at most half a voxel on each axis, in SHIFT_UNITS. In whole numbers, hence exact.
+    """
+    group = labels[tuple(members.T)]
+    sums = np.zeros((len(sizes), 3), np.int64)
+    np.add.at(sums, group, members)
+    apart2 = ((members * sizes[group, None] - sums[group]) ** 2).sum(axis=1)
+    order = np.lexsort((np.arange(len(members)), apart2, group))
+    chosen = order[np.searchsorted(group[order], np.arange(len(sizes)))]
+    shifts = (sums - members[chosen] * sizes[:, None]) * SHIFT_UNITS // np.maximum(sizes, 1)[:, None]
+    return chosen, np.clip(shifts, -SHIFT_UNITS // 2, SHIFT_UNITS // 2)
+
+
+@compiled()
+def _between_voxels(d2, offset, voxels, shifts, clear_d2, least_d2):  # noqa: ANN001, ANN202, PLR0917
+    """Set the squared distance (place,) of places off their voxels (n, 3) by `shifts` to the nearest obstacle.
+
+    Of the obstacles that a voxel and its neighbours are nearest to. A place with too little room stays on its voxel.
+    """
+    for n in range(len(voxels)):
+        best = np.int64(1 << 40)
+        for dx in (-1, 0, 1):
+            for dy in (-1, 0, 1):
+                for dz in (-1, 0, 1):
+                    a, b, c = voxels[n, 0] + dx, voxels[n, 1] + dy, voxels[n, 2] + dz
+                    if a < 0 or b < 0 or c < 0 or a >= d2.shape[0] or b >= d2.shape[1] or c >= d2.shape[2]:
+                        continue
+                    if d2[a, b, c] < 0 or d2[a, b, c] == FAR_D2:
+                        continue
+                    x = (np.int64(offset[a, b, c, 0]) - dx) * SHIFT_UNITS + shifts[n, 0]
+                    y = (np.int64(offset[a, b, c, 1]) - dy) * SHIFT_UNITS + shifts[n, 1]
+                    z = (np.int64(offset[a, b, c, 2]) - dz) * SHIFT_UNITS + shifts[n, 2]
+                    best = min(best, x * x + y * y + z * z)
+        if best >= least_d2 * SHIFT_UNITS**2:
+            clear_d2[n] = best / SHIFT_UNITS**2
+        else:
+            shifts[n] = 0
 
 
 @compiled()

@@ -4,6 +4,7 @@ Blocks lie open near the camera. Those left behind are compressed, and opened ag
 the map does not change by it. When even the compressed blocks exceed the bound, the oldest are dropped for good.
 """
 
+import itertools
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -60,29 +61,20 @@ class Block:
 
 _EMPTY = Block()
 FIELDS = tuple(_EMPTY.__dataclass_fields__)
-BLOCK_BYTES = sum(getattr(_EMPTY, name).nbytes for name in FIELDS)
+MEASURED = ("sdf", "weight", "label")  # what a grid holds whose distances lie in another one ...
+DERIVED = ("label", "d2", "offset", "basis")  # ... and that other one
+for _name in FIELDS:
+    getattr(_EMPTY, _name).setflags(write=False)
 
 BlockKey = tuple[int, int, int]
 Part = tuple[slice, slice, slice]
 
 
-def _packed(block: Block) -> bytes:
-    return zlib.compress(b"".join(getattr(block, name).tobytes() for name in FIELDS), 1)
-
-
-def _opened(data: bytes) -> Block:
-    raw, start, fields = zlib.decompress(data), 0, {}
-    for name in FIELDS:
-        sample = getattr(_EMPTY, name)
-        fields[name] = np.frombuffer(raw, sample.dtype, sample.size, start).reshape(sample.shape).copy()
-        start += sample.nbytes
-    return Block(**fields)
-
-
 class VoxelGrid:
     """Blocks by index. Voxel i covers [i, i + 1) * voxel_m in the world."""
 
-    def __init__(self) -> None:
+    def __init__(self, names: tuple[str, ...] = FIELDS) -> None:
+        self.names = names  # the fields that it holds; the others stay blank, and cannot be written
         self.blocks: dict[BlockKey, Block] = {}
         self._packed: dict[BlockKey, bytes] = {}  # oldest first
         self.packed_bytes = 0
@@ -97,14 +89,23 @@ class VoxelGrid:
     @property
     def size_bytes(self) -> int:
         """Memory of all voxels, open and compressed."""
-        return len(self.blocks) * BLOCK_BYTES + self.packed_bytes
+        return len(self.blocks) * self.block_bytes + self.packed_bytes
+
+    @property
+    def block_bytes(self) -> int:
+        """Memory of an open block."""
+        return sum(getattr(_EMPTY, name).nbytes for name in self.names)
+
+    def blank(self) -> Block:
+        """A block without observations that is in no grid yet."""
+        return Block(**{name: getattr(_EMPTY, name) for name in FIELDS if name not in self.names})
 
     def block(self, key: BlockKey) -> Block | None:
         """A block, opened if it was compressed; None if there is none."""
-        data = self._packed.pop(key, None)
+        data = self._packed.pop(key, None) if self._packed else None
         if data is not None:
             self.packed_bytes -= len(data)
-            self.blocks[key] = _opened(data)
+            self.blocks[key] = self._opened(data)
         return self.blocks.get(key)
 
     def insert(self, key: BlockKey, block: Block) -> None:
@@ -123,7 +124,7 @@ class VoxelGrid:
         keys = list(self.blocks)
         distances = np.linalg.norm((np.array(keys).reshape(-1, 3) + 0.5) * BLOCK - center, axis=1)
         for index in np.flatnonzero(distances > radius).tolist():
-            data = _packed(self.blocks.pop(keys[index]))
+            data = self._squeezed(self.blocks.pop(keys[index]))
             self._packed[keys[index]] = data
             self.packed_bytes += len(data)
         dropped = []
@@ -146,6 +147,17 @@ class VoxelGrid:
         for block, outer, inner in self._overlaps(box):
             getattr(block, name)[inner] = window[outer]
 
+    def forget(self, box: Box) -> None:
+        """Nothing inside `box` was ever observed; blocks that hold nothing else are gone."""
+        for name in self.names:
+            sample = getattr(_EMPTY, name)
+            self.scatter(name, box, np.full((*box.shape, *sample.shape[3:]), sample[0, 0, 0], sample.dtype))
+        ends = zip((box.low // BLOCK).tolist(), (-(-box.high // BLOCK)).tolist(), strict=True)
+        for x, y, z in itertools.product(*(range(low, high) for low, high in ends)):
+            block = self.block((x, y, z))
+            if block is not None and not block.label.any():
+                del self.blocks[x, y, z]
+
     def voxels_with(self, label: int) -> np.ndarray:
         """Indices (n, 3) of all voxels with this label, in ascending order."""
         parts = [np.argwhere(b.label == label) + np.array(key) * BLOCK for key, b in self._all()]
@@ -156,7 +168,19 @@ class VoxelGrid:
         """Every block; compressed ones stay compressed."""
         yield from self.blocks.items()
         for key, data in self._packed.items():
-            yield key, _opened(data)
+            yield key, self._opened(data)
+
+    def _squeezed(self, block: Block) -> bytes:
+        return zlib.compress(b"".join(getattr(block, name).tobytes() for name in self.names), 1)
+
+    def _opened(self, data: bytes) -> Block:
+        raw, start, block = zlib.decompress(data), 0, self.blank()
+        for name in self.names:
+            sample = getattr(_EMPTY, name)
+            values = np.frombuffer(raw, sample.dtype, sample.size, start).reshape(sample.shape).copy()
+            setattr(block, name, values)
+            start += sample.nbytes
+        return block
 
     def _overlaps(self, box: Box) -> list[tuple[Block, Part, Part]]:
         """Blocks that meet `box`, each with its part of the window and its part of the block."""

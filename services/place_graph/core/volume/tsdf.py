@@ -22,7 +22,6 @@ from prior_sg.services.place_graph.core.volume.grid import (
     FREE,
     OCCUPIED,
     UNOBSERVED,
-    Block,
     BlockKey,
     Box,
     VoxelGrid,
@@ -75,7 +74,7 @@ def integrate(grid: VoxelGrid, view: View, fusion: Fusion, sign: int = ADD) -> n
     lens = np.array((camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px))
     changed: list[np.ndarray] = []
     found = np.empty((BLOCK**3, 3), np.int64)
-    spare = Block()
+    spare = grid.blank()
     for key in visible_blocks(camera, view.world_from_camera, fusion.voxel_m, fusion.max_range_m):
         known = grid.block(key)
         if known is None and sign == REMOVE:
@@ -87,7 +86,7 @@ def integrate(grid: VoxelGrid, view: View, fusion: Fusion, sign: int = ADD) -> n
         )
         if touched and known is None:
             grid.insert(key, spare)
-            spare = Block()
+            spare = grid.blank()
         if count:
             changed.append(found[:count].copy())
     return np.concatenate(changed) if changed else np.empty((0, 3), np.int64)
