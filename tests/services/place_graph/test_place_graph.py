@@ -1066,7 +1066,7 @@ def test_a_successor_says_which_keyframes_it_lacks():
 
 def test_a_successor_of_a_dead_one_needs_no_new_keyframe():
     first = Runner(service.SERVICE, CFG, Identity("r", "p", 1))
-    store = Runner(BY_NAME["scene_store"])
+    store = Runner(BY_NAME["scene_store"], BY_NAME["scene_store"].config(path=":memory:"))
     store.feed(*[delta for _, delta in first.feed(*ROOM_WALK[:6])])
     former = store.answer(SCENE, SceneRequest(robot="r"))
     second = Runner(service.SERVICE, CFG, Identity("r", "q", 2), {ARCHIVE: archive_of(ROOM_WALK[:6]), SCENE: store})
