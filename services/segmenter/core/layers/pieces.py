@@ -5,7 +5,7 @@ Spheres of free space end at walls, so two pieces on both sides of a wall or a s
 """
 
 import numpy as np
-from scipy.spatial import cKDTree
+import scipy
 
 from prior_sg.services.segmenter.core.map.received import ReceivedGraph
 from prior_sg.services.segmenter.core.regions.components import numbered
@@ -24,7 +24,7 @@ def near_regions(graph: ReceivedGraph, rows: np.ndarray, edges: np.ndarray, coun
         return np.zeros((0, 2), np.int64)
     of_place = piece[rows]
     members = sorted((np.flatnonzero(of_place == one) for one in np.unique(of_place).tolist()), key=len)
-    trees = [cKDTree(graph.positions_m[one]) for one in members]
+    trees = [scipy.spatial.cKDTree(graph.positions_m[one]) for one in members]
     pairs = []
     for number, small in enumerate(members):
         for tree, large in zip(trees[number + 1 :], members[number + 1 :], strict=True):
@@ -35,7 +35,7 @@ def near_regions(graph: ReceivedGraph, rows: np.ndarray, edges: np.ndarray, coun
 
 
 def _nearest(
-    graph: ReceivedGraph, small: np.ndarray, large: np.ndarray, tree: cKDTree, join_m: float
+    graph: ReceivedGraph, small: np.ndarray, large: np.ndarray, tree: "scipy.spatial.cKDTree", join_m: float
 ) -> tuple[int, int] | None:
     """The places of two pieces whose spheres are nearest, unless these are more than `join_m` apart."""
     points_m, radii_m = graph.positions_m, graph.radii_m
