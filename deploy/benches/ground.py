@@ -13,13 +13,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
+from prior_sg.deploy.benches.places import keyframes_of
 from prior_sg.deploy.evaluation.datasets import WORLD, WorldName, named_worlds, world_source
 from prior_sg.deploy.evaluation.worlds import World, world_of
 from prior_sg.deploy.evaluation.worlds.ways import ways_of
 from prior_sg.deploy.truth import TrueObject, read_objects
 from prior_sg.schemas.frames import Keyframe
 from prior_sg.services import images
-from prior_sg.services.geometry import transform
+from prior_sg.services.geometry import back_project, transform
 from prior_sg.services.ingest.sources import Source, open_source
 from prior_sg.services.place_graph.core.config import preset
 from prior_sg.services.registry import BY_NAME
@@ -28,6 +29,8 @@ from prior_sg.services.runtime.service import Identity
 
 NEAR_M = 0.15  # of the ground, along each axis
 CELL_M = 0.1
+EVERY_PX = 2  # of the depth images in each direction
+POINT_M = 0.05  # of the points in a cube of this side one is kept
 FLAT_M = 0.06  # of the floor: what a depth image shows within is of it
 LOW_M = 0.25  # lower objects are driven over: rugs
 STAIR_M = 0.3  # above and below all floors
@@ -65,8 +68,9 @@ def measured(path: str, name: WorldName | None, settings: dict[str, Any]) -> dic
     pieces = [piece for i, piece in state.graph.pieces.items() if i in state.ledger.places]
     tops_m = [(piece.voxels + TOP) * voxel_m for piece in pieces]
     tree = cKDTree(truth.every_m)
-    true = [tree.query(top_m, p=np.inf)[0] <= max(NEAR_M, 0.75 * voxel_m) for top_m in tops_m]
-    covered = cKDTree(np.concatenate(tops_m)).query(truth.seen_m, p=np.inf)[0] <= max(NEAR_M, 0.75 * voxel_m)
+    near_m = max(NEAR_M, 0.75 * voxel_m)
+    true = [tree.query(top_m, p=np.inf)[0] <= near_m for top_m in tops_m]
+    covered = cKDTree(np.concatenate(tops_m)).query(truth.seen_m, p=np.inf)[0] <= near_m
     floors_m = np.array([region.z_min_m for region in world.truth.regions] if world else [0.0])
     stairs = (np.abs(truth.seen_m[:, 2:] - floors_m) > STAIR_M).all(axis=1)
     return {
@@ -84,9 +88,7 @@ def _mapped(source: Source, settings: dict[str, Any]) -> tuple[Runner, np.ndarra
     named = {"name": "indoor"} | {"name" if key == "preset" else key: value for key, value in settings.items()}
     config = preset(**named, places="2d")
     runner, shown = Runner(BY_NAME["place_graph"], config, Identity("bench", "b", 1)), []
-    for frame in source:
-        fields = {name: getattr(frame, name) for name in Keyframe.__struct_fields__ if hasattr(frame, name)}
-        keyframe = Keyframe(robot="bench", **fields)
+    for keyframe in keyframes_of(source):
         runner.feed(keyframe)
         shown.append(_points_m(keyframe, max(RANGE_M, config.max_range_m)))
     return runner, np.concatenate(shown)
@@ -94,16 +96,10 @@ def _mapped(source: Source, settings: dict[str, Any]) -> tuple[Runner, np.ndarra
 
 def _points_m(keyframe: Keyframe, range_m: float) -> np.ndarray:
     depth_m = images.depth_of(keyframe, images.MAX_PRINCIPAL_OFFSET)
-    v, u = np.indices(depth_m.shape)[:, ::2, ::2].reshape(2, -1)
-    z = depth_m[v, u]
-    k, good = keyframe.intrinsics, (z > 0) & (z < range_m)
-    points_camera_m = np.stack(((u - k.cx_px) / k.fx_px * z, (v - k.cy_px) / k.fy_px * z, z), axis=1)[good]
-    return _thinned(transform(keyframe.world_from_camera, points_camera_m.astype(np.float64)), 0.05)
-
-
-def _thinned(points_m: np.ndarray, cell_m: float) -> np.ndarray:
-    _, first = np.unique(np.floor(points_m / cell_m).astype(np.int64), axis=0, return_index=True)
-    return points_m[first]
+    points_camera_m = back_project(depth_m, keyframe.intrinsics)[::EVERY_PX, ::EVERY_PX].reshape(-1, 3)
+    within = (points_camera_m[:, 2] > 0) & (points_camera_m[:, 2] < range_m)
+    points_m = transform(keyframe.world_from_camera, points_camera_m[within])
+    return points_m[np.unique(np.floor(points_m / POINT_M).astype(np.int64), axis=0, return_index=True)[1]]
 
 
 def _of_world(world: World, points_m: np.ndarray) -> TrueGround:

@@ -17,7 +17,7 @@ from prior_sg.deploy.benches.exactness import exactness_bench
 from prior_sg.deploy.benches.footprint import memory_bench, start_bench
 from prior_sg.deploy.benches.kernel import kernel
 from prior_sg.deploy.benches.learning import learning_bench
-from prior_sg.deploy.benches.places import place_bench
+from prior_sg.deploy.benches.places import keyframes_of, place_bench
 from prior_sg.deploy.benches.queries import query_bench
 from prior_sg.deploy.benches.store import store_bench
 from prior_sg.deploy.benches.swap import swap_bench
@@ -39,11 +39,7 @@ def machine() -> dict[str, Any]:
 
 def _sample_keyframes() -> list[Keyframe]:
     """Every frame of the sample as a keyframe."""
-    keyframes = []
-    for frame in open_source(SAMPLE):
-        fields = {name: getattr(frame, name) for name in Keyframe.__struct_fields__ if hasattr(frame, name)}
-        keyframes.append(Keyframe(robot="bench", **fields))
-    return keyframes
+    return list(keyframes_of(open_source(SAMPLE)))
 
 
 def _percentiles(milliseconds: list[float]) -> dict[str, float]:

@@ -3,7 +3,7 @@
 import cProfile
 import resource
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import msgspec
@@ -11,6 +11,7 @@ import numpy as np
 
 from prior_sg.schemas.frames import Keyframe
 from prior_sg.services import images
+from prior_sg.services.ingest.sources import Source
 from prior_sg.services.place_graph.core.ledger import PlaceLedger
 from prior_sg.services.place_graph.core.openings import Openings
 from prior_sg.services.place_graph.core.skeleton import distance, places
@@ -30,6 +31,13 @@ PLACE_STAGES: dict[str, Callable[..., Any]] = {  # the function of the place gra
     "publish": PlaceLedger.update,
 }
 LAP_M, MANY_PLACES = 25.6, 10_000  # a lap of the sample lies so far beside the one before, in whole blocks of voxels
+
+
+def keyframes_of(source: Source) -> Iterator[Keyframe]:
+    """Every frame of a source as a keyframe."""
+    for frame in source:
+        fields = {name: getattr(frame, name) for name in Keyframe.__struct_fields__ if hasattr(frame, name)}
+        yield Keyframe(robot="bench", **fields)
 
 
 def place_bench(keyframes: list[Keyframe]) -> tuple[dict, dict]:

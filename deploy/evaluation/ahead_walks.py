@@ -10,13 +10,12 @@ from scipy.spatial import cKDTree
 from prior_sg.deploy.evaluation.ahead import NEAR_M, NO_LABEL, Ahead, Stop, score
 from prior_sg.deploy.evaluation.errors import EvaluationError
 from prior_sg.deploy.evaluation.kinds import OURS
-from prior_sg.deploy.evaluation.methods import Case, Variant, labelling, without_pyramid
+from prior_sg.deploy.evaluation.methods import Case, Variant, labelling, put_in_force, without_pyramid
 from prior_sg.deploy.truth import GroundTruth
 from prior_sg.schemas.places import PlaceDelta
-from prior_sg.schemas.priors import Task
 from prior_sg.schemas.regions import NO_REGION
 from prior_sg.schemas.status import Tick
-from prior_sg.schemas.topics import DETECTIONS, PLACE_DELTA, PRIOR, PYRAMID, TASK
+from prior_sg.schemas.topics import DETECTIONS, PLACE_DELTA, PYRAMID
 from prior_sg.services.segmenter.core.config import Config
 from prior_sg.services.segmenter.core.state import State
 
@@ -64,14 +63,12 @@ def snapshots(variant: Variant, case: Case, deltas: Sequence[PlaceDelta]) -> lis
     prior, perception = variant.prior(case), case.perception
     config = msgspec.structs.replace(variant.config, space=perception.space)
     robot = perception.places.robot
-    task = Task(robot=robot, stamp_ns=0, environment=prior.environment, task=prior.task, regions=prior.vocabulary)
     pyramids = {pyramid.frame_id: pyramid for pyramid in variant.pyramids(case)}
     detections = {found.frame_id: found for found in variant.detections(case)}
     held = []
     with labelling(config, robot, lambda concepts: variant.text(perception.text(concepts))) as pipeline:
         segmenter = pipeline.of("segmenter")
-        pipeline.publish(TASK, task)
-        pipeline.publish(PRIOR, prior)
+        put_in_force(pipeline, robot, prior)
         for number, delta in enumerate(deltas, 1):
             pipeline.publish(PLACE_DELTA, delta)
             if delta.frame_id in pyramids:

@@ -9,15 +9,14 @@ import numpy as np
 
 from prior_sg.deploy.evaluation.datasets import Dataset
 from prior_sg.deploy.evaluation.level_metrics import NONE, level_scores, levels_in, nodes_at, true_nodes
-from prior_sg.deploy.evaluation.methods import Case, labelling, scene_of
+from prior_sg.deploy.evaluation.methods import Case, labelling, put_in_force, scene_of
 from prior_sg.deploy.evaluation.metrics import evaluate
 from prior_sg.deploy.truth import GroundTruth
 from prior_sg.schemas.levels import LevelName, LevelNode
 from prior_sg.schemas.places import PlaceDelta
-from prior_sg.schemas.priors import Task
 from prior_sg.schemas.scene import Scene
 from prior_sg.schemas.status import Tick
-from prior_sg.schemas.topics import PLACE_DELTA, PRIOR, PYRAMID, TASK
+from prior_sg.schemas.topics import PLACE_DELTA, PYRAMID
 from prior_sg.services.segmenter.core.config import Config
 from prior_sg.services.segmenter.core.layers.layer_map import LayerMap
 from prior_sg.services.segmenter.core.state import State
@@ -55,13 +54,11 @@ def walk(case: Case, deltas: Sequence[PlaceDelta], config: Config) -> Walked:
     prior, perception = case.prior, case.perception
     config = msgspec.structs.replace(config, space=perception.space)
     robot = perception.places.robot
-    task = Task(robot=robot, stamp_ns=0, environment=prior.environment, task=prior.task, regions=prior.vocabulary)
     pyramids = {pyramid.frame_id: pyramid for pyramid in perception.pyramids}
     moments, spent_s = list[Held](), list[float]()
     with labelling(config, robot, perception.text) as pipeline:
         segmenter = pipeline.of("segmenter")
-        pipeline.publish(TASK, task)
-        pipeline.publish(PRIOR, prior)
+        put_in_force(pipeline, robot, prior)
         for number, delta in enumerate(deltas, 1):
             pipeline.publish(PLACE_DELTA, delta)
             if delta.frame_id in pyramids:

@@ -71,7 +71,6 @@ class Variant:
         prior, perception = self.prior(case), case.perception
         config = msgspec.structs.replace(self.config, space=perception.space)
         robot = perception.places.robot
-        task = Task(robot=robot, stamp_ns=0, environment=prior.environment, task=prior.task, regions=prior.vocabulary)
         with labelling(config, robot, lambda concepts: self.text(perception.text(concepts))) as pipeline:
             pipeline.publish(PLACE_DELTA, perception.places)
             for pyramid in self.pyramids(case):
@@ -80,8 +79,7 @@ class Variant:
                 pipeline.publish(DETECTIONS, detections)
             segmenter = pipeline.of("segmenter")
             self.seen(case, segmenter.state)
-            pipeline.publish(TASK, task)
-            pipeline.publish(PRIOR, prior)
+            put_in_force(pipeline, robot, prior)
             for stamp_ns in (1, 2):
                 pipeline.feed(segmenter, Tick(stamp_ns=stamp_ns))
             return scene_of(pipeline, robot)
@@ -97,6 +95,13 @@ def labelling(config: Config, robot: str, text: Callable[[list[list[str]]], Text
             Runner(store, store.config(path=":memory:")),
         )
     )
+
+
+def put_in_force(pipeline: Pipeline, robot: str, prior: Prior) -> None:
+    """Give a robot the task of a prior, and the prior."""
+    task = Task(robot=robot, stamp_ns=0, environment=prior.environment, task=prior.task, regions=prior.vocabulary)
+    pipeline.publish(TASK, task)
+    pipeline.publish(PRIOR, prior)
 
 
 def scene_of(pipeline: Pipeline, robot: str) -> Scene:

@@ -16,16 +16,16 @@ from prior_sg.deploy.evaluation.datasets import WorldName, of_world
 from prior_sg.deploy.evaluation.foresight import loops
 from prior_sg.deploy.evaluation.foresight.explorer import BEYOND_CELLS, MET_M2, REACH_CELLS, Plan, plan_of, starts_of
 from prior_sg.deploy.evaluation.foresight.trials import FOUND_M2, SAME, Moment
-from prior_sg.deploy.evaluation.methods import Case, labelling
+from prior_sg.deploy.evaluation.methods import Case, labelling, put_in_force
 from prior_sg.deploy.evaluation.perception import Perceiver
 from prior_sg.deploy.evaluation.worlds import world_of
 from prior_sg.deploy.evaluation.worlds.ways import CELL_M
 from prior_sg.deploy.settings import DEMO_TASK
 from prior_sg.schemas.places import PlaceDelta
-from prior_sg.schemas.priors import Prior, Task
+from prior_sg.schemas.priors import Prior
 from prior_sg.schemas.regions import NO_REGION
 from prior_sg.schemas.status import Tick
-from prior_sg.schemas.topics import PLACE_DELTA, PRIOR, PYRAMID, TASK
+from prior_sg.schemas.topics import PLACE_DELTA, PYRAMID
 from prior_sg.services.segmenter.core.config import Config
 from prior_sg.services.segmenter.core.foresight.config import ForesightConfig
 from prior_sg.services.segmenter.core.foresight.openings import Openings, openings_of
@@ -63,11 +63,9 @@ def states(case: Case, deltas: Sequence[PlaceDelta], config: Config = Config()) 
     """A segmenter along a walk, every so many keyframes, while there are openings."""
     prior, perception = case.prior, case.perception
     robot, pyramids = perception.places.robot, {one.frame_id: one for one in perception.pyramids}
-    task = Task(robot=robot, stamp_ns=0, environment=prior.environment, task=prior.task, regions=prior.vocabulary)
     with labelling(msgspec.structs.replace(config, space=perception.space), robot, perception.text) as pipeline:
         segmenter = pipeline.of("segmenter")
-        pipeline.publish(TASK, task)
-        pipeline.publish(PRIOR, prior)
+        put_in_force(pipeline, robot, prior)
         for number, delta in enumerate(deltas, 1):
             pipeline.publish(PLACE_DELTA, delta)
             if delta.frame_id in pyramids:

@@ -238,7 +238,7 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
             cluster=round(self.min_cluster_area_m2 / self.graph_voxel_m**2),
             overlap=self.voxels(self.place_overlap_threshold_m),
             rise=self.voxels(self.place_max_neighbor_z_diff_m),
-            furniture=round(self.furniture_max_area_m2 / self.voxel_m**2),
+            furniture=round(self.furniture_max_area_m2 / self.graph_voxel_m**2),
         )
 
     @property

@@ -135,9 +135,8 @@ def observe(tracks: Tracks, detections: Detections, cfg: TrackingConfig) -> bool
         del tracks.archive[next(iter(tracks.archive))]
         tracks.forgetful = True
     if detections.space == (tracks.space if tracks.renewal is None else tracks.renewal.fresh.space):
-        place = (detections.frame_id, detections.detector)
-        tracks.disordered |= place < tracks.newest
-        tracks.newest = max(place, tracks.newest)
+        tracks.disordered |= _place(key) < tracks.newest
+        tracks.newest = max(_place(key), tracks.newest)
     if tracks.renewal is not None and detections.space == tracks.renewal.fresh.space:
         tracks.renewal.waiting.append(key)
     elif detections.space == tracks.space and not tracks.moved:
