@@ -41,7 +41,6 @@ CODES = {dtype: code for code, dtype in enumerate(LITTLE)}
 REAL = float | int
 FEW = 32  # numbers
 MAX_DIMENSIONS = 8
-SCRATCH_BYTES = 8_000_000  # of a message whose memory is kept for the next
 LAST_NUMBER = 2**62  # so that the next one, and sums of two, fit 64 bits
 Number = Annotated[int, msgspec.Meta(ge=0, le=LAST_NUMBER)]  # of a frame, an epoch or a revision; how many
 NumberOrNone = Annotated[int, msgspec.Meta(ge=-1, le=LAST_NUMBER)]  # the same; -1 = none yet
@@ -269,22 +268,6 @@ def prepare() -> None:
 def encode(message: Message) -> bytes:
     """MessagePack of one message."""
     return _encoder.encode(message)
-
-
-class Scratch:
-    """Memory into which one thread encodes its messages, one after the other: new memory for each would cost as much
-    again as filling it.
-    """
-
-    def __init__(self) -> None:
-        self._memory = bytearray()
-
-    def encoded(self, message: Message) -> bytearray:
-        """MessagePack of one message, until the next is encoded."""
-        if len(self._memory) > SCRATCH_BYTES:
-            self._memory = bytearray()
-        _encoder.encode_into(message, self._memory)
-        return self._memory
 
 
 def decode(message_type: type[M], payload: bytes | memoryview) -> M:

@@ -26,7 +26,7 @@ import zenoh
 from prior_sg.deploy.keys.authority import Authority
 from prior_sg.deploy.keys.routing import beyond_this_host
 from prior_sg.deploy.settings import use_keys
-from prior_sg.schemas.codec import Scratch, decode, encode
+from prior_sg.schemas.codec import decode, encode
 from prior_sg.schemas.frames import Keyframe
 from prior_sg.schemas.topics import KEYFRAME
 from prior_sg.services.runtime.bus import Sample, pack_header
@@ -101,11 +101,9 @@ def _received(pipe: Connection) -> Any:
 
 
 def _write_typed(endpoint: str, message: Keyframe, number: int, pipe: Connection) -> float:
-    bus, key, scratch = ZenohBus(endpoint), KEYFRAME.key_of(message), Scratch()  # as a host's outbox
+    bus, key = ZenohBus(endpoint), KEYFRAME.key_of(message)
     try:
-        return _write(
-            lambda sequence: bus.put(KEYFRAME, key, scratch.encoded(message), _header(sequence)), number, pipe
-        )
+        return _write(lambda sequence: bus.put(KEYFRAME, key, encode(message), _header(sequence)), number, pipe)
     finally:
         bus.close()
 

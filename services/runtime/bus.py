@@ -83,8 +83,8 @@ OnAlive = Callable[[str, bool], None]
 class Bus(Protocol):
     """Publish, subscribe, call, serve, and tell who is alive."""
 
-    def put(self, topic: Topic, key: str, payload: bytes | bytearray, header: bytes) -> None:
-        """Publish one sample with the topic's delivery. What the payload holds is taken over before this returns."""
+    def put(self, topic: Topic, key: str, payload: bytes, header: bytes) -> None:
+        """Publish one sample with the topic's delivery."""
 
     def subscribe(self, topic: Topic, pattern: str, on_sample: OnSample, on_missed: OnMissed) -> Callable[[], None]:
         """Receive samples; for `every`, also those published shortly before. Returns what ends it."""
@@ -178,9 +178,9 @@ class LocalBus:
         self._hub = hub
         self._id = next(hub.ids)
 
-    def put(self, topic: Topic, key: str, payload: bytes | bytearray, header: bytes) -> None:
+    def put(self, topic: Topic, key: str, payload: bytes, header: bytes) -> None:
         """Deliver to every matching subscriber at once; keep the newest for later ones."""
-        sample = Sample(topic, key, bytes(payload), *unpack_header(header))
+        sample = Sample(topic, key, payload, *unpack_header(header))
         with self._hub.lock:
             if topic.cache:
                 kept = self._hub.history.setdefault(key, [])

@@ -238,7 +238,7 @@ class ZenohBus:
                     raise BusError(unanswered(endpoint)) from error
                 time.sleep(0.2)
 
-    def put(self, topic: Topic, key: str, payload: bytes | bytearray, header: bytes) -> None:
+    def put(self, topic: Topic, key: str, payload: bytes, header: bytes) -> None:
         """Publish one sample. Raises BusError for one that no router and no reader would take."""
         if len(payload) > topic.most_bytes:
             raise BusError(f"{topic.name}: a message of {len(payload)} bytes, and at most {topic.most_bytes} are taken")

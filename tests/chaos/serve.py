@@ -102,8 +102,8 @@ def disturbed(mode: ModeNow) -> type[ZenohBus]:
     dialect = mode().dialect
 
     class Disturbed(ZenohBus):
-        def put(self, topic: Topic, key: str, payload: bytes | bytearray, header: bytes) -> None:
-            super().put(topic, key, spoken(topic.type, bytes(payload), dialect), header)
+        def put(self, topic: Topic, key: str, payload: bytes, header: bytes) -> None:
+            super().put(topic, key, spoken(topic.type, payload, dialect), header)
 
         def subscribe(self, topic: Topic, pattern: str, on_sample: OnSample, on_missed: OnMissed) -> Callable[[], None]:
             return super().subscribe(topic, pattern, Ear(mode, topic, on_sample), on_missed)

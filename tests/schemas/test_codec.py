@@ -16,10 +16,8 @@ from prior_sg.schemas import features, frames, levels, objects, places, priors, 
 from prior_sg.schemas.codec import (
     ARRAY_EXT_CODE,
     DTYPES,
-    SCRATCH_BYTES,
     DecodeError,
     Message,
-    Scratch,
     Shape,
     copied,
     decode,
@@ -283,15 +281,6 @@ def test_arrays_point_into_the_payload_and_are_read_only():
 class Shaped(Message, kw_only=True):
     a: Annotated[np.ndarray, Shape("float32", "n", 3)]
     b: Annotated[np.ndarray, Shape("int64", "n")]
-
-
-def test_messages_encoded_into_one_memory_are_those_of_memory_of_their_own():
-    scratch = Scratch()
-    for message in sorted(GOLDEN, key=lambda message: len(encode(message)) % 997):  # longer and shorter in turn
-        assert scratch.encoded(message) == encode(message)
-    memory = scratch.encoded(GOLDEN[0])
-    large = msgspec.structs.replace(GOLDEN[0], color=bytes(SCRATCH_BYTES))
-    assert scratch.encoded(large) is memory and scratch.encoded(GOLDEN[0]) is not memory
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,7 @@
 import time
 from typing import Any
 
-from prior_sg.schemas.codec import Message, Scratch
+from prior_sg.schemas.codec import Message, encode
 from prior_sg.schemas.status import Consumed
 from prior_sg.schemas.topics import JOURNAL, Topic
 from prior_sg.services.runtime.bus import Bus, pack_header
@@ -18,7 +18,6 @@ class Outbox:
         self.writer = f"{service}/{identity.instance}/{identity.epoch}"
         self._service, self._identity, self._bus, self._progress = service, identity, bus, progress
         self._sequences: dict[str, int] = {}  # next one, by key
-        self._scratch = Scratch()
         self._order = 0
         self.written = 0  # messages other than journal entries
 
@@ -30,8 +29,7 @@ class Outbox:
         if topic is not JOURNAL:
             self.written += 1
             self._progress.published(topic.name, sequence)
-        header = pack_header(self.writer, sequence, time.time_ns())
-        self._bus.put(topic, key, self._scratch.encoded(message), header)
+        self._bus.put(topic, key, encode(message), pack_header(self.writer, sequence, time.time_ns()))
 
     def journal(self, topic: str, **fields: Any) -> None:
         """One more input is finished with; `fields` are those of `Consumed` that say which."""
