@@ -8,7 +8,7 @@ from tests.help.hosts import Network
 from tests.help.long import long_run
 from tests.help.two_hosts import TwoHosts, alone, differences
 
-FRAMES, CUT_S = 8, 10.0
+FRAMES, CUT_S, MANY = 8, 10.0, 16
 
 
 @pytest.fixture
@@ -37,3 +37,16 @@ def test_two_hosts_by_the_documented_commands_lose_nothing_to_a_link_that_is_cut
     for service, topics in health.items():
         assert not any(count["malformed"] or count["limited"] for count in topics.values()), (service, topics)
     assert sum(pair.link.lost) > 0
+
+
+@long_run
+@pytest.mark.timeout(1800)
+def test_workers_of_a_third_host_share_the_work_of_the_edges(tmp_path):
+    """A robot's jobs reach them through the router of the edge, which passes them on."""
+    with Network() as network:
+        three = TwoHosts(tmp_path, network, MANY, speed=6.0, more_workers=True)
+        three.begin()
+        scene = three.settled()
+        done = three.encoders()
+        assert len(done) == 2 and min(done.values()) > 0 and sum(done.values()) == MANY, done
+        assert differences(scene, alone(tmp_path, three.source))[0] == []

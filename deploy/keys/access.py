@@ -77,7 +77,8 @@ def grants_of(role: Role, name: str) -> Grants:
     heard = name if role == "robot" else ANYBODY
     given = () if role in ("viewer", "fleet") else OPERATOR_WRITES
     written = {*given, *(OF_ANY_SERVICE if services else ()), *(t for s in services for t in s.writes)}
-    jobs = [topic for topic in JOBS if topic in written]
+    # An edge also passes robots' jobs on to workers of other hosts.
+    jobs = [topic for topic in JOBS if topic in written or role == "edge"]
     worked = [service.job for service in services if service.job is not None]
     return Grants(
         writes=tuple(t.pattern(robot) for t in TOPICS if t in written and t not in JOBS and _may_write(role, t)),

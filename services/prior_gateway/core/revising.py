@@ -5,6 +5,7 @@ robots have met places that none explains, the regions: a model may name those t
 that is a region of its own. It describes each as it describes those of a new prior.
 """
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -21,6 +22,7 @@ from prior_sg.services.prior_gateway.core.turns import (
     LEAST,
     TEXT,
     Dialogue,
+    Schema,
     Talk,
     Unusable,
     containment,
@@ -100,10 +102,7 @@ def revise(prior: Prior, told: str, form: Form, talk: Talk) -> Dialogue[Entries]
     two: evidence may be weighed, not contradicted.
     """
     schema = form_of(
-        {
-            kind: form_of({r: form_of(dict.fromkeys(row, talk.cfg.percent)) for r, row in rows.items()})
-            for kind, rows in form.items()
-        }
+        {kind: form_of({row: _within(talk, of) for row, of in rows.items()}) for kind, rows in form.items()}
     )
     talk.fields |= {"environment": prior.environment, "task": prior.task}
     talk.fields["regions"] = ", ".join(region.name for region in prior.regions)
@@ -123,6 +122,13 @@ def revise(prior: Prior, told: str, form: Form, talk: Talk) -> Dialogue[Entries]
         return found, faults
 
     return (yield from talk.ask("revise", schema, read, disagreements=told))
+
+
+def _within(talk: Talk, spans: dict[str, tuple[float, float]]) -> Schema:
+    """The form of a row of percentages, each from what was expected to what was observed."""
+    return form_of(
+        {column: talk.cfg.number(math.floor(min(span)), math.ceil(max(span))) for column, span in spans.items()}
+    )
 
 
 def missing_regions(prior: Prior, strange: str, objects: Sequence[str], talk: Talk) -> Dialogue[list[Addition]]:

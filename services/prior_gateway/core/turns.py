@@ -45,7 +45,7 @@ PROMPT_FIELDS: dict[str, set[str]] = {
     "revise_regions": {"environment", "task", "regions", "strange", "most"},
     "neighbours": {"environment", "regions", "batch"},
     "reason": set(),
-    "answer": {"schema"},
+    "answer": {"form"},
     "faults": {"faults"},
 }
 MOST_FAULTS = 12  # told at once
@@ -83,7 +83,8 @@ class SynthesisConfig(msgspec.Struct, frozen=True, kw_only=True):
     def number(self, low: int, high: int) -> Schema:
         """The form of a whole number."""
         form: Schema = {"type": "integer", "minimum": low, "maximum": high}
-        return form | {"enum": np.linspace(low, high, self.steps).round().astype(int).tolist()} if self.steps else form
+        steps = np.unique(np.linspace(low, high, self.steps).round().astype(int)).tolist()
+        return form | {"enum": steps} if self.steps else form
 
     @property
     def length(self) -> Schema:
@@ -149,7 +150,7 @@ class Talk:
     def ask(self, name: str, schema: Schema, read: Callable[[str], tuple[A, list[str]]], **more: str) -> Dialogue[A]:
         """One question: thought about, answered as JSON, sent back with its faults. Raises Unusable."""
         fields = {key: value for key, value in (self.fields | more).items() if key in PROMPT_FIELDS[name]}
-        question, form = self.prompts(name, **fields), self.prompts("answer", schema=json.dumps(schema))
+        question, form = self.prompts(name, **fields), self.prompts("answer", form=outline(schema))
         messages = [("system", self.prompts("system"))]
         if self.cfg.reason:
             messages.append(("user", f"{question}\n\n{self.prompts('reason')}"))
@@ -361,6 +362,20 @@ def form_of(properties: dict[str, Schema]) -> Schema:
         "required": list(properties),
         "additionalProperties": False,
     }
+
+
+def outline(schema: Schema) -> str:
+    """A form as a model reads it: a schema that repeats what a number is for each of hundreds costs many times that."""
+    match schema:
+        case {"properties": properties}:
+            return f"{{{', '.join(f'{json.dumps(name)}: {outline(of)}' for name, of in properties.items())}}}"
+        case {"items": items, "maxItems": most}:
+            return f"[{outline(items)}, {schema.get('minItems', 0)} to {most} of these]"
+        case {"minimum": least, "maximum": most}:
+            return f"<{least} to {most}>"
+        case {"enum": choices}:
+            return " or ".join(map(json.dumps, choices))
+    return '"text"'
 
 
 def probability(percent: Any) -> np.ndarray:

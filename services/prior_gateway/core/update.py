@@ -247,8 +247,8 @@ def _conclude(state: State, making: Making, cfg: Config) -> Iterator[Told]:
 
 
 def _conclude_revision(state: State, making: Making, found: revising.Revision, cfg: Config) -> Iterator[Told]:
-    """What the model has revised; regions that it added belong to the prior before any revision, too, so that maps
-    revise them from now on."""
+    """What the model has revised, as a statement that observations outvote as they do any prior's; regions that it
+    added belong to the prior before any revision, too, so that maps revise them from now on."""
     root, current = prior_in_force(state, making, cfg)
     note = "revised by the model from what was observed"
     if found.additions:
@@ -262,10 +262,13 @@ def _conclude_revision(state: State, making: Making, found: revising.Revision, c
 
     made = _provenance(state, making, cfg, **_parents(state, making, root, current))
     made = msgspec.structs.replace(made, note="; ".join(filter(None, (note, found.remark))))
+    stated = revising.applied(root, found, with_name, made)
     for addition in found.additions:
         root = revising.extended(root, addition, with_name)
-    state.roots[asked_for(making.task)] = root
-    yield _keep(making, revising.applied(current, found, with_name, made), state)
+    asked = asked_for(making.task)
+    state.roots[asked] = root
+    seen = learning.estimate(stated, state.evidence.get(asked, {}).values(), cfg.learning)
+    yield _keep(making, learning.revised(stated, seen.totals, cfg.learning.strength, made), state)
 
 
 def _parents(state: State, making: Making, root: Prior, current: Prior) -> dict[str, Any]:

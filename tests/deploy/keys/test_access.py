@@ -188,6 +188,7 @@ def test_every_key_of_the_table_is_granted_to_whom_it_concerns():
         key = topic.pattern("r").replace("*", "x")
         if topic.delivery == "job":
             assert included(job_key(topic, "w", "r"), robot.asks) and included(job_key(topic, "w", "*"), edge.answers)
+            assert included(job_key(topic, "w", "*"), edge.asks), "what robots ask passes on to workers of other hosts"
             assert included(worker_keys(topic, "w", "a/b")[1], robot.reads) and not included(key, viewer.asks)
             continue
         assert included(key, (*robot.writes, *edge.writes)), topic.name

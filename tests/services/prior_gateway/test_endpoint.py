@@ -284,7 +284,7 @@ def test_a_model_makes_a_prior():
     origin = prior.provenance
     assert (origin.source, origin.samples, origin.made_by) == ("fake", 1, "g1")
     assert origin.question
-    assert origin.prompts.startswith("v1-")
+    assert origin.prompts.startswith("v2-")
     assert prior.answers(home())
 
 

@@ -30,7 +30,7 @@ from tests.help.model import fill
 ROOMS, THINGS = ["kitchen", "bathroom", "hall"], ["stove", "toilet", "coat rack", "bench", "lathe", "saw"]
 TRUE = np.array([[0.9, 0.02, 0.02], [0.02, 0.9, 0.02], [0.02, 0.02, 0.9]])
 DAY_NS = 24 * 3600 * 10**9
-PROMPTS = prompts.load("v1")
+PROMPTS = prompts.load("v2")
 
 
 def stated(held: np.ndarray, vocabulary=()) -> Prior:
@@ -337,6 +337,15 @@ def test_regions_that_the_task_has_fixed_stay():
     [prior] = gateway.revise(by_model=True, vocabulary=ROOMS)
     assert gateway.asked == ["revise"]
     assert [region.name for region in prior.regions] == ROOMS
+
+
+def test_observations_outvote_a_model_that_stays_with_what_was_expected():
+    gateway, wrong = Modelled(vocabulary=ROOMS), stated(TRUE[[1, 0, 2]], ROOMS)
+    gateway.found = {"preferred": wrong}
+    gateway.feed(*[a_map(wrong, f"r{i}", 1, looking_like(0, 1, 2), HOME) for i in range(6)])
+    [prior] = gateway.revise(by_model=True, vocabulary=ROOMS)
+    assert gateway.asked == ["revise"]
+    assert prior.containment[0, 0] > 0.6 and prior.containment[0, 1] < 0.4
 
 
 @pytest.mark.parametrize(("limits", "calls"), [({"calls_per_day": 3}, 3), ({"tokens_per_day": 300}, 2)])

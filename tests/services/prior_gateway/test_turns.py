@@ -20,7 +20,7 @@ from prior_sg.services.prior_gateway.outside import library, prompts
 from prior_sg.services.runtime.service import ServiceError
 from tests.help.model import REGIONS, fill, reply_to
 
-PROMPTS = prompts.load("v1")
+PROMPTS = prompts.load("v2")
 CFG = synthesis.SynthesisConfig(samples=1, reason=False)
 LIBRARY = library.load()
 
@@ -56,6 +56,15 @@ def broken_once(change, name):
 
 
 # The conversation
+
+
+def test_a_form_is_told_in_few_words():
+    item = synthesis.form_of({"name": synthesis.TEXT, "splits": {"type": "string", "enum": ["hall", "none"]}})
+    form = synthesis.form_of({"regions": {"type": "array", "items": item, "maxItems": 2}, "share": {"type": "integer"}})
+    form["properties"]["share"] |= {"minimum": 0, "maximum": 100, "enum": list(range(101))}
+    assert synthesis.outline(form) == (
+        '{"regions": [{"name": "text", "splits": "hall" or "none"}, 0 to 2 of these], "share": <0 to 100>}'
+    )
 
 
 def test_top_down_regions_objects_matrices():
@@ -267,7 +276,7 @@ def test_whatever_a_model_says_the_dialogue_ends_in_a_draft_or_unusable(answers,
 
 
 def test_prompts_have_a_version_and_wrong_ones_are_named(tmp_path):
-    assert PROMPTS.version.startswith("v1-")
+    assert PROMPTS.version.startswith("v2-")
     with pytest.raises(ServiceError, match=r"v9.*v1"):
         prompts.load("v9")
     for name, template in PROMPTS.texts.items():
