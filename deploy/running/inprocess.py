@@ -36,6 +36,9 @@ class InProcess:
         self._thread.start()
         self._running: dict[str, tuple[Host, Future]] = {}
 
+    def prepare(self, service: str) -> None:
+        """Nothing: what there is to load is loaded here once for all."""
+
     def start(self, service: str, copies: int = 1) -> None:
         """Start one service, or several workers of it."""
         known = BY_NAME[service]

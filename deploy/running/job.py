@@ -246,7 +246,7 @@ class Run:
         with _progress(self.console) as progress, _interrupt_sets(self.interrupted):
             bar = progress.add_task("starting services", total=None)
             names = [service.name for service in SERVICES if service.name != "ingest"]
-            self._start(names)
+            self._start(names, "ingest")
             progress.update(bar, description="asking for the prior")
             prior = self._task(lambda reason: self._waiting(progress, bar, reason))
             progress.console.print(f"prior: {prior.provenance.source}, {prior.provenance.note}")
@@ -286,11 +286,13 @@ class Run:
                         found.append(Loss(what=f"{where} messages lost", reason=reason, count=count, example=""))
         return merged(found)
 
-    def _start(self, names: list[str]) -> None:
-        """Start services and wait until they are seen."""
+    def _start(self, names: list[str], then: str = "") -> None:
+        """Start services and wait until they are seen; meanwhile what comes then loads what it needs."""
         wanted = {name: self.job.workers if name == "feature_pyramid" else 1 for name in names}
         for name, copies in wanted.items():
             self.supervisor.start(name, copies)
+        if then:
+            self.supervisor.prepare(then)
         deadline_s = time.monotonic() + START_TIMEOUT_S
         while True:
             alive = list(self.client.alive().values())

@@ -51,6 +51,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--succeeds", default="", metavar="INSTANCE", help="take over from this process, which yields and ends"
     )
+    parser.add_argument("--held", action="store_true", help="load everything, and begin when standard input has a line")
     parser.add_argument("--log-level", default="info", choices=("debug", "info", "warning", "error"))
     parser.add_argument("--parent", type=int, default=0, help="end when this process is gone")
     parser.add_argument("--crashes", default="", metavar="FOLDER", help="write there how the service died, if it does")
@@ -185,6 +186,8 @@ def run(arguments: argparse.Namespace) -> int:
             import uvloop
 
             asyncio.set_event_loop_policy(uvloop.EventLoopPolicy())
+        if arguments.held and not _released(arguments.service):
+            return 0
         with noted(instance), crashes.watched(arguments.crashes, instance):
             yielded = asyncio.run(serve(arguments, instance))
     except LaterError as error:
@@ -204,6 +207,12 @@ def run(arguments: argparse.Namespace) -> int:
         return 1
     log.info("another has taken over" if yielded else "stopped")
     return EXIT_YIELDED if yielded else 0
+
+
+def _released(name: str) -> bool:
+    """Load a service and wait until it may begin; False where nobody is left to say so."""
+    declared(name)
+    return bool(sys.stdin.readline())
 
 
 def main() -> int:

@@ -1,5 +1,6 @@
 """Child processes: one per service instance, restarted when they die, stopped in order."""
 
+import contextlib
 import itertools
 import json
 import os
@@ -56,6 +57,7 @@ class Child:
     later: bool = False  # it ran, and lacks what can come back
     unique: str = ""  # its name on the bus
     succeeds: str = ""  # the instance that it is to take over from, until it has
+    held: bool = False  # it loads what it needs and waits for its release
 
     def start(self) -> None:
         """Start the process; its log is appended to."""
@@ -69,6 +71,7 @@ class Child:
             str(os.getpid()),
             *self.arguments,
             *(("--succeeds", self.succeeds) if self.succeeds else ()),
+            *(("--held",) if self.held else ()),
         ]
         # Unique on the bus: another robot, host or run may have a process of the same short name.
         self.unique = f"{self.instance}-{uuid.uuid4().hex[:6]}"
@@ -76,12 +79,20 @@ class Child:
         with self.log_path.open("ab") as log:
             self.process = subprocess.Popen(
                 [*command, "--instance", self.unique],
-                stdin=subprocess.DEVNULL,
+                stdin=subprocess.PIPE if self.held else subprocess.DEVNULL,
                 stdout=log,
                 stderr=log,
                 start_new_session=True,
                 env=environment | {"OMP_WAIT_POLICY": "PASSIVE"},
             )
+        self.started_s = time.monotonic()
+
+    def release(self) -> None:
+        """Let a held process begin; one that is not there now will not be held any more."""
+        self.held = False
+        if self.process is not None and self.process.stdin is not None:
+            with contextlib.suppress(BrokenPipeError), self.process.stdin as told:
+                told.write(b"go\n")
         self.started_s = time.monotonic()
 
     @property
@@ -144,8 +155,18 @@ class Supervisor:
         """Where services leave how they died: beside the logs."""
         return self.log_folder.parent / "crashes"
 
+    def prepare(self, service: str) -> None:
+        """Begin a process of a service that loads what it needs and waits for `start`."""
+        self.log_folder.mkdir(parents=True, exist_ok=True)
+        self._start(service, f"{service}-1", 1, self.config, settings=self.settings, held=True)
+
     def start(self, service: str, copies: int = 1) -> None:
-        """Start one service, or several workers of it."""
+        """Start one service, or several workers of it; what was prepared is let go."""
+        prepared = [child for child in self.children if child.service == service and child.held]
+        for child in prepared:
+            child.release()
+        if prepared:
+            return
         self.log_folder.mkdir(parents=True, exist_ok=True)
         # Workers share the cores; the others do much with little and would only get in each other's way.
         threads = max(1, (os.cpu_count() or 1) // copies) if BY_NAME[service].job is not None else 1
@@ -153,7 +174,15 @@ class Supervisor:
             self._start(service, f"{service}-{number + 1}", threads, self.config, settings=self.settings)
 
     def _start(
-        self, service: str, instance: str, threads: int, config: str, *, settings: Sequence[str], succeeds: str = ""
+        self,
+        service: str,
+        instance: str,
+        threads: int,
+        config: str,
+        *,
+        settings: Sequence[str],
+        succeeds: str = "",
+        held: bool = False,
     ) -> Child:
         arguments = ["--robot", self.robot, "--connect", self.connect, "--crashes", str(self.crash_folder)]
         arguments += ["--config", config] if config else []
@@ -161,7 +190,7 @@ class Supervisor:
             arguments += ["--set", setting]
         log_path = self.log_folder / f"{instance}.log"
         log_path.unlink(missing_ok=True)
-        child = Child(service, instance, arguments, log_path, threads, succeeds=succeeds)
+        child = Child(service, instance, arguments, log_path, threads, succeeds=succeeds, held=held)
         child.start()
         self.children.append(child)
         return child

@@ -21,7 +21,9 @@ from prior_sg.deploy.running import job
 from prior_sg.deploy.running.job import RunError, claimed_folder
 from prior_sg.deploy.running.supervisor import Child, ChildFailed, Supervisor
 from prior_sg.deploy.sample import SAMPLE
+from prior_sg.services.runtime.client import BusClient
 from prior_sg.services.runtime.endpoints import free_endpoint
+from prior_sg.services.runtime.zenoh_bus import ZenohBus, open_free_router
 
 COMMAND = [sys.executable, "-m", "prior_sg.deploy.cli.main"]
 ENVIRONMENT = os.environ | {"PYTHONPATH": str(Path(prior_sg.__file__).parents[1])}
@@ -188,3 +190,27 @@ def test_a_service_ended_by_a_signal_is_told_by_its_name(tmp_path):
     child.started_s = time.monotonic()
     with pytest.raises(ChildFailed, match="ended by signal SIGSEGV"):
         supervisor.check()
+
+
+def test_a_prepared_service_waits_until_it_is_started_and_ends_with_whom_it_waits_for(tmp_path):
+    """It has loaded everything by then; what is prepared and never started leaves nothing behind."""
+    endpoint, stop_router = open_free_router("tcp/127.0.0.1:0")
+    supervisor = Supervisor(endpoint, "r", tmp_path / "logs")
+    try:
+        supervisor.prepare("prior_gateway")
+        [child] = supervisor.children
+        with BusClient(ZenohBus(endpoint)) as client:
+            time.sleep(4.0)
+            assert child.runs and supervisor.check() == [] and "prior_gateway" not in client.alive(0.5).values()
+            supervisor.start("prior_gateway")
+            assert supervisor.children == [child] and not child.held
+            end_s = time.monotonic() + 30
+            while "prior_gateway" not in client.alive(0.5).values():
+                assert time.monotonic() < end_s and child.runs, child.last_words()
+        supervisor.prepare("scene_store")
+        waiting = supervisor.children[-1].process
+        waiting.stdin.close()  # as when the supervisor has died
+        assert waiting.wait(30) == 0
+    finally:
+        supervisor.stop()
+        stop_router()
