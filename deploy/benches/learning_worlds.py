@@ -67,7 +67,9 @@ def learning_worlds_bench(
     """
     environment, names = vocabulary(kind, [*seeds[0], *seeds[1]])
     right = library_prior(environment, TASK, names)
-    explored, tested = (seen_worlds(kind, each, right, encoder, folder, say) for each in seeds)
+    explored, tested = (
+        [seen_world(WorldName(kind, seed), right, encoder, folder, say) for seed in each] for each in seeds
+    )
     pairs = exchanged_pairs(names)
     metrics: dict[str, Any] = {}
     for suffix, wrong in HANDS.items():
@@ -102,18 +104,13 @@ def vocabulary(kind: str, seeds: Iterable[int]) -> tuple[str, list[str]]:
     return datasets[0].prior.environment, list(names)
 
 
-def seen_worlds(
-    kind: str, seeds: Iterable[int], prior: Prior, encoder: str, folder: Path, say: Say
-) -> list[SeenWorld]:
-    """Worlds with what is seen of them; `prior` names the objects that are looked for."""
-    found = []
-    for seed in seeds:
-        dataset = of_world(WorldName(kind, seed), TASK)
-        say(f"{dataset.name}: seen by {encoder}")
-        perception = simulated_perception(dataset, encoder, folder=folder)
-        view = oracles.seen_objects(dataset.objects, prior, perception.voxels)
-        found.append(SeenWorld(dataset, perception, mistaken(view, SIGHT, np.random.default_rng(seed))))
-    return found
+def seen_world(name: WorldName, prior: Prior, encoder: str, folder: Path, say: Say) -> SeenWorld:
+    """A world with what is seen of it; `prior` names the objects that are looked for."""
+    dataset = of_world(name, TASK)
+    say(f"{dataset.name}: seen by {encoder}")
+    perception = simulated_perception(dataset, encoder, folder=folder)
+    view = oracles.seen_objects(dataset.objects, prior, perception.voxels)
+    return SeenWorld(dataset, perception, mistaken(view, SIGHT, np.random.default_rng(name.seed)))
 
 
 def mistaken(view: ObjectView, sight: Sight, rng: np.random.Generator) -> ObjectView:
