@@ -60,18 +60,6 @@ def votes(state: State, rows: np.ndarray, cfg: Config) -> dict[str, Vote]:
     return {name: (np.maximum(log_probabilities, floor), sure) for name, (log_probabilities, sure) in answers.items()}
 
 
-def weights(state: State, answers: dict[str, Vote], cfg: Config) -> dict[str, np.ndarray]:
-    """Weight (place,) of each expert's vote: its confidence times its reliability.
-
-    Crops that tell little of the labels are as sure as others, of what may be wrong of a whole region. So where what a
-    region holds has a say, looks weigh as much less as beliefs are less sure.
-    """
-    found = {name: sure * cfg.experts[name] for name, (_, sure) in answers.items()}
-    if "visual" in found and "contents" in found:
-        found["visual"] = found["visual"] / np.where(answers["contents"][1] > 0, doubt(state, cfg), 1.0)
-    return found
-
-
 def context_of(state: State, rows: np.ndarray, cfg: Config) -> Context:
     """What experts may look at to judge the places in `rows`."""
     aligned = state.aim.aligned
@@ -145,7 +133,6 @@ def weigh(state: State, crops: Crops) -> None:
     if abs(told - state.labelling.told) > TOLD_TOLERANCE * told:
         state.labelling.told = told
         state.map.places.unbelieved[:] = True
-        state.map.places.doubtful |= state.map.places.contents.any(axis=1)
 
 
 def worth(state: State, cfg: Config) -> float:
@@ -262,8 +249,8 @@ def evaluate_experts(state: State, idle: bool, cfg: Config) -> None:
     places, rows = state.map.places, np.flatnonzero(state.map.places.doubtful)
     answers = votes(state, rows, cfg)
     unary = np.zeros((len(rows), places.unary.shape[1]))
-    for name, weight in weights(state, answers, cfg).items():
-        unary -= weight[:, None] * answers[name][0]
+    for name, (log_probabilities, confidence) in answers.items():
+        unary -= (confidence * cfg.experts[name])[:, None] * log_probabilities
     changed = rows[(unary != places.unary[rows]).any(axis=1)]
     places.unary[rows] = unary
     places.sight[rows] = answers["visual"][1] if "visual" in answers else 0.0
@@ -301,14 +288,9 @@ def settle(state: State, cfg: Config, *, hurried: bool) -> None:
 
 def temperature(state: State, cfg: Config) -> float:
     """Of the posteriors: the higher, the less the crops of this map tell of the labels."""
-    return cfg.temperature * doubt(state, cfg)
-
-
-def doubt(state: State, cfg: Config) -> float:
-    """How many times too sure looks are, from 1 up, by what the crops of this map tell of the labels."""
     if not cfg.informed:
-        return 1.0
-    return min(max(cfg.informed / max(state.labelling.told, 1e-9), 1.0), LEAST_SURE)
+        return cfg.temperature
+    return cfg.temperature * min(max(cfg.informed / max(state.labelling.told, 1e-9), 1.0), LEAST_SURE)
 
 
 def believe(state: State, cfg: Config) -> None:

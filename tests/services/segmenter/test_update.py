@@ -679,17 +679,3 @@ def test_beliefs_are_the_less_sure_the_less_crops_tell():
     run.state.labelling.told = 0.0
     assert inference.temperature(run.state, cfg) == inference.LEAST_SURE * cfg.temperature
     assert inference.temperature(run.state, Config(informed=0.0)) == cfg.temperature
-
-
-def test_looks_that_tell_little_give_way_where_what_a_region_holds_has_a_say():
-    """Two places, of which the region of the first holds something: reliability 4 times confidence 0.5, and a quarter
-    of it where crops tell a quarter of what they should."""
-    run, _ = finished()
-    words = np.zeros((2, 3))
-    answers = {"visual": (words, np.full(2, 0.5)), "contents": (words, np.array([1.0, 0.0]))}
-    run.state.labelling.told = 0.05
-    found = inference.weights(run.state, answers, Config())
-    np.testing.assert_allclose(found["visual"], [0.5, 2.0])
-    np.testing.assert_allclose(found["contents"], [2.5, 0.0])
-    run.state.labelling.told = 0.4
-    np.testing.assert_allclose(inference.weights(run.state, answers, Config())["visual"], [2.0, 2.0])
