@@ -1,40 +1,47 @@
-"""`python -m prior_sg.deploy.benches.learning_worlds`: `prior-sg bench learning` in generated worlds.
+"""`prior-sg bench learning --worlds KIND`: does a prior that is wrong about the world come right in generated worlds?
 
-The robot explores worlds of one kind, of the generator that `prior-sg eval` takes, and other worlds are segmented
-before and after. The prior in hand is the library's for all labels of those worlds, once as it is and once half wrong:
-half of the regions have exchanged objects, neighbours and frequencies. Looks come from a simulated encoder; of the
-objects in view a detector that is simulated, too, misses some and mistakes some.
+The worlds are those of one kind, of the generator that `prior-sg eval` takes. A robot explores some of them, each
+labelled under the prior as revised so far; others are segmented before and after. The prior in hand is the library's
+for all labels of those worlds, once as it is and once half wrong: half of the regions have exchanged objects,
+neighbours and frequencies. Looks come from a simulated encoder. Of the objects in view, which are named as the
+generator names them, a detector that is simulated, too, misses some and mistakes some.
 """
 
-import argparse
-import json
 import statistics
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
 
 from prior_sg.deploy.benches.homes import Sight, exchanged
+from prior_sg.deploy.benches.learning import EXPLORED, LEARNING, MOST_TICKS
 from prior_sg.deploy.evaluation import oracles
 from prior_sg.deploy.evaluation.datasets import Dataset, WorldName, of_world
-from prior_sg.deploy.evaluation.methods import Case, Variant
+from prior_sg.deploy.evaluation.methods import labelling, put_in_force, scene_of
 from prior_sg.deploy.evaluation.metrics import evaluate
-from prior_sg.deploy.evaluation.perception import CACHE, simulated_perception
+from prior_sg.deploy.evaluation.perception import CACHE, Perception, simulated_perception
 from prior_sg.deploy.evaluation.priors import library_prior
 from prior_sg.schemas.priors import Prior, PriorEvidence
 from prior_sg.schemas.scene import Scene
+from prior_sg.schemas.status import Tick
+from prior_sg.schemas.topics import PLACE_DELTA, PYRAMID
 from prior_sg.services.prior_gateway.core import learning
 from prior_sg.services.segmenter.core import prior_evidence
 from prior_sg.services.segmenter.core.config import Config
 from prior_sg.services.segmenter.core.experts.context import ObjectView
 from prior_sg.services.segmenter.core.inference import see_objects
-from prior_sg.services.segmenter.core.state import State
 
 TASK = "find the way around"
 SIGHT = Sight(lookalike=0.0, detected=0.8, mistaken=0.15)  # of the detector; looks are the encoder's
-EXPLORED = (0, 1, 3, 10)
+EXPLORED_SEEDS, TESTED_SEEDS = range(60, 70), range(70, 76)
+ENCODER = "simlike:0.4"  # most like a real encoder, see `simulated`
+HANDS = {"": True, "_right": False}  # by the suffix of their figures: whether the prior in hand is half wrong
+CFG = Config(evidence_ticks=0)
+
+Say = Callable[[str], None]
 
 
 @dataclass(frozen=True)
@@ -42,20 +49,68 @@ class SeenWorld:
     """One world as a robot saw it."""
 
     dataset: Dataset
-    case: Case
+    perception: Perception
     objects: ObjectView
 
 
-def seen_worlds(kind: str, seeds: Iterable[int], encoder: str, prior: Prior, folder: Path) -> list[SeenWorld]:
-    """Worlds with what is seen of them; `prior` names the objects that are looked for."""
-    found = []
-    for seed in seeds:
-        dataset = of_world(WorldName(kind, seed), TASK)
-        perception = simulated_perception(dataset, encoder, folder=folder)
-        view = oracles.seen_objects(dataset.objects, prior, perception.voxels)
-        case = Case(perception, prior, dataset.truth)
-        found.append(SeenWorld(dataset, case, mistaken(view, SIGHT, np.random.default_rng(seed))))
-    return found
+def learning_worlds_bench(
+    kind: str,
+    say: Say,
+    seeds: tuple[Sequence[int], Sequence[int]] = (EXPLORED_SEEDS, TESTED_SEEDS),
+    encoder: str = ENCODER,
+    folder: Path = CACHE,
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """F1_S of the tested worlds after some explored ones, and the gain of each over none: mean, standard error, least.
+
+    `seeds` are those of the worlds to explore and of those to test; `folder` keeps perceptions. Raises EvaluationError
+    for a kind that does not exist, ValueError for what is no simulated encoder.
+    """
+    environment, names = vocabulary(kind, [*seeds[0], *seeds[1]])
+    right = library_prior(environment, TASK, names)
+    explored, tested = (
+        [seen_world(WorldName(kind, seed), right, encoder, folder, say) for seed in each] for each in seeds
+    )
+    pairs = exchanged_pairs(names)
+    metrics: dict[str, Any] = {}
+    for suffix, wrong in HANDS.items():
+        prior = exchanged(right, pairs, np.random.default_rng(seeds[0][0])) if wrong else right
+        priors = learnt(explored, prior, lambda text, hand=suffix: say(f"{kind}{hand}: {text}"))  # type: ignore[misc]
+        scores = {n: f1_s(tested, priors[n]) for n in EXPLORED if n < len(priors)}
+        metrics |= {name + suffix: value for name, value in figures(scores).items()}
+        say(f"{kind}{suffix}: F1_S {' / '.join(f'{statistics.mean(found):.3f}' for found in scores.values())}")
+    settings = {"kind": kind, "encoder": encoder, "explored": len(explored), "tested": len(tested)}
+    return metrics, settings | {"regions": len(names), "exchanged_pairs": pairs, "strength": LEARNING.strength}
+
+
+def exchanged_pairs(names: Sequence[str]) -> int:
+    """Pairs of regions that make half of all, as nearly as pairs can."""
+    return max(1, round(len(names) / 4))
+
+
+def figures(scores: Mapping[int, Sequence[float]]) -> dict[str, float]:
+    """Means over the worlds of F1_S (world,) by number of explored worlds, and what the largest number gains."""
+    gains = np.subtract(scores[max(scores)], scores[0])
+    return {f"f1_s_{number}": statistics.mean(found) for number, found in scores.items()} | {
+        "f1_s_gain": float(gains.mean()),
+        "f1_s_gain_se": float(gains.std(ddof=1) / len(gains) ** 0.5),
+        "f1_s_gain_least": float(gains.min()),
+    }
+
+
+def vocabulary(kind: str, seeds: Iterable[int]) -> tuple[str, list[str]]:
+    """Environment and labels of some worlds."""
+    datasets = [of_world(WorldName(kind, seed), TASK) for seed in seeds]
+    names = dict.fromkeys(region.label for dataset in datasets for region in dataset.truth.regions)
+    return datasets[0].prior.environment, list(names)
+
+
+def seen_world(name: WorldName, prior: Prior, encoder: str, folder: Path, say: Say) -> SeenWorld:
+    """A world with what is seen of it; `prior` names the objects that are looked for."""
+    dataset = of_world(name, TASK)
+    say(f"{dataset.name}: seen by {encoder}")
+    perception = simulated_perception(dataset, encoder, folder=folder)
+    view = oracles.seen_objects(dataset.objects, prior, perception.voxels)
+    return SeenWorld(dataset, perception, mistaken(view, SIGHT, np.random.default_rng(name.seed)))
 
 
 def mistaken(view: ObjectView, sight: Sight, rng: np.random.Generator) -> ObjectView:
@@ -69,81 +124,42 @@ def mistaken(view: ObjectView, sight: Sight, rng: np.random.Generator) -> Object
     return ObjectView(np.arange(len(kept)), view.positions_m[kept], concepts)
 
 
-def segmented(world: SeenWorld, prior: Prior) -> tuple[Scene, PriorEvidence | None]:
-    """The world's scene under a prior, and what it tells of the prior."""
-    config, states = Config(), list[State]()
-
-    def see(_: Case, state: State) -> None:
-        states.append(state)
-        see_objects(state, world.objects, config)
-
-    scene = Variant(config, seen=see).run(replace(world.case, prior=prior))
-    told = prior_evidence.evidence(states[0], msgspec.structs.replace(config, space=world.case.perception.space))
-    robot = world.dataset.name.replace(":", "-")
-    return scene, told and msgspec.structs.replace(told, robot=robot)
+def learnt(explored: Sequence[SeenWorld], prior: Prior, say: Say) -> list[Prior]:
+    """The prior after 0, 1, 2, ... worlds, each labelled under the one before and seen by another robot."""
+    priors, seen = [prior], list[PriorEvidence]()
+    for world in explored:
+        say(f"learning from {world.dataset.name}")
+        told = segmented(world, priors[-1])[1]
+        seen += [told] if told is not None else []
+        shown = learning.estimate(prior, seen, LEARNING)
+        priors.append(learning.revised(prior, shown.totals, LEARNING.strength, prior.provenance))
+    return priors
 
 
 def f1_s(worlds: Sequence[SeenWorld], prior: Prior) -> list[float]:
-    """F1_S of each world under a prior."""
+    """F1_S (world,) under a prior."""
     scenes = [segmented(world, prior)[0] for world in worlds]
     return [
-        evaluate(scene, world.case.perception.voxels, world.dataset.truth)["f1_s"]
+        evaluate(scene, world.perception.voxels, world.dataset.truth)["f1_s"]
         for world, scene in zip(worlds, scenes, strict=True)
     ]
 
 
-def learnt(explored: Sequence[SeenWorld], prior: Prior) -> list[Prior]:
-    """The prior after 0, 1, 2, ... worlds, each labelled under the one before and seen by another robot."""
-    cfg, priors, seen = learning.LearningConfig(), [prior], list[PriorEvidence]()
-    for world in explored:
-        told = segmented(world, priors[-1])[1]
-        seen += [told] if told is not None else []
-        shown = learning.estimate(prior, seen, cfg)
-        priors.append(learning.revised(prior, shown.totals, cfg.strength, prior.provenance))
-    return priors
-
-
-def vocabulary(kind: str, seeds: Iterable[int]) -> tuple[str, list[str]]:
-    """Environment and labels of some worlds."""
-    datasets = [of_world(WorldName(kind, seed), TASK) for seed in seeds]
-    names = dict.fromkeys(region.label for dataset in datasets for region in dataset.truth.regions)
-    return datasets[0].prior.environment, list(names)
-
-
-def measured(kind: str, explored: Sequence[int], tested: Sequence[int], encoder: str, folder: Path) -> dict[str, float]:
-    """F1_S of the tested worlds after some explored ones, with a half wrong prior and with the library's."""
-    environment, names = vocabulary(kind, [*explored, *tested])
-    right = library_prior(environment, TASK, names)
-    hands = {
-        "wrong": exchanged(right, max(1, len(names) // 4), np.random.default_rng(explored[0])),
-        "right": right,
-    }
-    seen = [seen_worlds(kind, seeds, encoder, right, folder) for seeds in (explored, tested)]
-    figures: dict[str, float] = {"regions": len(names), "objects": len(right.objects)}
-    for hand, prior in hands.items():
-        priors = learnt(seen[0], prior)
-        scores = {n: f1_s(seen[1], priors[n]) for n in EXPLORED if n < len(priors)}
-        figures |= {f"{hand}_f1_s_{n}": statistics.mean(found) for n, found in scores.items()}
-        gains = [after - before for after, before in zip(scores[max(scores)], scores[0], strict=True)]
-        figures[f"{hand}_gain"] = statistics.mean(gains)
-        figures[f"{hand}_gain_se"] = statistics.stdev(gains) / len(gains) ** 0.5
-        figures[f"{hand}_gain_least"] = min(gains)
-    return figures
-
-
-def main() -> None:
-    """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--kind", default="home")
-    parser.add_argument("--explored", default="60-69", help="seeds of the worlds to explore, such as 60-69")
-    parser.add_argument("--tested", default="70-75", help="seeds of those that are segmented before and after")
-    parser.add_argument("--encoder", default="simlike:0.4")
-    parser.add_argument("--cache", type=Path, default=CACHE)
-    given = parser.parse_args()
-    seeds = [range(int(low), int(high) + 1) for low, high in (s.split("-") for s in (given.explored, given.tested))]
-    figures = measured(given.kind, list(seeds[0]), list(seeds[1]), given.encoder, given.cache)
-    print(json.dumps({name: round(value, 4) for name, value in figures.items()}, indent=1))
-
-
-if __name__ == "__main__":
-    main()
+def segmented(world: SeenWorld, prior: Prior) -> tuple[Scene, PriorEvidence | None]:
+    """The world's scene under a prior once the segmenter rests, and what it tells of the prior."""
+    seen = world.perception
+    config, robot = msgspec.structs.replace(CFG, space=seen.space), seen.places.robot
+    with labelling(config, robot, seen.text) as pipeline:
+        pipeline.publish(PLACE_DELTA, seen.places)
+        for pyramid in seen.pyramids:
+            pipeline.publish(PYRAMID, pyramid)
+        segmenter = pipeline.of("segmenter")
+        see_objects(segmenter.state, world.objects, config)
+        put_in_force(pipeline, robot, prior)
+        for stamp_ns in range(1, MOST_TICKS):
+            pipeline.feed(segmenter, Tick(stamp_ns=stamp_ns))
+            if not segmenter.state.labelling.dirty:
+                break
+        told = prior_evidence.evidence(segmenter.state, config)
+        scene = scene_of(pipeline, robot)
+    return scene, told and msgspec.structs.replace(told, robot=world.dataset.name.replace(":", "-"))

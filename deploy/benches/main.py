@@ -23,6 +23,7 @@ from prior_sg.deploy.benches.store import store_bench
 from prior_sg.deploy.benches.swap import swap_bench
 from prior_sg.deploy.sample import SAMPLE
 from prior_sg.deploy.settings import DEMO_ENVIRONMENT, DEMO_TASK
+from prior_sg.deploy.terminal import Terminal
 from prior_sg.schemas.frames import Keyframe
 from prior_sg.schemas.priors import PriorRequest, Task
 from prior_sg.schemas.topics import KEYFRAME, PRIOR, PRIORS, TASK, TEXT
@@ -192,13 +193,25 @@ LONG: dict[str, Callable[[float], tuple[dict, dict]]] = {  # no part of `all`; t
 }
 
 
-def run(name: str, seconds: float, paths: Sequence[Path] = (), presets: Sequence[str] = ()) -> dict[str, Any]:
+def learning_in_worlds(kind: str) -> tuple[dict, dict]:
+    """Learning in generated worlds; see `prior_sg.deploy.benches.learning_worlds`."""
+    from prior_sg.deploy.benches.learning_worlds import learning_worlds_bench  # compiles the worlds' loops
+
+    return learning_worlds_bench(kind, Terminal(stderr=True).print)
+
+
+def run(
+    name: str, seconds: float, paths: Sequence[Path] = (), presets: Sequence[str] = (), *, worlds: str = ""
+) -> dict[str, Any]:
     """One measurement as the object that `--json` prints; `seconds` are those of the attacked pool.
 
     With `paths`, `places` is the table of those recordings and worlds, made with these presets of the place graph.
+    With `worlds`, a kind of generated world, `learning` takes place there. Raises EvaluationError for an unknown kind.
     """
     if name == "places" and paths:
         metrics, settings = exactness_bench(paths, presets)
+    elif name == "learning" and worlds:
+        metrics, settings = learning_in_worlds(worlds)
     else:
         metrics, settings = LONG[name](seconds) if name in LONG else BENCHES[name]()
     return {"bench": name, "metrics": metrics, "machine": machine(), "settings": settings}

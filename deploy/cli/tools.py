@@ -128,6 +128,9 @@ def _add_measuring(commands: Commands) -> None:
     bench.add_argument("--seconds", type=float, default=300.0, help="how long pool lasts (default: %(default)s)")
     bench.add_argument("--on", nargs="+", type=Path, default=[], metavar="PATH", help="measure places on these instead")
     bench.add_argument("--presets", nargs="+", default=["indoor"], help="of the place graph, with --on")
+    bench.add_argument(
+        "--worlds", default="", metavar="KIND", help="measure learning in generated worlds, such as home"
+    )
     bench.add_argument("--json", action="store_true", help="print one JSON object per measurement")
 
 
@@ -300,7 +303,7 @@ def cmd_bench(arguments: argparse.Namespace) -> int:
         )
     for name in bench.BENCHES if arguments.name == "all" else [arguments.name]:
         with console.status(f"measuring {name}"):
-            found = bench.run(name, arguments.seconds, arguments.on, arguments.presets)
+            found = bench.run(name, arguments.seconds, arguments.on, arguments.presets, worlds=arguments.worlds)
         if arguments.json:
             print(json.dumps(found))
         else:

@@ -10,6 +10,7 @@ import msgspec
 import numpy as np
 import scipy
 
+from prior_sg.schemas.regions import NO_REGION
 from prior_sg.services.segmenter.core.appearance import adaptation, information, smoothing, unmixing
 from prior_sg.services.segmenter.core.appearance.label_bias import label_bias
 from prior_sg.services.segmenter.core.config import Config
@@ -218,8 +219,10 @@ def rebalance(state: State, idle: bool, cfg: Config) -> None:
 
 
 def weigh_contents(state: State) -> None:
-    """What the objects of each region, as the regions are, say of the label of its places."""
+    """What the objects of each region, as the regions are, say of its places' label; later, while there are none."""
     places = state.map.places
+    if len(places.regions) and (places.regions == NO_REGION).all():
+        return
     found = held_around(state.objects.view, state.map.graph.positions_m, places.regions)
     now = words_of_contents(state.aim.aligned.prior, found) if found.shape[1] else np.zeros_like(places.contents)
     moved = (np.abs(now - places.contents) > CORRECTION_TOLERANCE).any(axis=1)

@@ -129,17 +129,19 @@ def test_each_region_is_told_of_apart_from_its_label():
     np.testing.assert_allclose(seen.contents[np.argsort(rooms)], [[0.9, 0.1], [0, 0], [0, 0]], rtol=1e-6)
 
 
-def rooms_under(counted: float, stove_in: str, ticks: int = 6) -> list[str]:
-    """Labels of three rooms, the first of which holds an oven, under a prior in whose regions `counted` were tested."""
+def rooms_under(counted: float, stove_in: str, ticks: int = 6, *, prior_last: bool = False) -> list[str]:
+    """Labels of three rooms, the first of which holds an oven, under a prior in whose regions `counted` were tested and
+    which comes before anything is seen or, with `prior_last`, after all is."""
     positions, edges = place_grid(3)
     held = np.full((3, 2), 0.02, np.float32)
     held[ROOMS.index(stove_in), 0] = 0.98
     tested = Counts(regions=np.full(3, counted, np.float32)) if counted else None
     runner = segmenter(Config(evidence_ticks=0), ALIKE)
-    runner.feed(place_delta(positions, edges), task(), prior(ROOMS, containment=held, tested=tested), *walk(3), TICK)
+    aim = (task(), prior(ROOMS, containment=held, tested=tested))
+    runner.feed(place_delta(positions, edges), *(() if prior_last else aim), *walk(3), TICK)
     view = ObjectView(np.array([1]), np.array([[2.0, 2.0, 0.5]]), np.array([[1.0, 0.0]]))
     inference.see_objects(runner.state, view, runner.cfg)
-    runner.feed(*[TICK] * ticks)
+    runner.feed(*(aim if prior_last else ()), *[TICK] * ticks)
     assert not runner.state.labelling.dirty, "it rests"
     places = runner.state.map.places
     order = np.argsort(runner.state.map.graph.positions_m[:, 0], kind="stable")
@@ -150,6 +152,10 @@ def test_what_a_whole_region_holds_has_a_say_once_the_prior_was_tested():
     assert rooms_under(0, "bedroom") == ROOMS
     assert rooms_under(50, "bedroom") == ["bedroom", "hall", "bedroom"]
     assert rooms_under(50, "kitchen") == ROOMS
+
+
+def test_it_has_a_say_where_the_prior_comes_to_a_map_that_has_no_regions_yet():
+    assert rooms_under(50, "bedroom", prior_last=True) == ["bedroom", "hall", "bedroom"]
 
 
 def test_each_place_hears_what_its_region_holds_and_the_nearest_most():
