@@ -131,11 +131,19 @@ def hydra() -> tuple[dict, dict]:
     return hydra_bench()
 
 
-def merge() -> tuple[dict, dict]:
-    """Maps of two robots that find together; see `prior_sg.deploy.benches.merge`."""
+def merge(paths: Sequence[Path] = (), report: Callable[[str], None] = lambda text: None) -> tuple[dict, dict]:
+    """Maps of two robots that find together; see `prior_sg.deploy.benches.merge`. `paths` name worlds of one kind, as
+    `world:home:80-91`. Raises EvaluationError."""
     from prior_sg.deploy.benches.merge import merge_bench
+    from prior_sg.deploy.evaluation.datasets import named_worlds
+    from prior_sg.deploy.evaluation.errors import EvaluationError
 
-    return merge_bench()
+    if not paths:
+        return merge_bench(report=report)
+    worlds = [world for path in paths for world in named_worlds(str(path))]
+    if len({world.kind for world in worlds}) > 1:
+        raise EvaluationError("merge walks worlds of one kind: name one, such as world:home:80-91")
+    return merge_bench([world.seed for world in worlds], kind=worlds[0].kind, report=report)
 
 
 def e2e() -> tuple[dict, dict]:
@@ -192,13 +200,22 @@ LONG: dict[str, Callable[[float], tuple[dict, dict]]] = {  # no part of `all`; t
 }
 
 
-def run(name: str, seconds: float, paths: Sequence[Path] = (), presets: Sequence[str] = ()) -> dict[str, Any]:
+def run(
+    name: str,
+    seconds: float,
+    paths: Sequence[Path] = (),
+    presets: Sequence[str] = (),
+    report: Callable[[str], None] = lambda text: None,
+) -> dict[str, Any]:
     """One measurement as the object that `--json` prints; `seconds` are those of the attacked pool.
 
-    With `paths`, `places` is the table of those recordings and worlds, made with these presets of the place graph.
+    With `paths`, `places` is the table of those recordings and worlds, made with these presets of the place graph, and
+    `merge` walks those worlds. `report` hears how far `merge` is.
     """
     if name == "places" and paths:
         metrics, settings = exactness_bench(paths, presets)
+    elif name == "merge":
+        metrics, settings = merge(paths, report)
     else:
         metrics, settings = LONG[name](seconds) if name in LONG else BENCHES[name]()
     return {"bench": name, "metrics": metrics, "machine": machine(), "settings": settings}

@@ -198,6 +198,31 @@ def test_numbers_live_on_in_a_file(tmp_path):
         Fleet(msgspec.structs.replace(CFG, memory=str(tmp_path / "broken")))
 
 
+def test_the_frame_lives_on_in_that_file_for_maps_that_go_on(tmp_path):
+    path = str(tmp_path / "home.msgpack")
+    cfg = msgspec.structs.replace(CFG, memory=path)
+    fleet = Fleet(cfg)
+    fleet.tell(first())
+    fleet.tell(second())
+    fleet.tick()
+    keep(path, fleet.kept[-1])
+    before = dict(zip(fleet.scene().place_ids.tolist(), fleet.scene().positions_m, strict=True))
+
+    def gaps_m(epoch):
+        again = Fleet(cfg, epoch=6)
+        again.tell(second(), epoch)
+        again.tick()
+        scene = again.scene()
+        assert len(scene.place_ids)
+        return [
+            float(np.linalg.norm(before[place] - position_m))
+            for place, position_m in zip(scene.place_ids.tolist(), scene.positions_m, strict=True)
+        ]
+
+    assert max(gaps_m(epoch=1)) < 0.1  # r2 alone, in the frame that r1 gave
+    assert min(gaps_m(epoch=2)) > 1.0  # another writer may map from another place
+
+
 @pytest.mark.parametrize(
     ("changes", "why"),
     [
