@@ -6,7 +6,7 @@ import statistics
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from prior_sg.deploy.benches import features as bench_features
 from prior_sg.deploy.benches import segmenter
@@ -23,7 +23,6 @@ from prior_sg.deploy.benches.store import store_bench
 from prior_sg.deploy.benches.swap import swap_bench
 from prior_sg.deploy.sample import SAMPLE
 from prior_sg.deploy.settings import DEMO_ENVIRONMENT, DEMO_TASK
-from prior_sg.deploy.terminal import Terminal
 from prior_sg.schemas.frames import Keyframe
 from prior_sg.schemas.priors import PriorRequest, Task
 from prior_sg.schemas.topics import KEYFRAME, PRIOR, PRIORS, TASK, TEXT
@@ -31,6 +30,21 @@ from prior_sg.services.ingest.sources import open_source
 from prior_sg.services.registry import BY_NAME
 from prior_sg.services.runtime.runner import Pipeline, Runner
 from prior_sg.services.runtime.service import Identity
+
+
+def _silent(text: str) -> None:
+    """Nobody hears how far a measurement is."""
+
+
+class Asked(NamedTuple):
+    """What may be asked of measurements."""
+
+    seconds: float = 300.0  # how long the pool is attacked
+    paths: Sequence[Path] = ()  # recordings and worlds to measure on: of places, foresight and merge
+    presets: Sequence[str] = ("indoor",)  # of the place graph, with `paths`
+    worlds: str = ""  # the kind of generated worlds in which learning takes place
+    seeds: int = 0  # worlds of each kind that an explorer foresees, 0 = all
+    report: Callable[[str], None] = _silent  # hears how far it is
 
 
 def machine() -> dict[str, Any]:
@@ -58,9 +72,9 @@ def features() -> tuple[dict, dict]:
     return bench_features.features(_sample_keyframes())
 
 
-def attacked_pool(seconds: float) -> tuple[dict, dict]:
+def attacked_pool(asked: Asked) -> tuple[dict, dict]:
     """A pool whose workers are killed, frozen, slowed and added at random."""
-    return bench_features.attacked(_sample_keyframes(), seconds, rate_hz=40.0)
+    return bench_features.attacked(_sample_keyframes(), asked.seconds, rate_hz=40.0)
 
 
 def exchanged_encoder() -> tuple[dict, dict]:
@@ -101,11 +115,14 @@ def exchanged() -> tuple[dict, dict]:
     return exchange_bench(ROWS, SAMPLE)
 
 
-def foresight() -> tuple[dict, dict]:
-    """Regions foreseen and searched for in generated worlds; see `prior_sg.deploy.benches.foresight`."""
-    from prior_sg.deploy.benches.foresight import foresight_bench  # compiles the worlds' loops
+def foresight(asked: Asked) -> tuple[dict, dict]:
+    """Regions foreseen and searched for in generated worlds, and on maps of those named; see
+    `prior_sg.deploy.benches.foresight`. Raises EvaluationError."""
+    from prior_sg.deploy.benches.foresight import MAPPED, SEEDS, foresight_bench  # compiles the worlds' loops
+    from prior_sg.deploy.evaluation.datasets import named_worlds
 
-    return foresight_bench()
+    worlds = [world for path in asked.paths for world in named_worlds(str(path))] or MAPPED
+    return foresight_bench(SEEDS[: asked.seeds or len(SEEDS)], worlds, report=asked.report)
 
 
 def memory() -> tuple[dict, dict]:
@@ -132,11 +149,19 @@ def hydra() -> tuple[dict, dict]:
     return hydra_bench()
 
 
-def merge() -> tuple[dict, dict]:
-    """Maps of two robots that find together; see `prior_sg.deploy.benches.merge`."""
+def merge(asked: Asked) -> tuple[dict, dict]:
+    """Maps of two robots that find together, of worlds of one kind; see `prior_sg.deploy.benches.merge`. Raises
+    EvaluationError."""
     from prior_sg.deploy.benches.merge import merge_bench
+    from prior_sg.deploy.evaluation.datasets import named_worlds
+    from prior_sg.deploy.evaluation.errors import EvaluationError
 
-    return merge_bench()
+    if not asked.paths:
+        return merge_bench(report=asked.report)
+    worlds = [world for path in asked.paths for world in named_worlds(str(path))]
+    if len({world.kind for world in worlds}) > 1:
+        raise EvaluationError("merge walks worlds of one kind: name one, such as world:home:80-91")
+    return merge_bench([world.seed for world in worlds], kind=worlds[0].kind, report=asked.report)
 
 
 def e2e() -> tuple[dict, dict]:
@@ -179,39 +204,33 @@ BENCHES: dict[str, Callable[[], tuple[dict, dict]]] = {
     "memory": memory,
     "start": start,
 }
-LONG: dict[str, Callable[[float], tuple[dict, dict]]] = {  # no part of `all`; the pool lasts as long as it is told to
+LONG: dict[str, Callable[[Asked], tuple[dict, dict]]] = {  # no part of `all`; the pool lasts as long as it is told to
     "pool": attacked_pool,
-    "store_crashes": lambda seconds: crashes(),
-    "lidar": lambda seconds: lidar(),  # seven minutes and more
-    "levels": lambda seconds: levels(),  # many minutes
-    "exchange": lambda seconds: exchanged(),  # nine runs of the sample at half its pace
-    "foresight": lambda seconds: foresight(),  # worlds of every kind: long
-    "fleet": lambda seconds: fleet(),  # processes of its own, for minutes
-    "view": lambda seconds: view(),  # needs an extra and a browser
-    "hydra": lambda seconds: hydra(),  # needs an extra
-    "merge": lambda seconds: merge(),  # maps dozens of homes, which it keeps
+    "store_crashes": lambda asked: crashes(),
+    "lidar": lambda asked: lidar(),  # seven minutes and more
+    "levels": lambda asked: levels(),  # many minutes
+    "exchange": lambda asked: exchanged(),  # nine runs of the sample at half its pace
+    "foresight": foresight,  # worlds of every kind: long
+    "fleet": lambda asked: fleet(),  # processes of its own, for minutes
+    "view": lambda asked: view(),  # needs an extra and a browser
+    "hydra": lambda asked: hydra(),  # needs an extra
+    "merge": merge,  # maps dozens of homes, which it keeps
 }
 
 
-def learning_in_worlds(kind: str) -> tuple[dict, dict]:
-    """Learning in generated worlds; see `prior_sg.deploy.benches.learning_worlds`."""
+def learning_in_worlds(asked: Asked) -> tuple[dict, dict]:
+    """Learning in generated worlds; see `prior_sg.deploy.benches.learning_worlds`. Raises EvaluationError."""
     from prior_sg.deploy.benches.learning_worlds import learning_worlds_bench  # compiles the worlds' loops
 
-    return learning_worlds_bench(kind, Terminal(stderr=True).print)
+    return learning_worlds_bench(asked.worlds, asked.report)
 
 
-def run(
-    name: str, seconds: float, paths: Sequence[Path] = (), presets: Sequence[str] = (), *, worlds: str = ""
-) -> dict[str, Any]:
-    """One measurement as the object that `--json` prints; `seconds` are those of the attacked pool.
-
-    With `paths`, `places` is the table of those recordings and worlds, made with these presets of the place graph.
-    With `worlds`, a kind of generated world, `learning` takes place there. Raises EvaluationError for an unknown kind.
-    """
-    if name == "places" and paths:
-        metrics, settings = exactness_bench(paths, presets)
-    elif name == "learning" and worlds:
-        metrics, settings = learning_in_worlds(worlds)
+def run(name: str, asked: Asked) -> dict[str, Any]:
+    """One measurement as the object that `--json` prints."""
+    if name == "places" and asked.paths:
+        metrics, settings = exactness_bench(asked.paths, asked.presets)
+    elif name == "learning" and asked.worlds:
+        metrics, settings = learning_in_worlds(asked)
     else:
-        metrics, settings = LONG[name](seconds) if name in LONG else BENCHES[name]()
+        metrics, settings = LONG[name](asked) if name in LONG else BENCHES[name]()
     return {"bench": name, "metrics": metrics, "machine": machine(), "settings": settings}

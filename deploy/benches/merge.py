@@ -3,18 +3,21 @@
 Each home is walked in two parts that share some of the way, each in a frame of its own (see `partial_walks`). The
 matcher's answer is right when it is within RIGHT_M at the middle of the first map and RIGHT_RAD in heading. Every
 part is then matched with the parts of other homes: any answer but a refusal is a false accept. Where maps have found
-together, the merged scene is judged as one walk through the whole home is.
+together, the merged scene is judged beside one walk through the whole home, with and without drift, and, where a part
+has been, beside that part: scores leave out what a map does not cover, so that over the whole home half a map may seem
+better than a whole one.
 """
 
 import itertools
 import statistics
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import msgspec
 import numpy as np
 
-from prior_sg.deploy.evaluation.metrics import evaluate
+from prior_sg.deploy.evaluation.metrics import assign, evaluate
 from prior_sg.deploy.evaluation.partial_walks import Part, PartialMap, Walks
 from prior_sg.deploy.fleet.core.finding.config import MatchConfig
 from prior_sg.deploy.fleet.core.finding.frames import apart
@@ -28,6 +31,8 @@ from prior_sg.schemas.scene import Scene
 from prior_sg.services.geometry import inverse, transform
 
 SCORED = range(60, 100)
+FULL, DRIFTING = Part(0.0, 1.0, 0), Part(0.0, 1.0, 3)  # the whole walk, from true poses and from such as parts have
+WORTH = "f1_s", "miou_s_penalised", "accuracy"
 RIGHT_M, RIGHT_RAD = 0.5, np.radians(5)
 SHARED = (0.05, 0.7)  # share of the walk that both parts hold, drawn anew for each home
 DIFFERENT = 1000  # pairs of different homes
@@ -67,17 +72,25 @@ class Outcome(NamedTuple):
         return self.found is not None and bool(self.gap_m < RIGHT_M and self.gap_rad < RIGHT_RAD)
 
 
-def merge_bench(seeds: Sequence[int] = SCORED, folder: Path = FOLDER) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Success, errors, false accepts, and what merged scenes are worth."""
-    walks = Walks(folder)
-    homes = [two_of(walks, seed) for seed in seeds]
-    outcomes = [outcome_of(two) for two in homes]
-    metrics = figures(outcomes)
-    tried, accepted = false_accepts(homes, DIFFERENT)
+def merge_bench(
+    seeds: Sequence[int] = SCORED,
+    folder: Path = FOLDER,
+    *,
+    kind: str = "home",
+    report: Callable[[str], None] = lambda text: None,
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Success, errors, false accepts, and what merged scenes are worth. `report` hears what is being done."""
+    walks = Walks(folder, kind=kind)
+    outcomes, scores = [], []
+    for number, seed in enumerate(seeds, 1):
+        report(f"{kind} {seed}, {number} of {len(seeds)}")
+        outcomes.append(outcome_of(two_of(walks, seed)))
+        if outcomes[-1].right:
+            scores.append(worth(walks, outcomes[-1]))
+    metrics = figures(outcomes) | means(scores) | resumed(outcomes)
+    tried, accepted = false_accepts([one.two for one in outcomes], DIFFERENT, report=report)
     metrics |= {"different_pairs": tried, "false_accepts": len(accepted)}
-    metrics |= worth(walks, outcomes)
-    metrics |= resumed(outcomes)
-    return metrics, {"homes": len(homes), "seeds": f"{min(seeds)}-{max(seeds)}", "right_m": RIGHT_M}
+    return metrics, {"worlds": kind, "homes": len(seeds), "seeds": f"{min(seeds)}-{max(seeds)}", "right_m": RIGHT_M}
 
 
 def parts_of(seed: int) -> tuple[Part, Part]:
@@ -121,38 +134,72 @@ def figures(outcomes: list[Outcome]) -> dict[str, float]:
     return found
 
 
-def false_accepts(homes: Sequence[Two], most: int, cfg: MatchConfig = CFG) -> tuple[int, list[tuple[int, int]]]:
+def false_accepts(
+    homes: Sequence[Two],
+    most: int,
+    cfg: MatchConfig = CFG,
+    report: Callable[[str], None] = lambda text: None,
+) -> tuple[int, list[tuple[int, int]]]:
     """How many pairs of maps of different homes were tried, and the homes of those that were taken for one."""
     both = itertools.product((0, 1), repeat=2)
     pairs = [(*homes_, *parts) for homes_, parts in itertools.product(itertools.combinations(homes, 2), both)]
     order = np.random.default_rng(0).permutation(len(pairs))[:most]
     accepted = []
-    for one, other, here, there in (pairs[at] for at in order.tolist()):
+    for number, (one, other, here, there) in enumerate((pairs[at] for at in order.tolist()), 1):
+        report(f"different homes, pair {number} of {len(order)}")
         if match(one.maps[here], other.maps[there], cfg).b_from_a is not None:
             accepted.append((one.seed, other.seed))
     return len(order), accepted
 
 
-def worth(walks: Walks, outcomes: list[Outcome]) -> dict[str, float]:
-    """F1_S of merged scenes against that of one full walk, and of the better of the two parts."""
-    scores: dict[str, list[float]] = {"f1_s_merged": [], "f1_s_full": [], "f1_s_better_part": []}
-    for one in outcomes:
-        if not one.right or one.found is None:
-            continue
-        whole, truth = walks.part(one.two.seed, Part(0.0, 1.0, 0)), walks.truth(one.two.seed)
-        first, second = one.two.parts
-        world_from_first = inverse(first.own_from_world)
-        poses = world_from_first, world_from_first @ inverse(one.found)
-        sources = [
-            Source(Name(f"robot{k}", 0), part.scene, pose)
-            for k, (part, pose) in enumerate(zip((first, second), poses, strict=True))
-        ]
-        both = merged("home", sources, Memory()).scene
-        alone = [merged("home", [source], Memory()).scene for source in sources]
-        scores["f1_s_merged"].append(evaluate(both, whole.voxels, truth)["f1_s"])
-        scores["f1_s_full"].append(evaluate(whole.scene, whole.voxels, truth)["f1_s"])
-        scores["f1_s_better_part"].append(max(evaluate(scene, whole.voxels, truth)["f1_s"] for scene in alone))
-    return {name: statistics.mean(values) if values else float("nan") for name, values in scores.items()}
+def worth(walks: Walks, outcome: Outcome) -> dict[str, float]:
+    """Scores of one home's merged scene, by what was scored and where. Raises ValueError where none was found."""
+    if outcome.found is None:
+        raise ValueError("the parts have not found together")
+    whole, truth = walks.part(outcome.two.seed, FULL), walks.truth(outcome.two.seed)
+    drifting = walks.part(outcome.two.seed, DRIFTING)
+    first, second = outcome.two.parts
+    world_from_first = inverse(first.own_from_world)
+    poses = world_from_first, world_from_first @ inverse(outcome.found)
+    sources = [
+        Source(Name(f"robot{k}", 0), part.scene, pose)
+        for k, (part, pose) in enumerate(zip((first, second), poses, strict=True))
+    ]
+    alone = [merged("home", [source], Memory()).scene for source in sources]
+    one_robot = Source(Name("robot", 0), drifting.scene, inverse(drifting.own_from_world))
+    scenes = {
+        "merged": merged("home", sources, Memory()).scene,
+        "full": whole.scene,
+        "full_drifting": merged("home", [one_robot], Memory()).scene,
+    }
+    found = {
+        f"{score}_{name}": value
+        for name, scene in scenes.items()
+        for score, value in evaluate(scene, whole.voxels, truth).items()
+        if score in WORTH
+    }
+    found["f1_s_better_part"] = max(evaluate(scene, whole.voxels, truth)["f1_s"] for scene in alone)
+    there: dict[str, list[float]] = {}
+    for part in alone:
+        own = msgspec.structs.replace(whole.voxels, free=assign(part, whole.voxels, truth).voxels)
+        for name, scene in (scenes | {"part": part}).items():
+            for score, value in evaluate(scene, own, truth).items():
+                if score in WORTH:
+                    there.setdefault(f"{score}_where_a_part_was_{name}", []).append(value)
+    return found | {name: statistics.mean(values) for name, values in there.items()}
+
+
+def means(scores: list[dict[str, float]]) -> dict[str, float]:
+    """Means over homes, and what F1_S of merged scenes has on that of others, with its standard error."""
+    if not scores:
+        return {}
+    found = {name: statistics.mean(one[name] for one in scores) for name in scores[0]}
+    for where, rival in (("", "full"), ("", "full_drifting"), ("where_a_part_was_", "part")):
+        gaps = [one[f"f1_s_{where}merged"] - one[f"f1_s_{where}{rival}"] for one in scores]
+        found[f"gain_on_{rival}"] = statistics.mean(gaps)
+        if len(gaps) > 1:
+            found[f"gain_on_{rival}_sem"] = statistics.stdev(gaps) / len(gaps) ** 0.5
+    return found
 
 
 def resumed(outcomes: list[Outcome]) -> dict[str, float]:

@@ -123,10 +123,17 @@ def _add_measuring(commands: Commands) -> None:
     bench.add_argument(
         "name",
         help="bus, places, features, kernel, swap, segmenter, task, learning, encoder_swap, queries, e2e, store, all "
-        "of these, or exchange, levels, pool, store_crashes, lidar, view, hydra",
+        "of these, or exchange, fleet, foresight, levels, merge, pool, store_crashes, lidar, view, hydra",
     )
     bench.add_argument("--seconds", type=float, default=300.0, help="how long pool lasts (default: %(default)s)")
-    bench.add_argument("--on", nargs="+", type=Path, default=[], metavar="PATH", help="measure places on these instead")
+    bench.add_argument(
+        "--on",
+        nargs="+",
+        type=Path,
+        default=[],
+        metavar="PATH",
+        help="measure places on these instead, or merge, as on world:home:80-91",
+    )
     bench.add_argument("--presets", nargs="+", default=["indoor"], help="of the place graph, with --on")
     bench.add_argument(
         "--worlds", default="", metavar="KIND", help="measure learning in generated worlds, such as home"
@@ -302,8 +309,15 @@ def cmd_bench(arguments: argparse.Namespace) -> int:
             f"there is no measurement {arguments.name!r}; known: {', '.join((*bench.BENCHES, *bench.LONG))}, all"
         )
     for name in bench.BENCHES if arguments.name == "all" else [arguments.name]:
-        with console.status(f"measuring {name}"):
-            found = bench.run(name, arguments.seconds, arguments.on, arguments.presets, worlds=arguments.worlds)
+        with console.status(f"measuring {name}") as status:
+            asked = bench.Asked(
+                seconds=arguments.seconds,
+                paths=arguments.on,
+                presets=arguments.presets,
+                worlds=arguments.worlds,
+                report=partial(_tell, status, name),
+            )
+            found = bench.run(name, asked)
         if arguments.json:
             print(json.dumps(found))
         else:

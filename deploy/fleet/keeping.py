@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import msgspec
+import numpy as np
 
 from prior_sg.deploy.errors import UserError
 from prior_sg.deploy.fleet.core.ids import KINDS, Ids, Kind, Name
@@ -25,7 +26,14 @@ def kept_memory(path: str) -> Memory:
     ids = Ids()
     for kind, robot, session, number, given in numbers.given:
         ids.adopt(_kind(kind, path), Name(robot, session), number, given)
-    return Memory(ids, dict(numbers.region_of), numbers.next_region)
+    frames = {(Name(robot, session), epoch): _pose(rows, path) for robot, session, epoch, rows in numbers.frames}
+    return Memory(ids, dict(numbers.region_of), numbers.next_region, frames)
+
+
+def _pose(rows: Sequence[float], path: str) -> np.ndarray:
+    if len(rows) != 16 or not np.isfinite(rows).all():
+        raise ServiceError(f"{path} holds no numbers of a fleet: name another file, or move it away")
+    return np.array(rows, float).reshape(4, 4)
 
 
 def _kind(text: str, path: str) -> Kind:

@@ -1,9 +1,12 @@
 """What several robots together believe of each place's label (pure).
 
-Posteriors of robots that saw the same spot are multiplied and divided by the prior they share, the unknown mass of each
-counting as the prior. A place keeps the label of its robot's region where nobody else has seen it; elsewhere the joint
-belief names it. Then neighbours agree: a few rounds in which each place takes the label that its belief and the places
-beside it, by the width of the way there, make likeliest.
+Of robots that saw one spot the mean of the log beliefs counts, by how much of it each knows: they looked at the same
+walls, and a robot's own many looks count as their mean, too. These means are the costs of a field over all places, with
+the segmenter's edges, borders and price of a region, whose best labels are those of the merged map. A map that is alone
+keeps what its robot tells.
+
+What a robot believes holds the pull of its own neighbours already. Whoever knew how much its segmenter doubts itself
+could take that out, but robots do not tell; a wrong guess ruins the labels, and left in, it costs nothing.
 """
 
 from collections.abc import Sequence
@@ -12,12 +15,17 @@ from typing import NamedTuple
 import numpy as np
 
 from prior_sg.deploy.fleet.core.fusing import Fused, Placed
+from prior_sg.schemas.scene import Scene
+from prior_sg.services.segmenter.core.config import Config
+from prior_sg.services.segmenter.core.energy.mrf import Field
+from prior_sg.services.segmenter.core.energy.region_cost import consolidated
+from prior_sg.services.segmenter.core.energy.solver import Solver
+from prior_sg.services.segmenter.core.map.place_map import edge_weights
+from prior_sg.services.segmenter.core.map.received import ReceivedGraph
 
-FLOOR = 1e-3  # of any label's probability, before it is multiplied
-LEAST = 1e-4  # of any label's joint probability
-ROUNDS = 5
-NEIGHBOUR, OWN = 1.0, 1.0  # what a neighbour across an open way, and the label so far, are worth in log-likelihood
-OPEN_M = 0.6  # clearance from which a way is open
+CFG = Config()  # what a segmenter does that nobody has told otherwise
+FLOOR = 1e-3  # of any label's probability; what is below is not told when it changes
+LEAST_KNOWN = 1e-3  # of a place that no robot has looked at
 
 
 class Believed(NamedTuple):
@@ -36,68 +44,64 @@ def believed(maps: Sequence[Placed], found: Fused) -> Believed:
     count = len(found.ids)
     if not names:
         return Believed([], np.full(count, -1), np.zeros((count, 0)), np.ones(count), np.zeros(count, bool))
-    own = [_spread(one, names) for one in maps]
-    logs, unknown = np.zeros((count, len(names))), np.ones(count)
-    labels, seen, predicted = np.full(count, -1), np.zeros(count, int), np.ones(count, bool)
+    labels, unknown, predicted = np.full(count, -1), np.ones(count), np.ones(count, bool)
     for number, one in reversed(list(enumerate(maps))):
-        nodes, joint = found.node_of[number], _joint(number, own, found.beside)
-        np.add.at(logs, nodes, joint)
-        np.add.at(seen, nodes, 1)
+        nodes, own = found.node_of[number], _labels(one.scene, names)
         np.minimum.at(unknown, nodes, one.scene.unknown.astype(float))
         predicted[nodes] &= np.isin(one.scene.place_ids, one.scene.predicted_ids)
-        told = _labels(one, joint, names, found.beside[number])
-        labels[nodes] = np.where(told >= 0, told, labels[nodes])
-    logs /= np.maximum(seen, 1)[:, None]
+        labels[nodes] = np.where(own >= 0, own, labels[nodes])
+    logs = _together(maps, found, names)
     posteriors = np.exp(logs - logs.max(axis=1, keepdims=True))
     posteriors /= posteriors.sum(axis=1, keepdims=True)
-    several = len(maps) > 1
-    return Believed(names, _agreed(labels, posteriors, found) if several else labels, posteriors, unknown, predicted)
+    if len(maps) > 1:
+        labels = _settled(labels, -CFG.temperature * logs, found)
+    return Believed(names, labels, posteriors, unknown, predicted)
 
 
-def _spread(one: Placed, names: list[str]) -> np.ndarray:
-    """Log beliefs (place, name) with the unknown mass spread evenly."""
-    scene = one.scene
-    held = np.zeros((len(scene.place_ids), len(names)))
-    held[:, [names.index(label) for label in scene.labels]] = scene.posteriors
-    unknown = np.clip(scene.unknown.astype(float), 0, 1)[:, None]
-    held = held * (1 - unknown) + unknown / len(names)
-    return np.asarray(np.log(np.maximum(held / np.maximum(held.sum(axis=1, keepdims=True), 1e-9), FLOOR)))
+def _labels(scene: Scene, names: list[str]) -> np.ndarray:
+    """Label (place,) of each place of a map, -1 = none."""
+    calls = {region.id: names.index(region.label) for region in scene.regions if region.label in names}
+    return np.array([calls.get(region, -1) for region in scene.place_regions.tolist()], np.int64)
 
 
-def _joint(number: int, own: list[np.ndarray], beside: list[list[np.ndarray]]) -> np.ndarray:
-    """Log belief (place, name) of one map's places with what the others believe beside them; the prior is even."""
-    logs = own[number].copy()
-    for other, rows in enumerate(beside[number]):
-        met = rows >= 0
-        logs[met] += own[other][rows[met]]
-    return logs
+def _told(scene: Scene, names: list[str]) -> np.ndarray:
+    """A robot's log beliefs (place, name), over all names."""
+    told = np.zeros((len(scene.place_ids), len(names)))
+    told[:, [names.index(label) for label in scene.labels]] = scene.posteriors
+    return np.asarray(np.log(np.maximum(told / np.maximum(told.sum(axis=1, keepdims=True), FLOOR), FLOOR)))
 
 
-def _labels(one: Placed, joint: np.ndarray, names: list[str], beside: list[np.ndarray]) -> np.ndarray:
-    """Label (place,) of one map's places: its region's where no other map has a place, else by joint belief."""
-    calls = {region.id: names.index(region.label) for region in one.scene.regions if region.label in names}
-    own = np.array([calls.get(region, -1) for region in one.scene.place_regions.tolist()], np.int64)
-    met = np.zeros(len(own), bool)
-    for rows in beside:
-        met |= rows >= 0
-    return np.where(met & (own >= 0), joint.argmax(axis=1), own) if len(own) else own
+def _together(maps: Sequence[Placed], found: Fused, names: list[str]) -> np.ndarray:
+    """Mean log beliefs (node, name): of the places that a node is made of, and of places beside it in other maps."""
+    sums, masses = np.zeros((len(found.ids), len(names))), np.zeros(len(found.ids))
+    told = [_told(one.scene, names) for one in maps]
+    known = [np.maximum(1 - one.scene.unknown.astype(float), LEAST_KNOWN) for one in maps]
+    for number, nodes in enumerate(found.node_of):
+        np.add.at(sums, nodes, known[number][:, None] * told[number])
+        np.add.at(masses, nodes, known[number])
+        for other, rows in enumerate(found.beside[number]):
+            met = (rows >= 0) & ~np.isin(nodes, found.node_of[other])
+            np.add.at(sums, nodes[met], known[other][rows[met], None] * told[other][rows[met]])
+            np.add.at(masses, nodes[met], known[other][rows[met]])
+    return np.asarray(sums / masses[:, None])
 
 
-def _agreed(labels: np.ndarray, posteriors: np.ndarray, found: Fused) -> np.ndarray:
-    """Labels (node,) after neighbours were heard; a node without a label keeps none."""
+def _settled(labels: np.ndarray, unary: np.ndarray, found: Fused) -> np.ndarray:
+    """Labels (node,) of the field over all nodes that have a label; the others keep none."""
     known = np.flatnonzero(labels >= 0)
-    logs = np.log(np.maximum(posteriors, LEAST))
-    logs[known, labels[known]] += OWN
-    weights = NEIGHBOUR * np.minimum(found.clearances_m / OPEN_M, 1.0)
-    now = labels
-    for _ in range(ROUNDS):
-        votes = np.zeros_like(logs)
-        for here, there in ((0, 1), (1, 0)):
-            heard = now[found.edges[:, there]] >= 0
-            ends = found.edges[heard]
-            np.add.at(votes, (ends[:, here], now[ends[:, there]]), weights[heard])
-        then = np.where(labels >= 0, (logs + votes).argmax(axis=1), -1)
-        if (then == now).all():
-            break
-        now = then
-    return now
+    if not len(known):
+        return labels
+    rank = np.full(len(labels), -1)
+    rank[known] = np.arange(len(known))
+    inner = (rank[found.edges] >= 0).all(axis=1)
+    edges = rank[found.edges[inner]].reshape(-1, 2)
+    graph = ReceivedGraph(
+        found.ids[known], found.positions_m[known], found.radii_m[known], edges, found.clearances_m[inner]
+    )
+    border = CFG.beta * CFG.adjacency.border * (1 - np.eye(unary.shape[1]))  # of which no prior says anything
+    field = Field(unary[known], edges, edge_weights(graph, CFG), border)
+    solver = Solver(CFG.solver)
+    solver.update(field, labels[known])
+    labels = labels.copy()
+    labels[known] = consolidated(field, solver.drain(), CFG.region_cost)
+    return labels

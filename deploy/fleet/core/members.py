@@ -47,6 +47,11 @@ class Member:
             self._map = map_of(scenes.scene(self.graph))
         return self._map
 
+    @property
+    def written(self) -> tuple[Name, int]:
+        """Whose map it is, and the epoch of who writes its places."""
+        return self.name, self.graph.place_cursor.epoch
+
     def frame_ids(self) -> list[int]:
         """Of the map's trajectory."""
         graph = self.graph

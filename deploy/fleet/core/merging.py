@@ -40,6 +40,8 @@ class Memory:
     ids: Ids = field(default_factory=Ids)
     region_of: dict[int, int] = field(default_factory=dict)  # by place, also of places that are gone for now
     next_region: int = 0
+    frames: dict[tuple[Name, int], np.ndarray] = field(default_factory=dict)  # fleet_from_own (4, 4) of each map, by
+    # the epoch of who writes its places: how maps lay when the fleet was followed last
 
 
 @dataclass(frozen=True)

@@ -98,6 +98,7 @@ class Numbers(msgspec.Struct, frozen=True, kw_only=True):
     given: list[tuple[str, str, int, int, int]]  # kind, robot, session, the robot's number, the fleet's
     region_of: list[tuple[int, int]]  # place, region
     next_region: int
+    frames: list[tuple[str, int, int, list[float]]] = []  # robot, session, epoch of its places, fleet_from_own by rows
 
 
 class KeepNumbers(Message, frozen=True, kw_only=True):
@@ -140,7 +141,8 @@ def _tick(state: State, cfg: Config) -> Iterator[Message]:
     for one in members:
         one.changed = False
     events, state.events = state.events, []
-    if cfg.memory and (count := sum(state.memory.ids.following.values())) != state.kept_ids:
+    moved, count = _note_frames(state.memory, related), sum(state.memory.ids.following.values())
+    if cfg.memory and (moved or count != state.kept_ids):
         state.kept_ids = count
         yield KeepNumbers(robot=state.robot, content=_numbers(state.memory))
     tolerances = cfg.min_change_m, cfg.posterior_change
@@ -153,8 +155,19 @@ def _numbers(memory: Memory) -> bytes:
         for kind, known in memory.ids.given.items()
         for (name, number), fleet in known.items()
     ]
-    kept = Numbers(given=given, region_of=sorted(memory.region_of.items()), next_region=memory.next_region)
-    return msgspec.msgpack.encode(kept)
+    frames = [(*name, epoch, pose.ravel().tolist()) for (name, epoch), pose in memory.frames.items()]
+    regions = sorted(memory.region_of.items())
+    return msgspec.msgpack.encode(
+        Numbers(given=given, region_of=regions, next_region=memory.next_region, frames=frames)
+    )
+
+
+def _note_frames(memory: Memory, related: list[Member]) -> bool:
+    """Remember how the maps lie; whether any lies otherwise than remembered."""
+    now = {one.written: one.relation.fleet_from_own for one in related if one.relation is not None}
+    moved = any(not np.array_equal(pose, memory.frames.get(key)) for key, pose in now.items())
+    memory.frames |= now
+    return moved
 
 
 def merged_of(robot: str, members: list[Member], memory: Memory) -> tuple[Merged, list[tuple[Name, Change]]]:
@@ -177,6 +190,7 @@ def relate(state: State, cfg: Config) -> None:
     """Find out how maps lie in the fleet's frame, and fit what is known to what has been seen since."""
     members = [one for one in state.members() if len(one.graph.places) >= cfg.match.least_places]
     _given(members, cfg.transforms)
+    _as_before(state, members)
     if members and not any(one.relation for one in state.members()):
         first = next((one for one in members if one.former), members[0])
         first.relation, first.why = Relation(np.eye(4), given=True, places=len(first.graph.places)), ""
@@ -193,6 +207,19 @@ def _given(members: list[Member], transforms: Mapping[str, tuple[float, float, f
         if one.relation is None and not one.former and one.name.robot in transforms:
             x, y, z, yaw = transforms[one.name.robot]
             one.relation, one.why = Relation(level(yaw, np.array((x, y, z))), given=True), ""
+
+
+def _as_before(state: State, members: list[Member]) -> None:
+    """Maps whose writer goes on lie as they did when the fleet was followed last; the first of them holds the frame."""
+    found = []
+    for one in members:
+        pose = state.memory.frames.get(one.written)
+        if one.relation is None and not one.tried_places and pose is not None:
+            one.relation, one.why = Relation(pose, given=False, places=len(one.graph.places), tick=state.ticks), ""
+            found.append(one)
+    if found and not any(one.relation is not None and one.relation.given for one in members):
+        holder = next((one for one in found if one.former), found[0])
+        holder.relation = Relation(state.memory.frames[holder.written], given=True, places=len(holder.graph.places))
 
 
 def _due(state: State, one: Member) -> bool:
@@ -244,6 +271,7 @@ def _correct(state: State, one: Member, members: list[Member], cfg: Config) -> N
         one.changed |= moves
         return
     one.relation = None
+    state.memory.frames.pop(one.written, None)
     _seek(state, one, members, cfg)
     if one.relation is None:
         state.events.append(f"{one.name.robot} fits no longer: {fault_of(evidence, lenient)}")

@@ -1,12 +1,18 @@
 """What `prior-sg bench merge` counts, on small houses."""
 
+from pathlib import Path
+
+import msgspec
 import numpy as np
 import pytest
 
-from prior_sg.deploy.benches import merge
+from prior_sg.deploy.benches import main, merge
+from prior_sg.deploy.evaluation.errors import EvaluationError
 from prior_sg.deploy.evaluation.partial_walks import PartialMap, drifting, moved
 from prior_sg.deploy.fleet.core.finding.frames import level
 from prior_sg.deploy.fleet.core.finding.matching import map_of
+from prior_sg.deploy.truth import GroundTruth, TrueRegion
+from prior_sg.schemas.places import VoxelMap
 from prior_sg.services.geometry import inverse
 from tests.help import houses
 
@@ -57,3 +63,39 @@ def test_walks_are_moved_and_drift():
     told = drifting([pose] * 50, rng)
     gaps_m = [np.linalg.norm((inverse(pose) @ one)[:3, 3]) for one in told]
     assert 0.01 < max(gaps_m) < 0.4
+
+
+class Walks:
+    """A whole walk that takes the bathroom for a kitchen; with drift, for a hallway, and the bedroom, too."""
+
+    def part(self, seed, part):
+        wrong = {4: "kitchen"} if part == merge.FULL else {3: "hallway", 4: "hallway"}
+        scene = houses.scene()
+        regions = [msgspec.structs.replace(one, label=wrong.get(one.id, one.label)) for one in scene.regions]
+        x, y = np.meshgrid(np.arange(40), np.arange(45))
+        free = np.column_stack((x.ravel(), y.ravel(), np.full(x.size, 4))).astype(np.int16)
+        voxels = VoxelMap(robot="r1", voxel_m=0.2, free=free, occupied=free[:0])
+        return PartialMap(msgspec.structs.replace(scene, regions=regions), np.eye(4), voxels)
+
+    def truth(self, seed):
+        corners = [((x0, y0), (x1, y0), (x1, y1), (x0, y1)) for _, x0, y0, x1, y1 in houses.ROOMS]
+        rooms = zip(houses.ROOMS, corners, strict=True)
+        regions = [TrueRegion(n, room[0], np.array(polygon), 0.0, 2.0) for n, (room, polygon) in enumerate(rooms)]
+        return GroundTruth(tuple(regions))
+
+
+def test_a_merged_map_is_judged_beside_whole_walks_and_where_each_part_was(house):
+    scores = merge.worth(Walks(), merge.outcome_of(house))
+    assert scores["f1_s_merged"] == pytest.approx(1.0, abs=0.02)
+    assert scores["f1_s_full"] == pytest.approx(0.8, abs=0.03) and scores["f1_s_full_drifting"] < 0.7
+    assert scores["f1_s_where_a_part_was_part"] == pytest.approx(1.0, abs=0.02)
+    assert 0.7 < scores["f1_s_where_a_part_was_full"] < 0.95
+    worse = {name: value - 0.1 if name == "f1_s_merged" else value for name, value in scores.items()}
+    found = merge.means([scores, worse])
+    assert found["gain_on_full"] == pytest.approx(scores["f1_s_merged"] - scores["f1_s_full"] - 0.05)
+    assert found["gain_on_full_sem"] == pytest.approx(0.05) and found["gain_on_part_sem"] == pytest.approx(0.0)
+
+
+def test_worlds_are_of_one_kind():
+    with pytest.raises(EvaluationError, match="one kind"):
+        main.merge([Path("world:home:80"), Path("world:office:1-2")])

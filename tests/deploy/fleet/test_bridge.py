@@ -198,6 +198,26 @@ def test_numbers_live_on_in_a_file(tmp_path):
         Fleet(msgspec.structs.replace(CFG, memory=str(tmp_path / "broken")))
 
 
+def test_the_frame_lives_on_in_that_file_for_maps_that_go_on(tmp_path):
+    path = str(tmp_path / "home.msgpack")
+    cfg = msgspec.structs.replace(CFG, memory=path)
+    fleet = Fleet(cfg)
+    fleet.tell(first())
+    fleet.tell(second())
+    fleet.tick()
+    keep(path, fleet.kept[-1])
+    before_m = fleet.scene().positions_m
+
+    def gaps_m(epoch):
+        again = Fleet(cfg, epoch=6)
+        again.tell(second(), epoch)
+        again.tick()
+        return np.linalg.norm(again.scene().positions_m[:, None] - before_m, axis=2).min(axis=1)
+
+    assert gaps_m(epoch=1).max() < 0.1  # r2 alone, in the frame that r1 gave
+    assert gaps_m(epoch=2).min() > 1.0  # another writer may map from another place
+
+
 @pytest.mark.parametrize(
     ("changes", "why"),
     [

@@ -91,6 +91,47 @@ def test_the_surer_robot_names_the_room():
     assert sorted(region.label for region in scene.regions) == houses.LABELS
 
 
+def test_two_looks_at_the_same_are_no_two_witnesses():
+    """A map merged with itself is believed as firmly as it was, under the same labels."""
+    one = houses.scene()
+    alone = merged("home", [Source(ONE, one, np.eye(4))], Memory()).scene
+    twice = merged("home", [Source(ONE, one, np.eye(4)), Source(TWO, one, np.eye(4))], Memory()).scene
+    assert twice.posteriors == pytest.approx(alone.posteriors, abs=0.01)
+    assert twice.place_regions.tolist() == alone.place_regions.tolist()
+
+
+def test_who_has_hardly_looked_has_hardly_a_say():
+    first, second = houses.scene(), houses.scene("r2", MOVED)
+    bedroom = second.place_regions == 3
+    posteriors, unknown = second.posteriors.copy(), second.unknown.copy()
+    posteriors[bedroom] = 0.001
+    posteriors[bedroom, houses.LABELS.index("kitchen")] = 0.99
+    regions = [msgspec.structs.replace(r, label="kitchen") if r.id == 3 else r for r in second.regions]
+    unknown[bedroom] = 0.95
+
+    def bedrooms(unknown):
+        lying = msgspec.structs.replace(second, posteriors=posteriors, regions=regions, unknown=unknown)
+        sources = [Source(TWO, lying, inverse(MOVED)), Source(ONE, first, np.eye(4))]
+        return [r for r in merged("home", sources, Memory()).scene.regions if r.label == "bedroom"]
+
+    assert bedrooms(unknown) and not bedrooms(second.unknown)
+
+
+def test_a_few_places_that_waver_are_no_region():
+    """Where no robot has a region of its own for good reason, the merged map has none either."""
+    first, second = houses.scene(), houses.scene("r2", MOVED)
+    inside = np.linalg.norm(first.positions_m[:, :2] - np.array((5.5, 2.0)), axis=1) < 0.6
+    posteriors = first.posteriors.copy()
+    posteriors[inside] = 0.15
+    posteriors[inside, houses.LABELS.index("bathroom")] = 0.4
+    wavering = np.where(inside, 9, first.place_regions)
+    regions = [*first.regions, msgspec.structs.replace(first.regions[4], id=9)]
+    first = msgspec.structs.replace(first, posteriors=posteriors, place_regions=wavering, regions=regions)
+    second = msgspec.structs.replace(second, posteriors=posteriors, place_regions=wavering, regions=regions)
+    scene = merged("home", [Source(ONE, first, np.eye(4)), Source(TWO, second, inverse(MOVED))], Memory()).scene
+    assert inside.sum() > 3 and sorted(region.label for region in scene.regions) == houses.LABELS
+
+
 def test_openings_that_another_map_closes_are_none():
     first = houses.scene(rooms=houses.ROOMS[:1])
     spot = int(np.argmax(first.positions_m[:, 1]))
