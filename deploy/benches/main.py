@@ -100,11 +100,16 @@ def exchanged() -> tuple[dict, dict]:
     return exchange_bench(ROWS, SAMPLE)
 
 
-def foresight() -> tuple[dict, dict]:
-    """Regions foreseen and searched for in generated worlds; see `prior_sg.deploy.benches.foresight`."""
-    from prior_sg.deploy.benches.foresight import foresight_bench  # compiles the worlds' loops
+def foresight(
+    paths: Sequence[Path] = (), seeds: int = 0, report: Callable[[str], None] = lambda text: None
+) -> tuple[dict, dict]:
+    """Regions foreseen and searched for in generated worlds, and on maps of those named; see
+    `prior_sg.deploy.benches.foresight`. Raises EvaluationError."""
+    from prior_sg.deploy.benches.foresight import MAPPED, SEEDS, foresight_bench  # compiles the worlds' loops
+    from prior_sg.deploy.evaluation.datasets import named_worlds
 
-    return foresight_bench()
+    worlds = [world for path in paths for world in named_worlds(str(path))] or MAPPED
+    return foresight_bench(SEEDS[: seeds or len(SEEDS)], worlds, report=report)
 
 
 def memory() -> tuple[dict, dict]:
@@ -192,13 +197,24 @@ LONG: dict[str, Callable[[float], tuple[dict, dict]]] = {  # no part of `all`; t
 }
 
 
-def run(name: str, seconds: float, paths: Sequence[Path] = (), presets: Sequence[str] = ()) -> dict[str, Any]:
+def run(
+    name: str,
+    seconds: float,
+    paths: Sequence[Path] = (),
+    presets: Sequence[str] = (),
+    *,
+    seeds: int = 0,
+    report: Callable[[str], None] = lambda text: None,
+) -> dict[str, Any]:
     """One measurement as the object that `--json` prints; `seconds` are those of the attacked pool.
 
-    With `paths`, `places` is the table of those recordings and worlds, made with these presets of the place graph.
+    With `paths`, `places` is the table of those recordings and worlds, made with these presets of the place graph, and
+    `foresight` maps those worlds. `seeds` of each kind are those of `foresight`, 0 = all; `report` hears how far it is.
     """
     if name == "places" and paths:
         metrics, settings = exactness_bench(paths, presets)
+    elif name == "foresight":
+        metrics, settings = foresight(paths, seeds, report)
     else:
         metrics, settings = LONG[name](seconds) if name in LONG else BENCHES[name]()
     return {"bench": name, "metrics": metrics, "machine": machine(), "settings": settings}

@@ -3,6 +3,7 @@
 import argparse
 import json
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -123,10 +124,13 @@ def _add_measuring(commands: Commands) -> None:
     bench.add_argument(
         "name",
         help="bus, places, features, kernel, swap, segmenter, task, learning, encoder_swap, queries, e2e, store, all "
-        "of these, or exchange, levels, pool, store_crashes, lidar, view, hydra",
+        "of these, or exchange, foresight, levels, pool, store_crashes, lidar, view, hydra",
     )
     bench.add_argument("--seconds", type=float, default=300.0, help="how long pool lasts (default: %(default)s)")
-    bench.add_argument("--on", nargs="+", type=Path, default=[], metavar="PATH", help="measure places on these instead")
+    bench.add_argument(
+        "--on", nargs="+", type=Path, default=[], metavar="PATH", help="measure places, or map for foresight, these"
+    )
+    bench.add_argument("--seeds", type=int, default=0, help="of each kind of world, for foresight (default: all four)")
     bench.add_argument("--presets", nargs="+", default=["indoor"], help="of the place graph, with --on")
     bench.add_argument("--json", action="store_true", help="print one JSON object per measurement")
 
@@ -299,16 +303,32 @@ def cmd_bench(arguments: argparse.Namespace) -> int:
             f"there is no measurement {arguments.name!r}; known: {', '.join((*bench.BENCHES, *bench.LONG))}, all"
         )
     for name in bench.BENCHES if arguments.name == "all" else [arguments.name]:
-        with console.status(f"measuring {name}"):
-            found = bench.run(name, arguments.seconds, arguments.on, arguments.presets)
+        with console.status(f"measuring {name}") as status:
+            found = bench.run(
+                name,
+                arguments.seconds,
+                arguments.on,
+                arguments.presets,
+                seeds=arguments.seeds,
+                report=lambda text, name=name: status.update(f"measuring {name}: {text}"),
+            )
         if arguments.json:
             print(json.dumps(found))
         else:
             table = Table("metric", "value", title=f"{name} ({found['machine']['cores']} cores)")
-            for metric, value in found["metrics"].items():
+            for metric, value in _flat(found["metrics"]):
                 table.add_row(metric, f"{value:.4g}")
             console.print(table)
     return 0
+
+
+def _flat(metrics: dict, before: str = "") -> Iterator[tuple[str, float]]:
+    """Every figure with the names it stands under."""
+    for name, value in metrics.items():
+        if isinstance(value, dict):
+            yield from _flat(value, f"{before}{name}.")
+        else:
+            yield before + name, value
 
 
 def cmd_eval(arguments: argparse.Namespace) -> int:

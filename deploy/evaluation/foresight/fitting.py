@@ -1,8 +1,8 @@
 """Weights of foresight, fitted to what openings of worlds revealed; run as a module, it prints them.
 
-All parts of the model are logistic, so that each has one best fit: whether the same region goes on, which other one
-comes, where a region is taken for what it most likely is, what begins within some metres, and, given that, what is
-missing. Every world counts alike.
+All parts of the model are logistic, so that each has one best fit: whether an opening leads anywhere, by maps alone;
+by those that do, whether the same region goes on, which other one comes, where a region is taken for what it most
+likely is, and what begins within some metres; and, given all that, what is missing. Worlds and maps count alike.
 """
 
 import argparse
@@ -19,6 +19,7 @@ from prior_sg.deploy.evaluation.worlds import KINDS
 from prior_sg.schemas.priors import Prior
 from prior_sg.services.segmenter.core.foresight.beyond import (
     beyond,
+    leads_weights,
     missing_features,
     missing_weights,
     same_features,
@@ -33,6 +34,7 @@ RIDGE = 1e-2  # of the mean log-likelihood, around what is thought without world
 LOOSE = 1e-4  # the same of chances by opening and label, which are thousands of events a world
 THOUGHT = (1.0, 1.0, -1.0, -1.0, 0.0, 0.5, 0.5)  # weights of another region's label
 WITHIN = [name for name in ForesightConfig.__struct_fields__ if name.startswith("within_")]
+LEADS = [name for name in ForesightConfig.__struct_fields__ if name.startswith("leads_")]
 MISSING = [name for name in ForesightConfig.__struct_fields__ if name.startswith("missing_")]
 Walk = tuple[Sequence[Moment], Prior]
 Read = TypeVar("Read")  # what the model reads of one world
@@ -51,13 +53,17 @@ class Rows(NamedTuple):
 
 def fitted(walks: Sequence[Walk], cfg: ForesightConfig = ForesightConfig()) -> ForesightConfig:
     """The settings that make what was revealed likeliest."""
-    rows = [_rows(*walk, cfg) for walk in walks if any(len(moment.outcomes) for moment in walk[0])]
+    rows = [_rows(*walk, cfg) for walk in walks if any(len(moment.leading().outcomes) for moment in walk[0])]
     same = _least(lambda weights, one: _loss(weights, one.same, one.goes_on), rows, np.zeros(rows[0].same.shape[1]))
     within = _least(lambda weights, one: _loss(weights, one.within, one.met), rows, within_weights(cfg), LOOSE)
     other = _least(_other_loss, [one for one in rows if len(one.came)], np.array(THOUGHT))
     adjacency, existence, again, once, often, count, met = np.round(other, 2).tolist()
     *by_width, by_area, by_spread = np.round(same, 2).tolist()
     cfg = msgspec.structs.replace(cfg, **dict(zip(WITHIN, np.round(within, 2).tolist(), strict=True)))
+    signs = [one for one in map(_signs, (walk for walk, _ in walks)) if len(one[1])]
+    if signs:
+        leads = _least(lambda weights, one: _loss(weights, *one), signs, leads_weights(cfg), LOOSE)
+        cfg = msgspec.structs.replace(cfg, **dict(zip(LEADS, np.round(leads, 2).tolist(), strict=True)))
     left = [_left(*walk, cfg) for walk in walks]
     missing = _least(lambda weights, one: _loss(weights, *one), left, missing_weights(cfg), LOOSE)
     return msgspec.structs.replace(
@@ -77,12 +83,14 @@ def fitted(walks: Sequence[Walk], cfg: ForesightConfig = ForesightConfig()) -> F
 
 
 def _rows(walk: Sequence[Moment], prior: Prior, cfg: ForesightConfig) -> Rows:
-    kept = [moment for moment in walk if len(moment.outcomes)]
+    kept = [moment for moment in (one.leading() for one in walk) if len(moment.outcomes)]
     came = np.concatenate([moment.outcomes for moment in kept])
     chains = [expected(prior, moment.found, cfg) for moment in kept]
     same = [same_features(moment.views, chain.spread, cfg) for moment, chain in zip(kept, chains, strict=True)]
     other = [features(prior, moment.found)[moment.views.beliefs.argmax(axis=1)] for moment in kept]
-    within = [within_features(moment.views, chain) for moment, chain in zip(kept, chains, strict=True)]
+    within = [
+        within_features(moment.views, chain, len(moment.outcomes)) for moment, chain in zip(kept, chains, strict=True)
+    ]
     changes = came != SAME
     return Rows(
         np.concatenate(same),
@@ -92,6 +100,15 @@ def _rows(walk: Sequence[Moment], prior: Prior, cfg: ForesightConfig) -> Rows:
         np.concatenate([one.reshape(-1, one.shape[2]) for one in within]),
         np.concatenate([moment.met.reshape(-1) for moment in kept]),
     )
+
+
+def _signs(walk: Sequence[Moment]) -> tuple[np.ndarray, np.ndarray]:
+    """What a map's openings look like (event, feature), and whether they led anywhere; none where that is known."""
+    told = [(one.views.signs, one.led) for one in walk if one.views.signs is not None and one.led is not None]
+    if not told:
+        return np.zeros((0, len(LEADS))), np.zeros(0, bool)
+    signs, led = zip(*told, strict=True)
+    return np.concatenate(signs), np.concatenate(led)
 
 
 def _left(walk: Sequence[Moment], prior: Prior, cfg: ForesightConfig) -> tuple[np.ndarray, np.ndarray]:

@@ -90,8 +90,8 @@ def figures(worlds: Sequence[Judged]) -> dict[str, float]:
 
 
 def chance_figures(worlds: Sequence[tuple[Sequence[Moment], Prior]], cfg: ForesightConfig) -> dict[str, float]:
-    """Calibration and Brier score of what is said to begin behind each opening, and to be missing; `rate` is the score
-    of whoever knows nothing but how often that happens."""
+    """Calibration and Brier score of what is said to begin behind each opening, and to be missing: how often on average
+    (`said`), how often it was so (`true`); `rate` is the score of whoever knows nothing but that."""
     within: list[tuple[np.ndarray, np.ndarray]] = []
     missing: list[tuple[np.ndarray, np.ndarray]] = []
     for moments, prior in worlds:
@@ -104,6 +104,7 @@ def chance_figures(worlds: Sequence[tuple[Sequence[Moment], Prior]], cfg: Foresi
     for name, pairs in (("within", within), ("missing", missing)):
         chance, there = (np.concatenate(column).astype(float) for column in zip(*pairs, strict=True))
         found[f"{name}_ece"] = calibration_error(chance, there)
+        found[f"{name}_said"], found[f"{name}_true"] = float(chance.mean()), float(there.mean())
         found[f"{name}_brier"] = float(((chance - there) ** 2).mean())
         found[f"{name}_brier_rate"] = float(((there.mean() - there) ** 2).mean())
     return found
