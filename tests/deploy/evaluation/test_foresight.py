@@ -252,7 +252,7 @@ def test_fitting_learns_from_maps_which_openings_lead_anywhere():
     walk = []
     for _ in range(400):
         bare = moment([SAME] * 6, rng.uniform(0.4, 3.0, 6))
-        signs = leads_features(bare.views.widths_m, bare.views.areas_m2, rng.uniform(0, 0.7, 6), rng.uniform(0, 1, 6))
+        signs = leads_features(bare.views.widths_m, rng.uniform(0, 0.7, 6), rng.uniform(0, 1, 6))
         unsure = replace(bare.views, signs=signs)
         led = rng.random(6) < leads(unsure, true)
         walk.append(replace(bare, views=unsure, led=led, outcomes=np.where(led, 1, SAME)))
@@ -265,5 +265,5 @@ def test_fitting_learns_from_maps_which_openings_lead_anywhere():
 def test_only_openings_that_lead_somewhere_are_left():
     both = moment([SAME, 1], np.array([0.5, 2.0]))
     assert both.leading().outcomes.tolist() == [SAME, 1]
-    one = replace(both, led=np.array([False, True]), views=replace(both.views, signs=np.zeros((2, 5)))).leading()
+    one = replace(both, led=np.array([False, True]), views=replace(both.views, signs=np.zeros((2, 4)))).leading()
     assert one.outcomes.tolist() == [1] and one.views.widths_m.tolist() == [2.0] and one.views.signs is None

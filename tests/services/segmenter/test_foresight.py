@@ -116,7 +116,7 @@ def looking(widths_m, rises, unseen):
     """Openings out of a hall of 8 m2, of which it is not known whether they lead anywhere."""
     count = len(widths_m)
     areas_m2 = np.full(count, 8.0)
-    signs = leads_features(np.array(widths_m), areas_m2, np.array(rises), np.array(unseen))
+    signs = leads_features(np.array(widths_m), np.array(rises), np.array(unseen))
     return Views(np.tile(np.eye(4)[0], (count, 1)), np.array(widths_m), areas_m2, signs)
 
 
@@ -130,7 +130,7 @@ def test_shadows_ceilings_and_cracks_seldom_lead_anywhere():
 def test_what_may_lead_nowhere_says_less_of_all_that_may_be_behind(seed):
     the_prior, the_found, many = random_case(seed)
     rng = np.random.default_rng(seed)
-    signs = leads_features(many.widths_m, many.areas_m2, rng.uniform(0, 0.7, 7), rng.uniform(0, 1, 7))
+    signs = leads_features(many.widths_m, rng.uniform(0, 0.7, 7), rng.uniform(0, 1, 7))
     unsure = Views(many.beliefs, many.widths_m, many.areas_m2, signs)
     sure, result = foreseen(the_prior, the_found, many), foreseen(the_prior, the_found, unsure)
     chance = leads(unsure, CFG)

@@ -38,15 +38,15 @@ class Beyond:
     missing: np.ndarray  # (label,) that one more region of that label is behind any of the openings
 
 
-def leads_features(widths_m: np.ndarray, areas_m2: np.ndarray, rises: np.ndarray, unseen: np.ndarray) -> np.ndarray:
+def leads_features(widths_m: np.ndarray, rises: np.ndarray, unseen: np.ndarray) -> np.ndarray:
     """What the logit of P(leads) is made of (opening, feature), in the order of `leads_weights`; the arguments
-    (opening,) are those of `Openings` and `Views`."""
-    return np.column_stack((np.ones(len(widths_m)), np.log(widths_m), np.log1p(areas_m2), rises, unseen))
+    (opening,) are those of `Openings`."""
+    return np.column_stack((np.ones(len(widths_m)), np.log(widths_m), rises, unseen))
 
 
 def leads_weights(cfg: ForesightConfig) -> np.ndarray:
     """Weight (feature,) of each of `leads_features`."""
-    return np.array([cfg.leads_bias, cfg.leads_width, cfg.leads_area, cfg.leads_rise, cfg.leads_unseen])
+    return np.array([cfg.leads_bias, cfg.leads_width, cfg.leads_rise, cfg.leads_unseen])
 
 
 def leads(views: Views, cfg: ForesightConfig) -> np.ndarray:

@@ -20,11 +20,10 @@ class ForesightConfig(msgspec.Struct, frozen=True, kw_only=True):
     least_places: int = 3  # a region of fewer places does not count as found
 
     # That there is unobserved floor behind an opening at all, and it is no gap or shadow: logit.
-    leads_bias: float = 0.0
-    leads_width: float = 0.0  # by log of the opening's width / m
-    leads_area: float = 0.0  # by log(1 + seen area of the region it opens from / m2)
-    leads_rise: float = 0.0  # by how far its direction rises or falls (absolute sine)
-    leads_unseen: float = 0.0  # by the share of a fan behind it that no place covers
+    leads_bias: float = -1.3
+    leads_width: float = 1.15  # by log of the opening's width / m
+    leads_rise: float = -2.69  # by how far its direction rises or falls (absolute sine)
+    leads_unseen: float = 1.5  # by the share of a fan behind it that no place covers
 
     # That the same region goes on, where there is anything: logit by width of the opening, and by what was seen of it.
     widths_m: tuple[float, ...] = (0.6, 0.8, 1.1, 1.6, 2.5, 4.0)  # where the classes of width begin, after the first

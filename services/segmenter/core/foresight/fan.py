@@ -34,8 +34,7 @@ def _covered(graph: ReceivedGraph, points_m: np.ndarray, margin_m: float) -> np.
 
     |p - c|^2 - r^2 is least for one sphere: with sqrt(R^2 - r^2) as a fourth coordinate, that is the nearest centre.
     """
-    radii_m = graph.radii_m + margin_m
-    largest_m = radii_m.max()
-    centres = np.column_stack((graph.positions_m, np.sqrt(largest_m**2 - radii_m**2)))
+    radii_m2 = (graph.radii_m + margin_m) ** 2
+    centres = np.column_stack((graph.positions_m, np.sqrt(radii_m2.max() - radii_m2)))
     nearest_m, _ = scipy.spatial.cKDTree(centres).query(np.column_stack((points_m, np.zeros(len(points_m)))))
-    return np.asarray(nearest_m < largest_m)
+    return np.asarray(nearest_m**2 < radii_m2.max())

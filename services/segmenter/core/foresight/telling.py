@@ -44,7 +44,7 @@ def found_in(regions: Mapping[int, Region], prior: Prior, cfg: ForesightConfig) 
 def views_of(openings: Openings, regions: Mapping[int, Region]) -> Views:
     """What the openings tell of what is behind them."""
     areas_m2 = np.array([regions[region].area_m2 for region in openings.regions.tolist()])
-    signs = leads_features(openings.widths_m, areas_m2, openings.rises, openings.unseen)
+    signs = leads_features(openings.widths_m, openings.rises, openings.unseen)
     return Views(openings.beliefs, openings.widths_m, areas_m2, signs)
 
 
