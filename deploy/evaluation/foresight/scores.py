@@ -61,7 +61,8 @@ def _ties(given: np.ndarray, chance: np.ndarray) -> np.ndarray:
 
 
 def figures(worlds: Sequence[Judged]) -> dict[str, float]:
-    """Means over worlds, each the mean over its events, with standard errors; calibration over all events."""
+    """Means over worlds, each the mean over its events, with standard errors; calibration over all events. Where no
+    world has shown another region, nothing is told of that."""
     one = {
         "nll": [-np.log(np.maximum(world.chances, LEAST)).mean() for world in worlds],
         "top1": [(world.ranks < 1.5).mean() for world in worlds],
@@ -74,7 +75,7 @@ def figures(worlds: Sequence[Judged]) -> dict[str, float]:
         "top1_another": [(world.ranks_another[world.another] < 1.5).mean() for world in worlds if world.another.any()],
         "top3_another": [(world.ranks_another[world.another] <= 3).mean() for world in worlds if world.another.any()],
     }
-    found = {name: float(np.mean(values)) for name, values in one.items()}
+    found = {name: float(np.mean(values)) for name, values in one.items() if values}
     found |= {
         f"{name}_error": float(np.std(values, ddof=1) / len(values) ** 0.5)
         for name, values in one.items()

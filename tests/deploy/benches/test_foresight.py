@@ -33,6 +33,7 @@ def test_maps_are_judged_together_and_by_kind(maps, tmp_path):
     assert found["ours"]["events"] == 5 and found["within_true"] == pytest.approx(1 / 15)
     assert set(found["by_kind"]) == {"home", "office"}
     assert found["by_kind"]["home"]["within_true"] == pytest.approx(1 / 6)
+    assert "nll_another" in found["ours"] and "nll_another" not in found["by_kind"]["office"]["ours"]
     assert found["by_kind"]["office"]["existence"]["nll"] == pytest.approx(np.log(2))
     assert said == ["map 1 of 3: home 80", "map 2 of 3: office 80", "map 3 of 3: shop 80"]
     assert bench.mapped_figures(worlds[2:], ForesightConfig(), said.append, tmp_path) == {}

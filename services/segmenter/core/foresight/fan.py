@@ -14,9 +14,9 @@ from prior_sg.services.segmenter.core.map.received import ReceivedGraph
 def unseen_shares(graph: ReceivedGraph, edges_m: np.ndarray, outward: np.ndarray, cfg: ForesightConfig) -> np.ndarray:
     """Share (opening,) of the points of a level fan, from each edge (opening, 3) along its unit direction (opening, 3),
     that lie in no place's sphere."""
-    points_m = _fans(edges_m, outward, cfg)
-    if not len(points_m):
+    if not len(edges_m):
         return np.zeros(0)
+    points_m = _fans(edges_m, outward, cfg)
     covered = _covered(graph, points_m.reshape(-1, 3), cfg.covered_m).reshape(points_m.shape[:2])
     return np.asarray(1.0 - covered.mean(axis=1))
 
