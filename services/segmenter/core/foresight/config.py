@@ -20,10 +20,10 @@ class ForesightConfig(msgspec.Struct, frozen=True, kw_only=True):
     least_places: int = 3  # a region of fewer places does not count as found
 
     # That there is unobserved floor behind an opening at all, and it is no gap or shadow: logit.
-    leads_bias: float = -1.3
-    leads_width: float = 1.15  # by log of the opening's width / m
-    leads_rise: float = -2.69  # by how far its direction rises or falls (absolute sine)
-    leads_unseen: float = 1.5  # by the share of a fan behind it that no place covers
+    leads_bias: float = -1.36
+    leads_width: float = 0.77  # by log of the opening's width / m
+    leads_rise: float = -4.32  # by how far its direction rises or falls (absolute sine)
+    leads_unseen: float = 1.82  # by the share of a fan behind it that no place covers
 
     # That the same region goes on, where there is anything: logit by width of the opening, and by what was seen of it.
     widths_m: tuple[float, ...] = (0.6, 0.8, 1.1, 1.6, 2.5, 4.0)  # where the classes of width begin, after the first
@@ -53,11 +53,11 @@ class ForesightConfig(msgspec.Struct, frozen=True, kw_only=True):
     within_often: float = -0.29  # ... or several
 
     # That one more region of a label is behind any of the openings: logit.
-    missing_bias: float = 1.06
-    missing_sum: float = 0.86  # by log of the sum of the chances of all openings
+    missing_bias: float = 0.5
+    missing_sum: float = 0.28  # by log of the sum of the chances of all openings
     missing_existence: float = 0.11  # by log P(r)
-    missing_once: float = -0.46
-    missing_often: float = -0.43
+    missing_once: float = -1.05
+    missing_often: float = -1.0
 
     look_m: float = 1.0  # walked behind an opening to see what is there
     elsewhere_m: float = 40.0  # to what lies behind none of the openings
