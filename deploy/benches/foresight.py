@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from prior_sg.deploy.evaluation.datasets import WorldName
-from prior_sg.deploy.evaluation.foresight.mapped import mapped
+from prior_sg.deploy.evaluation.foresight.mapped import ENCODER, mapped
 from prior_sg.deploy.evaluation.foresight.predictors import PREDICTORS
 from prior_sg.deploy.evaluation.foresight.scores import Judged, chance_figures, figures, judge, search_figures
 from prior_sg.deploy.evaluation.foresight.searches import POLICIES, metres, quests
@@ -25,7 +25,6 @@ from prior_sg.services.segmenter.core.foresight.config import ForesightConfig
 SEEDS = range(76, 80)  # none of them was used to choose a constant
 SEARCHES = 33  # of each seed, over all kinds
 MAPPED = (*(WorldName("home", seed) for seed in range(80, 84)), WorldName("office", 80))
-ENCODER = "simlike:0.2"
 FOLDER = Path("out/bench/foresight")  # maps are kept: to make one takes minutes
 
 Report = Callable[[str], None]

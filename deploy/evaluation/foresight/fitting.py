@@ -1,8 +1,9 @@
 """Weights of foresight, fitted to what openings of worlds revealed; run as a module, it prints them.
 
-All parts of the model are logistic, so that each has one best fit: whether an opening leads anywhere, by maps alone;
-by those that do, whether the same region goes on, which other one comes, where a region is taken for what it most
-likely is, and what begins within some metres; and, given all that, what is missing. Worlds and maps count alike.
+All parts of the model are logistic, so that each has one best fit. Explorers, whose openings all lead somewhere, tell
+whether the same region goes on, which other one comes, where a region is taken for what it most likely is, and what
+begins within some metres; maps tell which openings lead anywhere; both, given all that, what is missing. Every world
+and every map counts alike.
 """
 
 import argparse
@@ -14,12 +15,14 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.special import expit, log_softmax
 
+from prior_sg.deploy.evaluation.datasets import named_worlds
+from prior_sg.deploy.evaluation.foresight.mapped import ENCODER, mapped
 from prior_sg.deploy.evaluation.foresight.trials import SAME, Moment, moments, trial
+from prior_sg.deploy.evaluation.perception import CACHE, Cache, Perceiver
 from prior_sg.deploy.evaluation.worlds import KINDS
 from prior_sg.schemas.priors import Prior
 from prior_sg.services.segmenter.core.foresight.beyond import (
     beyond,
-    leads_weights,
     missing_features,
     missing_weights,
     same_features,
@@ -53,22 +56,15 @@ class Rows(NamedTuple):
 
 def fitted(walks: Sequence[Walk], cfg: ForesightConfig = ForesightConfig()) -> ForesightConfig:
     """The settings that make what was revealed likeliest."""
-    rows = [_rows(*walk, cfg) for walk in walks if any(len(moment.leading().outcomes) for moment in walk[0])]
+    rows = [_rows(*walk, cfg) for walk in walks if any(len(moment.outcomes) for moment in walk[0])]
     same = _least(lambda weights, one: _loss(weights, one.same, one.goes_on), rows, np.zeros(rows[0].same.shape[1]))
     within = _least(lambda weights, one: _loss(weights, one.within, one.met), rows, within_weights(cfg), LOOSE)
     other = _least(_other_loss, [one for one in rows if len(one.came)], np.array(THOUGHT))
     adjacency, existence, again, once, often, count, met = np.round(other, 2).tolist()
     *by_width, by_area, by_spread = np.round(same, 2).tolist()
     cfg = msgspec.structs.replace(cfg, **dict(zip(WITHIN, np.round(within, 2).tolist(), strict=True)))
-    signs = [one for one in map(_signs, (walk for walk, _ in walks)) if len(one[1])]
-    if signs:
-        leads = _least(lambda weights, one: _loss(weights, *one), signs, leads_weights(cfg), LOOSE)
-        cfg = msgspec.structs.replace(cfg, **dict(zip(LEADS, np.round(leads, 2).tolist(), strict=True)))
-    left = [_left(*walk, cfg) for walk in walks]
-    missing = _least(lambda weights, one: _loss(weights, *one), left, missing_weights(cfg), LOOSE)
     return msgspec.structs.replace(
-        cfg,
-        **dict(zip(MISSING, np.round(missing, 2).tolist(), strict=True)),
+        _with_missing(walks, cfg),
         same_by_width=tuple(by_width),
         same_by_area=by_area,
         same_by_spread=by_spread,
@@ -82,8 +78,23 @@ def fitted(walks: Sequence[Walk], cfg: ForesightConfig = ForesightConfig()) -> F
     )
 
 
+def fitted_to_maps(maps: Sequence[Walk], walks: Sequence[Walk], cfg: ForesightConfig) -> ForesightConfig:
+    """The settings with the best weights of whether openings lead anywhere, by maps, and of what is missing, by both;
+    what explorers alone tell stays as it is."""
+    signs = [_signs(walk) for walk, _ in maps]
+    leads = _least(lambda weights, one: _loss(weights, *one), signs, np.zeros(len(LEADS)), LOOSE)
+    cfg = msgspec.structs.replace(cfg, **dict(zip(LEADS, np.round(leads, 2).tolist(), strict=True)))
+    return _with_missing([*walks, *maps], cfg)
+
+
+def _with_missing(walks: Sequence[Walk], cfg: ForesightConfig) -> ForesightConfig:
+    left = [_left(*walk, cfg) for walk in walks]
+    missing = _least(lambda weights, one: _loss(weights, *one), left, missing_weights(cfg), LOOSE)
+    return msgspec.structs.replace(cfg, **dict(zip(MISSING, np.round(missing, 2).tolist(), strict=True)))
+
+
 def _rows(walk: Sequence[Moment], prior: Prior, cfg: ForesightConfig) -> Rows:
-    kept = [moment for moment in (one.leading() for one in walk) if len(moment.outcomes)]
+    kept = [moment for moment in walk if len(moment.outcomes)]
     came = np.concatenate([moment.outcomes for moment in kept])
     chains = [expected(prior, moment.found, cfg) for moment in kept]
     same = [same_features(moment.views, chain.spread, cfg) for moment, chain in zip(kept, chains, strict=True)]
@@ -103,10 +114,8 @@ def _rows(walk: Sequence[Moment], prior: Prior, cfg: ForesightConfig) -> Rows:
 
 
 def _signs(walk: Sequence[Moment]) -> tuple[np.ndarray, np.ndarray]:
-    """What a map's openings look like (event, feature), and whether they led anywhere; none where that is known."""
+    """What a map's openings look like (event, feature), and whether they led anywhere (event,)."""
     told = [(one.views.signs, one.led) for one in walk if one.views.signs is not None and one.led is not None]
-    if not told:
-        return np.zeros((0, len(LEADS))), np.zeros(0, bool)
     signs, led = zip(*told, strict=True)
     return np.concatenate(signs), np.concatenate(led)
 
@@ -155,13 +164,21 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--kinds", default=",".join(KINDS))
     parser.add_argument("--seeds", type=int, default=len(TUNED), help="the first so many of those that are for tuning")
+    parser.add_argument(
+        "--maps", nargs="*", default=[], metavar="world:KIND:SEEDS", help="maps that are fitted to, too"
+    )
+    parser.add_argument("--keep", action="store_true", help="what explorers alone tell stays as it is set")
     given = parser.parse_args()
     walks = []
     for kind in given.kinds.split(","):
         for seed in TUNED[: given.seeds]:
             one = trial(kind, seed)
             walks.append((list(moments(one)), one.prior))
-    print(fitted(walks))
+    cfg = ForesightConfig() if given.keep else fitted(walks)
+    names = [name for text in given.maps for name in named_worlds(text)]
+    perceiver = Perceiver({}, Cache(CACHE), lambda *_: None, ENCODER)
+    maps = [mapped(name.kind, name.seed, perceiver) for name in names]
+    print(fitted_to_maps(maps, walks, cfg) if maps else cfg)
 
 
 if __name__ == "__main__":

@@ -33,6 +33,7 @@ from prior_sg.services.segmenter.core.foresight.telling import found_in, views_o
 from prior_sg.services.segmenter.core.map.received import ReceivedGraph
 from prior_sg.services.segmenter.core.state import State
 
+ENCODER = "simlike:0.2"
 EVERY = 5  # keyframes from one moment to the next
 MARGIN_M = 0.4  # around the spheres: what lies between them and walls has been seen
 TALL_M = 2.2  # a place is over ground that lies at most so far below it

@@ -90,13 +90,6 @@ class Moment:
     left: np.ndarray  # (label,) bool: one more region of it is to be found
     led: np.ndarray | None = None  # (opening,) bool: something unseen to stand on is behind; None = behind all
 
-    def leading(self) -> "Moment":
-        """Its openings that lead somewhere, as if that were known."""
-        rows = np.flatnonzero(np.ones(len(self.outcomes), bool) if self.led is None else self.led)
-        views = self.views
-        kept = Views(views.beliefs[rows], views.widths_m[rows], views.areas_m2[rows])
-        return Moment(kept, self.found, self.outcomes[rows], self.met[rows], self.left)
-
 
 @lru_cache(32)
 def vocabulary(kind: str) -> dict[str, tuple[str, ...]]:

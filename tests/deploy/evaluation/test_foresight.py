@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from prior_sg.deploy.evaluation.foresight.explorer import Explorer, Plan, crossings
-from prior_sg.deploy.evaluation.foresight.fitting import fitted
+from prior_sg.deploy.evaluation.foresight.fitting import fitted, fitted_to_maps
 from prior_sg.deploy.evaluation.foresight.loops import FAR
 from prior_sg.deploy.evaluation.foresight.mapped import behind, covered, ground_of
 from prior_sg.deploy.evaluation.foresight.predictors import PREDICTORS
@@ -246,24 +246,17 @@ def test_chances_are_judged_against_how_often_things_happen():
 
 
 def test_fitting_learns_from_maps_which_openings_lead_anywhere():
-    """Only those that led tell what comes next; whether they do is drawn from the model with known weights."""
-    rng, cfg = np.random.default_rng(6), ForesightConfig()
-    true = msgspec.structs.replace(cfg, leads_bias=-1.0, leads_rise=-3.0, leads_unseen=2.0, leads_width=1.0)
+    """Whether they do is drawn from the model with known weights, and what is missing is never there."""
+    rng, cfg, the_prior = np.random.default_rng(6), ForesightConfig(), home_trial().prior
+    true = msgspec.structs.replace(cfg, leads_bias=-1.0, leads_rise=-3.0, leads_unseen=2.0, leads_width=2.0)
     walk = []
     for _ in range(400):
-        bare = moment([SAME] * 6, rng.uniform(0.4, 3.0, 6))
+        bare = moment([SAME] * 6, rng.uniform(0.4, 3.0, 6), left=np.zeros(3, bool))
         signs = leads_features(bare.views.widths_m, rng.uniform(0, 0.7, 6), rng.uniform(0, 1, 6))
         unsure = replace(bare.views, signs=signs)
-        led = rng.random(6) < leads(unsure, true)
-        walk.append(replace(bare, views=unsure, led=led, outcomes=np.where(led, 1, SAME)))
-    found = fitted([(walk, home_trial().prior)], cfg)
+        walk.append(replace(bare, views=unsure, led=rng.random(6) < leads(unsure, true)))
+    found = fitted_to_maps([(walk, the_prior)], [], cfg)
     np.testing.assert_allclose(leads(walk[0].views, found), leads(walk[0].views, true), atol=0.1)
-    certain = PREDICTORS["ours"](walk[0].leading(), home_trial().prior, found)
-    assert (certain[:, 0] < 0.2).all()  # all that led showed another region
-
-
-def test_only_openings_that_lead_somewhere_are_left():
-    both = moment([SAME, 1], np.array([0.5, 2.0]))
-    assert both.leading().outcomes.tolist() == [SAME, 1]
-    one = replace(both, led=np.array([False, True]), views=replace(both.views, signs=np.zeros((2, 4)))).leading()
-    assert one.outcomes.tolist() == [1] and one.views.widths_m.tolist() == [2.0] and one.views.signs is None
+    said, before = (beyond(walk[0].views, expected(the_prior, walk[0].found, one), one).missing for one in (found, cfg))
+    assert said.max() < 0.1 < before.max()
+    assert found.within_bias == cfg.within_bias and found.same_by_width == cfg.same_by_width
