@@ -87,7 +87,7 @@ def _opening(
                 met=int(found.borders[here, label]),
             )
             for label in likely
-            if within[label] >= cfg.least_told
+            if within[label] >= cfg.least_within
         ],
     )
 
