@@ -191,14 +191,6 @@ def test_no_openings_foresee_nothing(rows):
     assert result.openings == [] and result.missing == []
 
 
-def test_what_may_be_behind_an_opening_that_hardly_leads_anywhere_is_still_told():
-    graph, places = a_map()
-    cfg = msgspec.structs.replace(CFG, leads_bias=CFG.leads_bias - 3.0)
-    openings = openings_of(graph, places, opened((0, (0, 0.8, 0.6), 1.0)), cfg)
-    told = foresight(openings, {7: region(7, "hall"), 8: region(8, "bath")}, home(), cfg).openings[0].labels
-    assert told and max(one.within for one in told) < 0.02
-
-
 def test_frontiers_follow_deltas():
     frontiers, none = Frontiers(), np.zeros(0, np.int64)
     positions, edges = place_grid(1)
