@@ -4,6 +4,7 @@ import argparse
 import json
 import time
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,6 +17,8 @@ from prior_sg.deploy.evaluation import tune_command as tuning
 from prior_sg.deploy.terminal import Part, line
 
 if TYPE_CHECKING:
+    from rich.status import Status
+
     from prior_sg.deploy.inspecting.health import Found
     from prior_sg.schemas.status import TopicCount
 
@@ -310,7 +313,7 @@ def cmd_bench(arguments: argparse.Namespace) -> int:
                 arguments.on,
                 arguments.presets,
                 seeds=arguments.seeds,
-                report=lambda text, name=name: status.update(f"measuring {name}: {text}"),
+                report=partial(_tell, status, name),
             )
         if arguments.json:
             print(json.dumps(found))
@@ -320,6 +323,10 @@ def cmd_bench(arguments: argparse.Namespace) -> int:
                 table.add_row(metric, f"{value:.4g}")
             console.print(table)
     return 0
+
+
+def _tell(status: "Status", name: str, text: str) -> None:
+    status.update(f"measuring {name}: {text}")
 
 
 def _flat(metrics: dict, before: str = "") -> Iterator[tuple[str, float]]:
