@@ -26,7 +26,7 @@ class Opening(Part, frozen=True, kw_only=True):
     beyond_m: Point  # a point in the unobserved space
     width_m: float
     region: int  # that it opens from
-    same: float  # probability that this region goes on behind it; with `next` of all labels, these sum to one
+    same: float  # probability that this region goes on behind it, or nothing is; with all `next` it sums to one
     labels: list[ForeseenLabel] = []  # the most probable first; others left out
 
 

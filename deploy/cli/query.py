@@ -276,7 +276,7 @@ def _show_outlook(found: "Outlook") -> None:
     table = Table("expected m", "probability", "way m", "place", "width m", "out of", "beyond m")
     for one in found.prospects:
         opening = one.opening
-        figures = (f"{one.expected_m:.1f}", f"{one.probability:.2f}", f"{one.way_m:.1f}", str(opening.place_id))
+        figures = (f"{one.expected_m:.1f}", f"{one.probability:.3f}", f"{one.way_m:.1f}", str(opening.place_id))
         table.add_row(*figures, f"{opening.width_m:.1f}", f"region {opening.region}", _at(opening.beyond_m))
     console.print(table)
     why = next(entry for entry in found.prospects[0].opening.labels if entry.label == found.label)

@@ -3,6 +3,8 @@
 import argparse
 import json
 import time
+from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,6 +17,8 @@ from prior_sg.deploy.evaluation import tune_command as tuning
 from prior_sg.deploy.terminal import Part, line
 
 if TYPE_CHECKING:
+    from rich.status import Status
+
     from prior_sg.deploy.inspecting.health import Found
     from prior_sg.schemas.status import TopicCount
 
@@ -132,8 +136,9 @@ def _add_measuring(commands: Commands) -> None:
         type=Path,
         default=[],
         metavar="PATH",
-        help="measure places on these instead, or merge, as on world:home:80-91",
+        help="measure places or merge on these instead, or map these for foresight, such as world:home:80-91",
     )
+    bench.add_argument("--seeds", type=int, default=0, help="of each kind of world, for foresight (default: all four)")
     bench.add_argument("--presets", nargs="+", default=["indoor"], help="of the place graph, with --on")
     bench.add_argument(
         "--worlds", default="", metavar="KIND", help="measure learning in generated worlds, such as home"
@@ -315,6 +320,7 @@ def cmd_bench(arguments: argparse.Namespace) -> int:
                 paths=arguments.on,
                 presets=arguments.presets,
                 worlds=arguments.worlds,
+                seeds=arguments.seeds,
                 report=partial(_tell, status, name),
             )
             found = bench.run(name, asked)
@@ -322,10 +328,23 @@ def cmd_bench(arguments: argparse.Namespace) -> int:
             print(json.dumps(found))
         else:
             table = Table("metric", "value", title=f"{name} ({found['machine']['cores']} cores)")
-            for metric, value in found["metrics"].items():
+            for metric, value in _flat(found["metrics"]):
                 table.add_row(metric, f"{value:.4g}")
             console.print(table)
     return 0
+
+
+def _tell(status: "Status", name: str, text: str) -> None:
+    status.update(f"measuring {name}: {text}")
+
+
+def _flat(metrics: dict, before: str = "") -> Iterator[tuple[str, float]]:
+    """Every figure with the names it stands under."""
+    for name, value in metrics.items():
+        if isinstance(value, dict):
+            yield from _flat(value, f"{before}{name}.")
+        else:
+            yield before + name, value
 
 
 def cmd_eval(arguments: argparse.Namespace) -> int:

@@ -1,8 +1,9 @@
 """Weights of foresight, fitted to what openings of worlds revealed; run as a module, it prints them.
 
-All parts of the model are logistic, so that each has one best fit: whether the same region goes on, which other one
-comes, where a region is taken for what it most likely is, what begins within some metres, and, given that, what is
-missing. Every world counts alike.
+All parts of the model are logistic, so that each has one best fit. Explorers, whose openings all lead somewhere, tell
+whether the same region goes on, which other one comes, where a region is taken for what it most likely is, and what
+begins within some metres; maps tell which openings lead anywhere; both, given all that, what is missing. Every world
+and every map counts alike.
 """
 
 import argparse
@@ -14,7 +15,10 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.special import expit, log_softmax
 
+from prior_sg.deploy.evaluation.datasets import named_worlds
+from prior_sg.deploy.evaluation.foresight.mapped import ENCODER, mapped
 from prior_sg.deploy.evaluation.foresight.trials import SAME, Moment, moments, trial
+from prior_sg.deploy.evaluation.perception import CACHE, Cache, Perceiver
 from prior_sg.deploy.evaluation.worlds import KINDS
 from prior_sg.schemas.priors import Prior
 from prior_sg.services.segmenter.core.foresight.beyond import (
@@ -33,6 +37,7 @@ RIDGE = 1e-2  # of the mean log-likelihood, around what is thought without world
 LOOSE = 1e-4  # the same of chances by opening and label, which are thousands of events a world
 THOUGHT = (1.0, 1.0, -1.0, -1.0, 0.0, 0.5, 0.5)  # weights of another region's label
 WITHIN = [name for name in ForesightConfig.__struct_fields__ if name.startswith("within_")]
+LEADS = [name for name in ForesightConfig.__struct_fields__ if name.startswith("leads_")]
 MISSING = [name for name in ForesightConfig.__struct_fields__ if name.startswith("missing_")]
 Walk = tuple[Sequence[Moment], Prior]
 Read = TypeVar("Read")  # what the model reads of one world
@@ -58,11 +63,8 @@ def fitted(walks: Sequence[Walk], cfg: ForesightConfig = ForesightConfig()) -> F
     adjacency, existence, again, once, often, count, met = np.round(other, 2).tolist()
     *by_width, by_area, by_spread = np.round(same, 2).tolist()
     cfg = msgspec.structs.replace(cfg, **dict(zip(WITHIN, np.round(within, 2).tolist(), strict=True)))
-    left = [_left(*walk, cfg) for walk in walks]
-    missing = _least(lambda weights, one: _loss(weights, *one), left, missing_weights(cfg), LOOSE)
     return msgspec.structs.replace(
-        cfg,
-        **dict(zip(MISSING, np.round(missing, 2).tolist(), strict=True)),
+        _with_missing(walks, cfg),
         same_by_width=tuple(by_width),
         same_by_area=by_area,
         same_by_spread=by_spread,
@@ -76,13 +78,30 @@ def fitted(walks: Sequence[Walk], cfg: ForesightConfig = ForesightConfig()) -> F
     )
 
 
+def fitted_to_maps(maps: Sequence[Walk], walks: Sequence[Walk], cfg: ForesightConfig) -> ForesightConfig:
+    """The settings with the best weights of whether openings lead anywhere, by maps, and of what is missing, by both;
+    what explorers alone tell stays as it is."""
+    signs = [_signs(walk) for walk, _ in maps]
+    leads = _least(lambda weights, one: _loss(weights, *one), signs, np.zeros(len(LEADS)), LOOSE)
+    cfg = msgspec.structs.replace(cfg, **dict(zip(LEADS, np.round(leads, 2).tolist(), strict=True)))
+    return _with_missing([*walks, *maps], cfg)
+
+
+def _with_missing(walks: Sequence[Walk], cfg: ForesightConfig) -> ForesightConfig:
+    left = [_left(*walk, cfg) for walk in walks]
+    missing = _least(lambda weights, one: _loss(weights, *one), left, missing_weights(cfg), LOOSE)
+    return msgspec.structs.replace(cfg, **dict(zip(MISSING, np.round(missing, 2).tolist(), strict=True)))
+
+
 def _rows(walk: Sequence[Moment], prior: Prior, cfg: ForesightConfig) -> Rows:
     kept = [moment for moment in walk if len(moment.outcomes)]
     came = np.concatenate([moment.outcomes for moment in kept])
     chains = [expected(prior, moment.found, cfg) for moment in kept]
     same = [same_features(moment.views, chain.spread, cfg) for moment, chain in zip(kept, chains, strict=True)]
     other = [features(prior, moment.found)[moment.views.beliefs.argmax(axis=1)] for moment in kept]
-    within = [within_features(moment.views, chain) for moment, chain in zip(kept, chains, strict=True)]
+    within = [
+        within_features(moment.views, chain, len(moment.outcomes)) for moment, chain in zip(kept, chains, strict=True)
+    ]
     changes = came != SAME
     return Rows(
         np.concatenate(same),
@@ -92,6 +111,13 @@ def _rows(walk: Sequence[Moment], prior: Prior, cfg: ForesightConfig) -> Rows:
         np.concatenate([one.reshape(-1, one.shape[2]) for one in within]),
         np.concatenate([moment.met.reshape(-1) for moment in kept]),
     )
+
+
+def _signs(walk: Sequence[Moment]) -> tuple[np.ndarray, np.ndarray]:
+    """What a map's openings look like (event, feature), and whether they led anywhere (event,)."""
+    told = [(one.views.signs, one.led) for one in walk if one.views.signs is not None and one.led is not None]
+    signs, led = zip(*told, strict=True)
+    return np.concatenate(signs), np.concatenate(led)
 
 
 def _left(walk: Sequence[Moment], prior: Prior, cfg: ForesightConfig) -> tuple[np.ndarray, np.ndarray]:
@@ -138,13 +164,21 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--kinds", default=",".join(KINDS))
     parser.add_argument("--seeds", type=int, default=len(TUNED), help="the first so many of those that are for tuning")
+    parser.add_argument(
+        "--maps", nargs="*", default=[], metavar="world:KIND:SEEDS", help="maps that are fitted to, too"
+    )
+    parser.add_argument("--keep", action="store_true", help="what explorers alone tell stays as it is set")
     given = parser.parse_args()
     walks = []
     for kind in given.kinds.split(","):
         for seed in TUNED[: given.seeds]:
             one = trial(kind, seed)
             walks.append((list(moments(one)), one.prior))
-    print(fitted(walks))
+    cfg = ForesightConfig() if given.keep else fitted(walks)
+    names = [name for text in given.maps for name in named_worlds(text)]
+    perceiver = Perceiver({}, Cache(CACHE), lambda *_: None, ENCODER)
+    maps = [mapped(name.kind, name.seed, perceiver) for name in names]
+    print(fitted_to_maps(maps, walks, cfg) if maps else cfg)
 
 
 if __name__ == "__main__":

@@ -33,9 +33,11 @@ from prior_sg.services.segmenter.core.foresight.telling import found_in, views_o
 from prior_sg.services.segmenter.core.map.received import ReceivedGraph
 from prior_sg.services.segmenter.core.state import State
 
+ENCODER = "simlike:0.2"
 EVERY = 5  # keyframes from one moment to the next
 MARGIN_M = 0.4  # around the spheres: what lies between them and walls has been seen
 TALL_M = 2.2  # a place is over ground that lies at most so far below it
+LED_M2 = 0.3  # of unseen floor behind an opening: it leads somewhere
 BESIDE_M = 0.4  # of an opening's edge, beside half its width
 
 
@@ -96,33 +98,36 @@ def _moment(state: State, ground: Ground, prior: Prior) -> Moment:
     known = covered(ground, state.map.graph)
     seen_m2 = np.bincount(plan.regions[ground.nodes[known[ground.nodes]]], minlength=len(plan.labels)) * CELL_M**2
     new = (seen_m2 < FOUND_M2) & (ground.labels >= 0) & ground.walkable
-    outcomes, met = behind(openings, ground, known, new, cfg)
+    outcomes, met, led = behind(openings, ground, known, new, cfg)
     return Moment(
         views_of(openings, state.regions.known),
         found_in(state.regions.known, prior, cfg),
         outcomes,
         met,
         np.bincount(ground.labels[new], minlength=len(prior.regions)) > 0,
+        led,
     )
 
 
 def behind(
     openings: Openings, ground: Ground, known: np.ndarray, new: np.ndarray, cfg: ForesightConfig
-) -> tuple[np.ndarray, np.ndarray]:
-    """What each opening reveals first (opening,), as in `Moment`, and whether a region of each label that is `new`
-    (region,) begins within reach (opening, label); `known` (node,) has been seen."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """What each opening reveals first (opening,), as in `Moment`; whether a region of each label that is `new`
+    (region,) begins within reach (opening, label); and whether anything is behind (opening,). `known` (node,) has been
+    seen."""
     plan, count = ground.plan, openings.beliefs.shape[1]
     outcomes = np.full(len(openings.place_ids), SAME)
-    met = np.zeros((len(outcomes), count), bool)
+    met, led = np.zeros((len(outcomes), count), bool), np.zeros(len(outcomes), bool)
     for row in range(len(outcomes)):
         edge = _edge(openings, row, ground, known, cfg.beyond_m)
         origin, first = _most(plan, edge), _nodes_behind(plan, known, edge, BEYOND_CELLS)
+        led[row] = first.sum() * CELL_M**2 >= LED_M2
         shown = int(first.argmax()) if first.any() else NO_REGION
         if shown not in (NO_REGION, origin) and ground.labels[shown] >= 0:
             outcomes[row] = ground.labels[shown]
         begins = new & (_nodes_behind(plan, known, edge, REACH_CELLS) * CELL_M**2 >= MET_M2)
         met[row, ground.labels[begins]] = True
-    return outcomes, met
+    return outcomes, met, led
 
 
 def covered(ground: Ground, graph: ReceivedGraph) -> np.ndarray:

@@ -61,7 +61,8 @@ def _ties(given: np.ndarray, chance: np.ndarray) -> np.ndarray:
 
 
 def figures(worlds: Sequence[Judged]) -> dict[str, float]:
-    """Means over worlds, each the mean over its events, with standard errors; calibration over all events."""
+    """Means over worlds, each the mean over its events, with standard errors; calibration over all events. Where no
+    world has shown another region, nothing is told of that."""
     one = {
         "nll": [-np.log(np.maximum(world.chances, LEAST)).mean() for world in worlds],
         "top1": [(world.ranks < 1.5).mean() for world in worlds],
@@ -74,7 +75,7 @@ def figures(worlds: Sequence[Judged]) -> dict[str, float]:
         "top1_another": [(world.ranks_another[world.another] < 1.5).mean() for world in worlds if world.another.any()],
         "top3_another": [(world.ranks_another[world.another] <= 3).mean() for world in worlds if world.another.any()],
     }
-    found = {name: float(np.mean(values)) for name, values in one.items()}
+    found = {name: float(np.mean(values)) for name, values in one.items() if values}
     found |= {
         f"{name}_error": float(np.std(values, ddof=1) / len(values) ** 0.5)
         for name, values in one.items()
@@ -90,8 +91,8 @@ def figures(worlds: Sequence[Judged]) -> dict[str, float]:
 
 
 def chance_figures(worlds: Sequence[tuple[Sequence[Moment], Prior]], cfg: ForesightConfig) -> dict[str, float]:
-    """Calibration and Brier score of what is said to begin behind each opening, and to be missing; `rate` is the score
-    of whoever knows nothing but how often that happens."""
+    """Calibration and Brier score of what is said to begin behind each opening, and to be missing: how often on average
+    (`said`), how often it was so (`true`); `rate` is the score of whoever knows nothing but that."""
     within: list[tuple[np.ndarray, np.ndarray]] = []
     missing: list[tuple[np.ndarray, np.ndarray]] = []
     for moments, prior in worlds:
@@ -104,6 +105,7 @@ def chance_figures(worlds: Sequence[tuple[Sequence[Moment], Prior]], cfg: Foresi
     for name, pairs in (("within", within), ("missing", missing)):
         chance, there = (np.concatenate(column).astype(float) for column in zip(*pairs, strict=True))
         found[f"{name}_ece"] = calibration_error(chance, there)
+        found[f"{name}_said"], found[f"{name}_true"] = float(chance.mean()), float(there.mean())
         found[f"{name}_brier"] = float(((chance - there) ** 2).mean())
         found[f"{name}_brier_rate"] = float(((there.mean() - there) ** 2).mean())
     return found

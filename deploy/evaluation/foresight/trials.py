@@ -88,6 +88,7 @@ class Moment:
     outcomes: np.ndarray  # (opening,) SAME or the label of another region
     met: np.ndarray  # (opening, label) bool: such a region, not found yet, begins within REACH_M
     left: np.ndarray  # (label,) bool: one more region of it is to be found
+    led: np.ndarray | None = None  # (opening,) bool: something unseen to stand on is behind; None = behind all
 
 
 @lru_cache(32)

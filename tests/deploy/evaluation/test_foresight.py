@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from prior_sg.deploy.evaluation.foresight.explorer import Explorer, Plan, crossings
-from prior_sg.deploy.evaluation.foresight.fitting import fitted
+from prior_sg.deploy.evaluation.foresight.fitting import fitted, fitted_to_maps
 from prior_sg.deploy.evaluation.foresight.loops import FAR
 from prior_sg.deploy.evaluation.foresight.mapped import behind, covered, ground_of
 from prior_sg.deploy.evaluation.foresight.predictors import PREDICTORS
@@ -15,7 +15,7 @@ from prior_sg.deploy.evaluation.foresight.scores import chance_figures, figures,
 from prior_sg.deploy.evaluation.foresight.searches import POLICIES, Quest, metres
 from prior_sg.deploy.evaluation.foresight.trials import SAME, Moment, Trial, go
 from prior_sg.deploy.evaluation.worlds.ways import CELL_M, LEVELS, ways_of
-from prior_sg.services.segmenter.core.foresight.beyond import Views, beyond
+from prior_sg.services.segmenter.core.foresight.beyond import Views, beyond, leads, leads_features
 from prior_sg.services.segmenter.core.foresight.config import ForesightConfig
 from prior_sg.services.segmenter.core.foresight.expectation import Found, expected
 from prior_sg.services.segmenter.core.foresight.openings import Openings
@@ -165,7 +165,7 @@ def test_fitting_finds_the_weights_that_made_the_events():
         missing_sum=2.0,
         missing_once=-1.0,
     )
-    walk = []
+    walk: list[Moment] = []
     for _ in range(600):
         counts = rng.integers(0, 2, 3).astype(float)
         at, widths_m = int(rng.integers(3)), rng.choice([0.9, 5.0], 4)
@@ -210,6 +210,8 @@ def opening_of(x_m, direction, width_m=1.0):
         widths_m=np.array([width_m]),
         regions=np.array([0]),
         beliefs=np.eye(3)[:1],
+        rises=np.zeros(1),
+        unseen=np.ones(1),
     )
 
 
@@ -225,12 +227,14 @@ def test_behind_the_products_openings_lies_what_its_places_do_not_cover():
     assert [one.tolist() for one in behind(east, ground, known, new, ForesightConfig())] == [
         [SAME],
         [[False, True, True]],  # around the sphere one comes to the west, too
+        [True],
     ]
     known |= PLAN.regions == 0
-    outcomes, met = behind(opening_of(middle_m[0] + 1.0, 1.0), ground, known, new, ForesightConfig())
+    outcomes, met, _ = behind(opening_of(middle_m[0] + 1.0, 1.0), ground, known, new, ForesightConfig())
     assert outcomes.tolist() == [2] and met.tolist() == [[False, False, True]]
     blind = opening_of(middle_m[0] - 1.5, 1.0)  # it ends within the hall
-    assert not behind(blind, ground, known, new, ForesightConfig())[1].any()
+    _, met, led = behind(blind, ground, known, new, ForesightConfig())
+    assert not met.any() and not led.any()
 
 
 def test_chances_are_judged_against_how_often_things_happen():
@@ -239,3 +243,20 @@ def test_chances_are_judged_against_how_often_things_happen():
     assert told["within_brier_rate"] == told["missing_brier_rate"] == pytest.approx(2 / 9)
     said = beyond(walk[0].views, expected(home_trial().prior, walk[0].found, ForesightConfig()), ForesightConfig())
     assert told["within_brier"] == pytest.approx(((said.within[0] - [0, 1, 0]) ** 2).mean())
+
+
+def test_fitting_learns_from_maps_which_openings_lead_anywhere():
+    """Whether they do is drawn from the model with known weights, and what is missing is never there."""
+    rng, cfg, the_prior = np.random.default_rng(6), ForesightConfig(), home_trial().prior
+    true = msgspec.structs.replace(cfg, leads_bias=-1.0, leads_rise=-3.0, leads_unseen=2.0, leads_width=2.0)
+    walk = []
+    for _ in range(400):
+        bare = moment([SAME] * 6, rng.uniform(0.4, 3.0, 6), left=np.zeros(3, bool))
+        signs = leads_features(bare.views.widths_m, rng.uniform(0, 0.7, 6), rng.uniform(0, 1, 6))
+        unsure = replace(bare.views, signs=signs)
+        walk.append(replace(bare, views=unsure, led=rng.random(6) < leads(unsure, true)))
+    found = fitted_to_maps([(walk, the_prior)], [], cfg)
+    np.testing.assert_allclose(leads(walk[0].views, found), leads(walk[0].views, true), atol=0.1)
+    said, before = (beyond(walk[0].views, expected(the_prior, walk[0].found, one), one).missing for one in (found, cfg))
+    assert said.max() < 0.1 < before.max()
+    assert found.within_bias == cfg.within_bias and found.same_by_width == cfg.same_by_width

@@ -10,9 +10,10 @@ from prior_sg.schemas.regions import RegionDelta
 from prior_sg.schemas.status import Tick
 from prior_sg.services.segmenter.core import update
 from prior_sg.services.segmenter.core.config import Config
-from prior_sg.services.segmenter.core.foresight.beyond import Views, beyond
+from prior_sg.services.segmenter.core.foresight.beyond import Views, beyond, leads, leads_features
 from prior_sg.services.segmenter.core.foresight.config import ForesightConfig
 from prior_sg.services.segmenter.core.foresight.expectation import Found, expected
+from prior_sg.services.segmenter.core.foresight.fan import unseen_shares
 from prior_sg.services.segmenter.core.foresight.openings import openings_of
 from prior_sg.services.segmenter.core.foresight.telling import differs, foresight
 from prior_sg.services.segmenter.core.map.frontiers import Frontiers
@@ -111,6 +112,42 @@ def test_narrow_openings_lead_elsewhere_and_wide_ones_show_more_of_the_same():
     assert door < hall
 
 
+def looking(widths_m, rises, unseen):
+    """Openings out of a hall of 8 m2, of which it is not known whether they lead anywhere."""
+    count = len(widths_m)
+    areas_m2 = np.full(count, 8.0)
+    signs = leads_features(np.array(widths_m), np.array(rises), np.array(unseen))
+    return Views(np.tile(np.eye(4)[0], (count, 1)), np.array(widths_m), areas_m2, signs)
+
+
+def test_shadows_ceilings_and_cracks_seldom_lead_anywhere():
+    door, crack, ceiling, shadow = leads(looking([1.2, 0.4, 1.2, 1.2], [0, 0, 0.6, 0], [0.9, 0.9, 0.9, 0.1]), CFG)
+    assert max(crack, ceiling, shadow) < 0.7 * door
+    assert leads(views(), CFG) == [1.0]
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_what_may_lead_nowhere_says_less_of_all_that_may_be_behind(seed):
+    the_prior, the_found, many = random_case(seed)
+    rng = np.random.default_rng(seed)
+    signs = leads_features(many.widths_m, rng.uniform(0, 0.7, 7), rng.uniform(0, 1, 7))
+    unsure = Views(many.beliefs, many.widths_m, many.areas_m2, signs)
+    sure, result = foreseen(the_prior, the_found, many), foreseen(the_prior, the_found, unsure)
+    chance = leads(unsure, CFG)
+    np.testing.assert_allclose(result.same + result.next.sum(axis=1), 1.0)
+    np.testing.assert_allclose(result.next, chance[:, None] * sure.next)
+    assert (result.within <= chance[:, None]).all()
+
+
+def test_a_fan_is_unseen_where_no_sphere_covers_it():
+    """Two large places 2 m apart: one looks at the other, one away, one along the gap between."""
+    graph = ReceivedGraph(np.arange(2), np.array([[0, 0, 1.0], [2.0, 0, 1.0]]), np.full(2, 1.2))
+    outward = np.array([[1.0, 0, 0], [-1.0, 0, 0], [0, 1.0, 0]])
+    towards, away, beside = unseen_shares(graph, graph.positions_m[[0, 0, 0]] + 1.2 * outward, outward, CFG)
+    assert towards < 0.3 and away > 0.8 and towards < beside
+    assert unseen_shares(graph, np.zeros((0, 3)), np.zeros((0, 3)), CFG).shape == (0,)
+
+
 def a_map():
     """A row of five places 1 m apart: a hall of four and a bath; frontiers north of 0 and 1, south of 1, up from 2."""
     graph = ReceivedGraph(
@@ -140,6 +177,9 @@ def test_neighbouring_frontiers_that_look_the_same_way_are_one_opening():
     assert result.widths_m == pytest.approx([1.5])
     assert result.beyond_m[0] == pytest.approx([1.0, 0.5 + CFG.beyond_m, 1.0])
     assert result.beliefs[0] == pytest.approx([0.8, 0.1, 0.1, 0.0])
+    assert result.rises == pytest.approx([0.0]) and result.unseen[0] > 0.8
+    slanted = openings_of(graph, places, opened((10, (0, 0.8, 0.6), 2.0), (20, (0.8, -0.6, 0), 2.0)), CFG)
+    assert slanted.rises == pytest.approx([0.6, 0.0]) and slanted.unseen[1] < 0.8  # along the row of places
     assert openings_of(graph, places, opened((0, north, 1.0), (10, south, 2.0)), CFG).place_ids.tolist() == [10, 0]
     assert openings_of(graph, places, opened((30, north, 1.0), (40, north, 1.0)), CFG).regions.tolist() == [7, 8]
 

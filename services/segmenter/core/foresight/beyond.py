@@ -1,11 +1,13 @@
 """What lies beyond an opening (pure).
 
+    P(it leads anywhere)       = sigmoid(by its width, its direction and what is covered behind it)
     P(the same region goes on) = sigmoid(by the opening's width + by what was seen of the region + by its label)
-    P(another region r)        = (1 - P(same)) sum_i P(i) T(i, r)
-    P(r within some metres)    = sigmoid(by the opening, by the label of the region it opens from, by r)
+    P(another region r)        = P(leads) (1 - P(goes on)) sum_i P(i) T(i, r)
+    P(r within some metres)    = P(leads) sigmoid(by the opening, by the label of the region it opens from, by r)
 
-with P(i) the belief of the region it opens from and T from `expectation`. The first two are of what is seen first, the
-third of all that begins within REACH_M: a corridor that goes on shows none of the rooms along it and leads to them.
+with P(i) the belief of the region it opens from and T from `expectation`. Of a map's openings most lead nowhere: they
+are shadows of furniture, gaps in depth, ceilings. P(goes on) and P(r) are of what is seen first, the last of all that
+begins within REACH_M: a corridor that goes on shows none of the rooms along it and leads to them.
 """
 
 from dataclasses import dataclass
@@ -23,16 +25,33 @@ class Views:
     beliefs: np.ndarray  # (opening, label) of the region it opens from, rows sum to one
     widths_m: np.ndarray  # (opening,)
     areas_m2: np.ndarray  # (opening,) seen of that region
+    signs: np.ndarray | None = None  # (opening, feature) of `leads_features`; None = all are known to lead somewhere
 
 
 @dataclass(frozen=True)
 class Beyond:
     """What is expected beyond each opening."""
 
-    same: np.ndarray  # (opening,) that the region it opens from goes on
+    same: np.ndarray  # (opening,) that the region it opens from goes on, or nothing is behind
     next: np.ndarray  # (opening, label) another region; with `same`, rows sum to one
     within: np.ndarray  # (opening, label) that such a region begins within REACH_M
     missing: np.ndarray  # (label,) that one more region of that label is behind any of the openings
+
+
+def leads_features(widths_m: np.ndarray, rises: np.ndarray, unseen: np.ndarray) -> np.ndarray:
+    """What the logit of P(leads) is made of (opening, feature), in the order of `leads_weights`; the arguments
+    (opening,) are those of `Openings`."""
+    return np.column_stack((np.ones(len(widths_m)), np.log(widths_m), rises, unseen))
+
+
+def leads_weights(cfg: ForesightConfig) -> np.ndarray:
+    """Weight (feature,) of each of `leads_features`."""
+    return np.array([cfg.leads_bias, cfg.leads_width, cfg.leads_rise, cfg.leads_unseen])
+
+
+def leads(views: Views, cfg: ForesightConfig) -> np.ndarray:
+    """Chance (opening,) that there is unobserved floor behind each."""
+    return np.ones(len(views.widths_m)) if views.signs is None else _sigmoid(views.signs @ leads_weights(cfg))
 
 
 def same_features(views: Views, spread: np.ndarray, cfg: ForesightConfig) -> np.ndarray:
@@ -48,15 +67,15 @@ def same_weights(cfg: ForesightConfig) -> np.ndarray:
     return np.array([*cfg.same_by_width, cfg.same_by_area, cfg.same_by_spread])
 
 
-def within_features(views: Views, expectation: Expectation) -> np.ndarray:
+def within_features(views: Views, expectation: Expectation, leading: float) -> np.ndarray:
     """What the logit of P(r within some metres) is made of (opening, label, feature), in the order of
-    `within_weights`."""
+    `within_weights`, for openings that lead somewhere; so many of the map's do."""
     count, labels = views.beliefs.shape
     beside = np.log(np.maximum(views.beliefs @ expectation.spread, FLOOR))
     of_openings = (np.ones(count), np.log(views.widths_m), np.log1p(views.areas_m2), beside)
     columns = (
         *(np.broadcast_to(column[:, None], (count, labels)) for column in of_openings),
-        np.full((count, labels), np.log(max(count, 1))),
+        np.full((count, labels), np.log(max(leading, 1.0))),
         np.log(np.maximum(views.beliefs @ expectation.adjacency, FLOOR)),
         np.broadcast_to(np.log(np.maximum(expectation.existence, FLOOR)), (count, labels)),
         views.beliefs,
@@ -98,9 +117,10 @@ def missing_weights(cfg: ForesightConfig) -> np.ndarray:
 
 def beyond(views: Views, expectation: Expectation, cfg: ForesightConfig) -> Beyond:
     """What is expected beyond each opening; behind none, nothing is missing."""
-    same = _sigmoid(same_features(views, expectation.spread, cfg) @ same_weights(cfg))
+    chance = leads(views, cfg)
+    same = 1.0 - chance * (1.0 - _sigmoid(same_features(views, expectation.spread, cfg) @ same_weights(cfg)))
     another = (1.0 - same)[:, None] * (views.beliefs @ expectation.next)
-    within = _sigmoid(within_features(views, expectation) @ within_weights(cfg))
+    within = chance[:, None] * _sigmoid(within_features(views, expectation, chance.sum()) @ within_weights(cfg))
     missing = _sigmoid(missing_features(within, expectation) @ missing_weights(cfg))
     return Beyond(same, another, within, missing if len(same) else np.zeros(len(missing)))
 

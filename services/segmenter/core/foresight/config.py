@@ -13,10 +13,19 @@ class ForesightConfig(msgspec.Struct, frozen=True, kw_only=True):
     opening_height_m: float = 2.0  # an opening's width is its area over this
     least_width_m: float = 0.4  # narrower openings are cracks
     most_openings: int = 64  # the widest are told
+    fan_m: tuple[float, ...] = (0.3, 0.6, 1.0, 1.5, 2.0)  # of points looked at behind an opening's edge ...
+    fan_rad: tuple[float, ...] = (-0.7, -0.35, 0.0, 0.35, 0.7)  # ... and how far they are turned from its direction
+    covered_m: float = 0.3  # beside a place's sphere, what was not seen of its free space: corners
     beyond_m: float = 1.0  # how far beyond the edge of what was seen an expected region is put
     least_places: int = 3  # a region of fewer places does not count as found
 
-    # That the same region goes on: logit by width of the opening, and by what was seen of the region.
+    # That there is unobserved floor behind an opening at all, and it is no gap or shadow: logit.
+    leads_bias: float = -1.36
+    leads_width: float = 0.77  # by log of the opening's width / m
+    leads_rise: float = -4.32  # by how far its direction rises or falls (absolute sine)
+    leads_unseen: float = 1.82  # by the share of a fan behind it that no place covers
+
+    # That the same region goes on, where there is anything: logit by width of the opening, and by what was seen of it.
     widths_m: tuple[float, ...] = (0.6, 0.8, 1.1, 1.6, 2.5, 4.0)  # where the classes of width begin, after the first
     same_by_width: tuple[float, ...] = (0.09, -0.18, -0.15, 0.32, 0.16, 0.53, 0.47)
     same_by_area: float = 0.8  # by log(1 + seen area of the region / m2)
@@ -36,7 +45,7 @@ class ForesightConfig(msgspec.Struct, frozen=True, kw_only=True):
     within_width: float = 0.17  # by log of the opening's width / m
     within_area: float = -0.14  # by log(1 + seen area of the region it opens from / m2)
     within_spread: float = 1.25  # by log of the mean number of other regions that touch one of its label
-    within_openings: float = -0.32  # by log of how many openings the map has
+    within_openings: float = -0.32  # by log of how many openings of the map lead anywhere
     within_adjacency: float = 0.42  # by log P(ri <-> rj)
     within_existence: float = 1.49  # by log P(r)
     within_again: float = -2.5  # by the belief that the region it opens from has that label
@@ -44,14 +53,15 @@ class ForesightConfig(msgspec.Struct, frozen=True, kw_only=True):
     within_often: float = -0.29  # ... or several
 
     # That one more region of a label is behind any of the openings: logit.
-    missing_bias: float = 1.06
-    missing_sum: float = 0.86  # by log of the sum of the chances of all openings
+    missing_bias: float = 0.5
+    missing_sum: float = 0.28  # by log of the sum of the chances of all openings
     missing_existence: float = 0.11  # by log P(r)
-    missing_once: float = -0.46
-    missing_often: float = -0.43
+    missing_once: float = -1.05
+    missing_often: float = -1.0
 
     look_m: float = 1.0  # walked behind an opening to see what is there
     elsewhere_m: float = 40.0  # to what lies behind none of the openings
     told_change: float = 0.05  # smaller changes of a probability are no news
     told_labels: int = 8  # of each opening, the most probable
-    least_told: float = 0.02
+    least_told: float = 0.02  # of what is missing
+    least_within: float = 0.001  # behind one opening: most lead nowhere, and the best of them is still where to look

@@ -7,6 +7,7 @@ import scipy
 
 from prior_sg.schemas.regions import NO_REGION
 from prior_sg.services.segmenter.core.foresight.config import ForesightConfig
+from prior_sg.services.segmenter.core.foresight.fan import unseen_shares
 from prior_sg.services.segmenter.core.map.frontiers import Frontiers
 from prior_sg.services.segmenter.core.map.received import ReceivedGraph
 from prior_sg.services.segmenter.core.map.table import Places
@@ -22,6 +23,8 @@ class Openings:
     widths_m: np.ndarray  # (opening,)
     regions: np.ndarray  # (opening,) id of the region it opens from
     beliefs: np.ndarray  # (opening, label) rows sum to one
+    rises: np.ndarray  # (opening,) absolute sine of its direction
+    unseen: np.ndarray  # (opening,) share of a fan behind it that no place covers
 
 
 def openings_of(graph: ReceivedGraph, places: Places, frontiers: Frontiers, cfg: ForesightConfig) -> Openings:
@@ -45,13 +48,16 @@ def openings_of(graph: ReceivedGraph, places: Places, frontiers: Frontiers, cfg:
     kept = kept[np.argsort(-widths_m[kept], kind="stable")][: cfg.most_openings]
     largest, beliefs = rows[first[kept]], beliefs[kept]
     outward = net_m2[kept] / np.linalg.norm(net_m2[kept], axis=1, keepdims=True)
+    edges_m = graph.positions_m[largest] + outward * graph.radii_m[largest][:, None]
     return Openings(
         place_ids=graph.ids[largest],
         positions_m=graph.positions_m[largest],
-        beyond_m=graph.positions_m[largest] + outward * (graph.radii_m[largest] + cfg.beyond_m)[:, None],
+        beyond_m=edges_m + outward * cfg.beyond_m,
         widths_m=widths_m[kept],
         regions=places.regions[largest],
         beliefs=beliefs / beliefs.sum(axis=1, keepdims=True),
+        rises=np.abs(outward[:, 2]),
+        unseen=unseen_shares(graph, edges_m, outward, cfg),
     )
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from prior_sg.schemas.foresight import ForeseenLabel, Foresight, MissingLabel, Opening
 from prior_sg.schemas.priors import Prior
 from prior_sg.schemas.regions import Region
-from prior_sg.services.segmenter.core.foresight.beyond import Beyond, Views, beyond
+from prior_sg.services.segmenter.core.foresight.beyond import Beyond, Views, beyond, leads_features
 from prior_sg.services.segmenter.core.foresight.config import ForesightConfig
 from prior_sg.services.segmenter.core.foresight.expectation import Found, expected
 from prior_sg.services.segmenter.core.foresight.openings import Openings
@@ -44,7 +44,8 @@ def found_in(regions: Mapping[int, Region], prior: Prior, cfg: ForesightConfig) 
 def views_of(openings: Openings, regions: Mapping[int, Region]) -> Views:
     """What the openings tell of what is behind them."""
     areas_m2 = np.array([regions[region].area_m2 for region in openings.regions.tolist()])
-    return Views(openings.beliefs, openings.widths_m, areas_m2)
+    signs = leads_features(openings.widths_m, openings.rises, openings.unseen)
+    return Views(openings.beliefs, openings.widths_m, areas_m2, signs)
 
 
 def differs(told: Foresight | None, now: Foresight, cfg: ForesightConfig) -> bool:
@@ -86,7 +87,7 @@ def _opening(
                 met=int(found.borders[here, label]),
             )
             for label in likely
-            if within[label] >= cfg.least_told
+            if within[label] >= cfg.least_within
         ],
     )
 
