@@ -98,4 +98,4 @@ def test_a_merged_map_is_judged_beside_whole_walks_and_where_each_part_was(house
 
 def test_worlds_are_of_one_kind():
     with pytest.raises(EvaluationError, match="one kind"):
-        main.merge([Path("world:home:80"), Path("world:office:1-2")])
+        main.merge(main.Asked(paths=[Path("world:home:80"), Path("world:office:1-2")]))
