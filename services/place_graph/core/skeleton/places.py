@@ -92,7 +92,9 @@ def extract(grid: VoxelGrid, box: Box, rules: ExtractionRules) -> Extraction:
 
 def _member_voxels(basis: np.ndarray, d2: np.ndarray, min_d2: float) -> np.ndarray:
     """GVD voxels (n, 3) with room enough around them, in ascending order."""
-    return np.argwhere((basis > 0) & (d2 >= min_d2))
+    found = np.flatnonzero(basis.reshape(-1) > 0)
+    found = found[d2.reshape(-1)[found] >= min_d2]
+    return np.stack(np.unravel_index(found, basis.shape), axis=1)
 
 
 def _unique_pairs(pairs: np.ndarray, count: int) -> np.ndarray:
