@@ -103,11 +103,12 @@ class PlaceGraph:
         sight = _Sight(grid.gather("d2", window, UNKNOWN_D2), window)
         changes = Changes()
         before = {place_id: self.places[place_id].voxel for place_id in self.within(region)}
-        id_of, left = self._replace(extraction, region, sight, changes)
-        self._retire(left, extraction, id_of, sight, changes)
+        id_of, gone = self._replace(extraction, region, sight, changes)
+        self._retire(gone, extraction, id_of, sight, changes)
         stirred = self._touch(region, extraction, id_of) | (changes.touched & self.places.keys())
-        ends = [before[place_id] for place_id in sorted(changes.touched & before.keys())]  # left, or moved from there
-        voxels = np.concatenate((self._voxels(sorted(stirred)), [changed.low, changed.high - 1, *ends]))
+        ends = [before[place_id] for place_id in sorted(changes.touched & before.keys())]  # gone, or moved from there
+        left = np.array(ends, np.int64).reshape(-1, 3)
+        voxels = np.concatenate((self._voxels(sorted(stirred)), [changed.low, changed.high - 1], left))
         self._relink(Box(voxels.min(axis=0), voxels.max(axis=0) + 1), grid, changes)
         return changes
 
