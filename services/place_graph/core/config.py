@@ -18,7 +18,8 @@ MAX_FIELD_VOXELS = 120  # offsets to the nearest obstacle are kept in 8 bits
 # `habitat`, `uhumans2` and `clio` those of its configurations of that name; their diagrams have voxels of 0.2 m.
 PRESETS: dict[str, dict[str, Any]] = {
     "indoor": {},
-    "mixed": {"field_voxels": 2, "merge_policy": "middle"},
+    # Middles of whole cells lie a cell apart, that of a share f of one (1 + f) / 2 beside it: parts below half go.
+    "mixed": {"field_voxels": 2, "merge_policy": "middle", "node_merge_distance_m": 0.75},
     "outdoor": {
         "voxel_m": 0.2,
         "truncation_m": 0.6,

@@ -531,6 +531,42 @@ def test_thinning_keeps_what_is_connected_connected():
     assert keep.sum() < np.triu(clear > 0).sum()
 
 
+def _edges_by_definition(d2, voxels, touching, limits):
+    """All edges of places (n, 3) of a window, by their ends, with their squared clearance."""
+    clear = links.clear_lines(d2, voxels, touching, *limits)
+    keep = links.thinned(clear, voxels, touching, limits[0])
+    return {(int(a), int(b)): int(clear[a, b]) for a, b in np.argwhere(keep)}
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_change_in_a_box_concerns_no_other_edges_and_those_it_concerns_are_found(seed):
+    rng = np.random.default_rng(seed)
+    shape, limits = (60, 60, 14), (4.0, 144.0, 9.0)
+    free = rng.random(shape) > 0.004
+    d2 = np.rint(ndimage.distance_transform_edt(free) ** 2).astype(np.int16)
+    voxels = np.argwhere(free)[rng.choice(free.sum(), 130, replace=False)]
+    near = ((voxels[:, None] - voxels[None]) ** 2).sum(axis=2) < 15**2
+    touching = np.triu(near & (rng.random(near.shape) < 0.1), 1)
+    touching |= touching.T
+    before = _edges_by_definition(d2, voxels, touching, limits)
+    low, high = np.array((24, 24, 2)), np.array((34, 36, 12))
+    part = tuple(slice(*ends) for ends in zip(low, high, strict=True))
+    d2[part] = np.rint(ndimage.distance_transform_edt(rng.random(high - low) > 0.02) ** 2)
+    inside = Box(low, high).contains(voxels)
+    voxels[inside] = rng.integers(low, high, (inside.sum(), 3))
+    after = _edges_by_definition(d2, voxels, touching, limits)
+
+    pairs, clearances = links.joined(d2, voxels, touching, low, high, *limits)
+    found = dict(zip(map(tuple, pairs.tolist()), clearances.tolist(), strict=True))
+    old = np.array(sorted(before)).reshape(-1, 2)
+    gone = links.concerned(voxels, old, low, high, limits[1], 0)
+    kept = {pair: before[pair] for pair in map(tuple, old[~gone].tolist())}
+    assert not kept.keys() & found.keys()
+    assert kept | found == after
+    assert len(found) < len(after) / 2
+    assert any(before.get(pair) != after.get(pair) for pair in before.keys() | after.keys())
+
+
 # Frontiers.
 
 
@@ -591,15 +627,16 @@ def test_a_coarse_voxel_is_an_obstacle_if_any_of_its_voxels_is_and_free_if_half_
     assert not len(coarse.renew_labels(fine, field, np.array(((-16, 0, 16),)), 2))
 
 
-def test_a_coarser_field_after_each_frame_is_that_of_the_finished_map_in_any_order():
-    state, batch, backwards = start(MIXED), start(MIXED), start(msgspec.structs.replace(MIXED, max_speed_m_s=0.0))
-    deltas = play(state, TWO_ROOMS_WALK, MIXED)
-    play(backwards, TWO_ROOMS_WALK[::-1], msgspec.structs.replace(MIXED, max_speed_m_s=0.0))
+@pytest.mark.parametrize("cfg", [MIXED, preset("mixed")], ids=["parts stay", "parts below half a cell are absorbed"])
+def test_a_coarser_field_after_each_frame_is_that_of_the_finished_map_in_any_order(cfg):
+    state, batch, backwards = start(cfg), start(cfg), start(msgspec.structs.replace(cfg, max_speed_m_s=0.0))
+    deltas = play(state, TWO_ROOMS_WALK, cfg)
+    play(backwards, TWO_ROOMS_WALK[::-1], msgspec.structs.replace(cfg, max_speed_m_s=0.0))
     for frame in TWO_ROOMS_WALK:
-        fusing.fuse(batch, frame, images.depth_of(frame, 0.5), MIXED)
-    renewal.renew(batch, observed(batch.grid), MIXED)
+        fusing.fuse(batch, frame, images.depth_of(frame, 0.5), cfg)
+    renewal.renew(batch, observed(batch.grid), cfg)
     assert canonical(state) == canonical(batch) == canonical(backwards)
-    near = msgspec.structs.replace(MIXED, map_window_max_radius_m=1.5)
+    near = msgspec.structs.replace(cfg, map_window_max_radius_m=1.5)
     compressed = start(near)
     assert [encode(d) for d in play(compressed, TWO_ROOMS_WALK, near)] == [encode(d) for d in deltas]
     assert compressed.grid.packed_bytes > 0 and compressed.field.packed_bytes > 0
@@ -666,6 +703,16 @@ def test_places_in_the_middle_are_found_again_on_a_shifted_grid():
         apart_m = np.linalg.norm(maps[0][:, None] - maps[1][None], axis=-1).min(axis=1)
         shares[policy] = np.mean(apart_m < 0.15)
     assert shares["middle"] > 0.7 and shares["middle"] > shares["basis_points"] + 0.1
+
+
+def test_the_mixed_preset_absorbs_parts_below_half_a_cell():
+    def count(**settings: float) -> int:
+        cfg = preset("mixed", **settings)
+        state = start(cfg)
+        play(state, TWO_ROOMS_WALK, cfg)
+        return len(ask(state, cfg).place_ids)
+
+    assert count() <= 0.8 * count(node_merge_distance_m=CFG.node_merge_distance_m)
 
 
 # Bounded memory.

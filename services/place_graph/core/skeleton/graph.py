@@ -6,7 +6,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from prior_sg.services.place_graph.core.skeleton.links import clear_lines, lenses, line_d2, nearest, thinned
+from prior_sg.services.place_graph.core.skeleton.links import (
+    clear_lines,
+    concerned,
+    joined,
+    lenses,
+    line_d2,
+    nearest,
+    thinned,
+)
 from prior_sg.services.place_graph.core.skeleton.places import SHIFT_UNITS, Extraction
 from prior_sg.services.place_graph.core.volume.grid import UNKNOWN_D2, Box, VoxelGrid
 
@@ -94,11 +102,13 @@ class PlaceGraph:
         window = region.grown(self._reach_voxels).clipped(grid.bounds)
         sight = _Sight(grid.gather("d2", window, UNKNOWN_D2), window)
         changes = Changes()
-        id_of, left = self._replace(extraction, region, sight, changes)
-        gone = self._voxels(left)
-        self._retire(left, extraction, id_of, sight, changes)
+        before = {place_id: self.places[place_id].voxel for place_id in self.within(region)}
+        id_of, gone = self._replace(extraction, region, sight, changes)
+        self._retire(gone, extraction, id_of, sight, changes)
         stirred = self._touch(region, extraction, id_of) | (changes.touched & self.places.keys())
-        voxels = np.concatenate((self._voxels(sorted(stirred)), [changed.low, changed.high - 1], gone))
+        ends = [before[place_id] for place_id in sorted(changes.touched & before.keys())]  # gone, or moved from there
+        left = np.array(ends, np.int64).reshape(-1, 3)
+        voxels = np.concatenate((self._voxels(sorted(stirred)), [changed.low, changed.high - 1], left))
         self._relink(Box(voxels.min(axis=0), voxels.max(axis=0) + 1), grid, changes)
         return changes
 
@@ -202,49 +212,69 @@ class PlaceGraph:
         return {place_id for place_id, others in before.items() if others != self._touching.get(place_id, set())}
 
     def _relink(self, region: Box, grid: VoxelGrid, changes: Changes) -> None:
-        """Renew the edges that may have changed: those with an end in `region`, or both ends within reach of it."""
-        inside = set(self.within(region))
-        near = set(self.within(region.grown(self._reach_voxels)))
-        window = region.grown(2 * self._reach_voxels).clipped(grid.bounds)
-        sight = _Sight(grid.gather("d2", window, UNKNOWN_D2), window)
-        renewed: dict[int, dict[int, int]] = {a: {} for a in near}
-        renewed.update({b: {} for a in inside for b in self.edges.get(a, ())})
-
-        def concerned(a: int, b: int) -> bool:
-            return (a in inside or b in inside or (a in near and b in near)) and self.frozen.isdisjoint((a, b))
-
-        for a, b, clearance in self._links_within(window, sight):
-            if concerned(a, b):
-                renewed.setdefault(a, {})[b] = renewed.setdefault(b, {})[a] = clearance
-        for a in sorted(renewed):
-            known = self.edges.get(a, {})
-            links = {b: clearance for b, clearance in known.items() if not concerned(a, b)} | renewed[a]
-            if links != known:
-                changes.touched.add(a)
-            self.edges[a] = links
-
-    def _links_within(self, box: Box, sight: _Sight) -> list[tuple[int, int, int]]:
-        """Edges between the places of `box`: smaller id, larger id, squared clearance."""
-        ids = [i for i in self.within(box) if i not in self.frozen]
+        """Renew the edges that a change inside `region` may concern."""
+        farther = self._margin or int(np.ceil(self.rules.reach))  # witnesses, or rivals where their number is limited
+        window = region.grown(self._reach_voxels + farther).clipped(grid.bounds)
+        ids = [i for i in self.within(window) if i not in self.frozen]
         index = {place_id: n for n, place_id in enumerate(ids)}
+        sight = _Sight(grid.gather("d2", window, UNKNOWN_D2), window)
+        renewed = self._links_within(ids, index, region, sight)
+        for pair in self._concerned(ids, index, region):
+            renewed.setdefault(pair, 0)
+        for (a, b), clearance in renewed.items():
+            if self.edges.get(a, {}).get(b, 0) != clearance:
+                changes.touched.update((a, b))
+            for one, two in ((a, b), (b, a)):
+                if clearance:
+                    self.edges.setdefault(one, {})[two] = clearance
+                else:
+                    del self.edges[one][two]
+
+    def _concerned(self, ids: list[int], index: Mapping[int, int], region: Box) -> list[tuple[int, int]]:
+        """Known edges, smaller id first, that a change inside `region` may concern."""
+        ends = ((a, b) for a in ids for b in self.edges.get(a, ()) if b not in self.frozen)
+        pairs = sorted({(min(pair), max(pair)) for pair in ends})
+        far = sorted({i for pair in pairs for i in pair if i not in index})  # from before an end moved
+        rows = {**index, **{place_id: len(ids) + n for n, place_id in enumerate(far)}}
+        where = np.array([(rows[a], rows[b]) for a, b in pairs], np.int64).reshape(-1, 2)
+        found = concerned(self._voxels(ids + far), where, *region, self.rules.reach**2, self._margin)
+        return [pairs[n] for n in np.flatnonzero(found).tolist()]
+
+    @property
+    def _margin(self) -> int:
+        """Where the number of edges is limited, those of a place depend on each other: how near both ends are then."""
+        limited = self.rules.check or self.rules.find or self.rules.overlap_check
+        return self._reach_voxels if limited else 0
+
+    def _links_within(
+        self, ids: list[int], index: Mapping[int, int], region: Box, sight: _Sight
+    ) -> dict[tuple[int, int], int]:
+        """Squared clearance of the edges, smaller id first, that a change inside `region` may concern."""
         touching = np.zeros((len(ids), len(ids)), np.bool_)
         for place_id in ids:
             for other in self._touching.get(place_id, ()):
                 if other in index:
                     touching[index[place_id], index[other]] = True
         voxels = self._voxels(ids) - sight.box.low
-        rules = self.rules
-        clear = clear_lines(sight.d2, voxels, touching, rules.edge**2, rules.reach**2, rules.free**2)
-        keep = thinned(clear, voxels, touching, rules.edge**2)
-        if rules.check or rules.find:
+        rules, low, high = self.rules, region.low - sight.box.low, region.high - sight.box.low
+        limits = rules.edge**2, rules.reach**2, rules.free**2
+        if not self._margin:
+            pairs, clearances = joined(sight.d2, voxels, touching, low, high, *limits)
+        else:
+            clear = clear_lines(sight.d2, voxels, touching, *limits)
+            keep = thinned(clear, voxels, touching, rules.edge**2)
             keep &= touching | nearest(clear > 0, voxels, rules.check) & nearest(keep & ~touching, voxels, rules.find)
-        if rules.overlap_check:
-            radii = np.sqrt([self.places[i].d2 for i in ids])
-            lens2 = lenses(sight.d2, voxels, radii, rules.overlap, self._reach_voxels)
-            lens2[~nearest(np.ones_like(keep), voxels, rules.overlap_check)] = 0
-            clear = np.where(keep, clear, lens2)
-            keep |= np.triu(lens2 > 0, 1)
-        return [(ids[one], ids[two], int(clear[one, two])) for one, two in np.argwhere(keep).tolist()]
+            if rules.overlap_check:
+                radii = np.sqrt([self.places[i].d2 for i in ids])
+                lens2 = lenses(sight.d2, voxels, radii, rules.overlap, self._reach_voxels)
+                lens2[~nearest(np.ones_like(keep), voxels, rules.overlap_check)] = 0
+                clear = np.where(keep, clear, lens2)
+                keep |= np.triu(lens2 > 0, 1)
+            pairs = np.argwhere(keep)
+            pairs = pairs[concerned(voxels, pairs, low, high, rules.reach**2, self._margin)]
+            clearances = clear[tuple(pairs.T)]
+        ends = zip(pairs.tolist(), clearances.tolist(), strict=True)
+        return {(ids[one], ids[two]): int(clearance) for (one, two), clearance in ends}
 
     def _voxels(self, ids: list[int]) -> np.ndarray:
         return np.array([self.places[i].voxel for i in ids], np.int64).reshape(-1, 3)
@@ -259,6 +289,8 @@ class PlaceGraph:
                 for z, ids in self._columns.get((x, y), {}).items():
                     if low[2] <= z < high[2]:
                         found.extend(ids)
+        if not (np.concatenate(box) % self.rules.cell).any():
+            return sorted(found)
         return sorted(np.array(found, np.int64)[box.contains(self._voxels(found))].tolist())
 
     def _id_at(self, voxel: np.ndarray) -> int | None:

@@ -11,6 +11,8 @@ import numpy as np
 from prior_sg.services.compiled import compiled
 from prior_sg.services.place_graph.core.volume.grid import FAR_D2
 
+WITNESS = 3**0.5  # a point nearer to both ends of a line than these to each other, from its middle, in half lengths
+
 
 @compiled()
 def line_d2(d2, start, stop):  # noqa: ANN001, ANN201
@@ -45,14 +47,102 @@ def clear_lines(d2, voxels, touching, edge_d2, reach_d2, free_d2):  # noqa: ANN0
     clear = np.zeros((count, count), np.int32)
     for one in range(count):
         for two in range(one + 1, count):
-            dx, dy, dz = voxels[one] - voxels[two]
-            near = dx * dx + dy * dy + dz * dz <= reach_d2
-            if not (near or touching[one, two]):
-                continue
-            lowest = line_d2(d2, voxels[one], voxels[two])
-            if (touching[one, two] and lowest >= edge_d2) or (near and lowest >= free_d2):
-                clear[one, two] = clear[two, one] = lowest
+            clear[one, two] = clear[two, one] = _line(d2, voxels, touching, one, two, edge_d2, reach_d2, free_d2)
     return clear
+
+
+@compiled()
+def _line(d2, voxels, touching, one, two, edge_d2, reach_d2, free_d2):  # noqa: ANN001, ANN202, PLR0917
+    """Squared clearance of the line between two places, 0 if it is not admissible; see `clear_lines`."""
+    near = _squared(voxels, one, two) <= reach_d2
+    if not (near or touching[one, two]):
+        return 0
+    lowest = line_d2(d2, voxels[one], voxels[two])
+    return lowest if (touching[one, two] and lowest >= edge_d2) or (near and lowest >= free_d2) else 0
+
+
+@compiled()
+def _squared(voxels, one, two):  # noqa: ANN001, ANN202
+    dx, dy, dz = voxels[one, 0] - voxels[two, 0], voxels[one, 1] - voxels[two, 1], voxels[one, 2] - voxels[two, 2]
+    return dx * dx + dy * dy + dz * dz
+
+
+@compiled()
+def concerned(voxels, pairs, low, high, reach_d2, margin):  # noqa: ANN001, ANN201, PLR0917
+    """Which pairs (n, 2) of places a change inside the box from `low` to `high` may join or part; see `_concerns`."""
+    found = np.empty(len(pairs), np.bool_)
+    for n in range(len(pairs)):
+        found[n] = _concerns(voxels, pairs[n, 0], pairs[n, 1], low, high, reach_d2, margin)
+    return found
+
+
+@compiled()
+def _concerns(voxels, one, two, low, high, reach_d2, margin):  # noqa: ANN001, ANN202, PLR0917
+    """Whether an end or a witness of a pair may lie in a box, or its line meet it.
+
+    Witnesses against a line are nearer to both ends than these to each other, hence within a ball around its middle.
+    With a `margin` instead: whether an end lies in the box, or both ends lie within the margin of it.
+    """
+    length2 = _squared(voxels, one, two)
+    around = 0.5 * WITNESS * np.sqrt(float(length2)) if length2 <= reach_d2 else 0.0
+    one_in = two_in = one_near = two_near = meets = True
+    for axis in range(3):
+        a, b = voxels[one, axis], voxels[two, axis]
+        one_in = one_in and low[axis] <= a < high[axis]
+        two_in = two_in and low[axis] <= b < high[axis]
+        one_near = one_near and low[axis] - margin <= a < high[axis] + margin
+        two_near = two_near and low[axis] - margin <= b < high[axis] + margin
+        first = min(a, b, 0.5 * (a + b) - around)
+        last = max(a, b, 0.5 * (a + b) + around)
+        meets = meets and first < high[axis] and last >= low[axis]
+    return one_in or two_in or (one_near and two_near if margin else meets)
+
+
+@compiled()
+def joined(d2, voxels, touching, low, high, edge_d2, reach_d2, free_d2):  # noqa: ANN001, ANN201, PLR0917
+    """Edges (edge, 2) of places (n, 3), smaller first, sorted, and their squared clearance (edge,).
+
+    Only those that a change in the box from `low` to `high` concerns. Clear lines are those of `clear_lines`, and stay
+    as edges as in `thinned`; only lines that may be edges, or witness against one, are looked at.
+    """
+    count = len(voxels)
+    starts = np.zeros(count + 1, np.int64)
+    beside = np.empty(16 * count + 16, np.int64)
+    fill = 0
+    for one in range(count):
+        for two in range(count):
+            if two != one and (touching[one, two] or _squared(voxels, one, two) <= reach_d2):
+                if fill == len(beside):
+                    beside = np.concatenate((beside, np.empty_like(beside)))
+                beside[fill] = two
+                fill += 1
+        starts[one + 1] = fill
+    known = np.full((count, count), -1, np.int32)  # clearance of the lines looked at
+    pairs, clearances, found = np.empty((fill // 2 + 1, 2), np.int64), np.empty(fill // 2 + 1, np.int64), 0
+    for one in range(count):
+        for two in beside[starts[one] : starts[one + 1]]:
+            if two < one or not _concerns(voxels, one, two, low, high, reach_d2, 0):
+                continue
+            if known[one, two] < 0:
+                line = _line(d2, voxels, touching, one, two, edge_d2, reach_d2, free_d2)
+                known[one, two] = known[two, one] = line
+            stays = known[one, two] > 0
+            if stays and not (touching[one, two] and known[one, two] >= edge_d2):
+                length = _squared(voxels, one, two)
+                for third in beside[starts[one] : starts[one + 1]]:
+                    if _squared(voxels, one, third) >= length or _squared(voxels, third, two) >= length:
+                        continue
+                    for end in (one, two):
+                        if known[end, third] < 0:
+                            line = _line(d2, voxels, touching, end, third, edge_d2, reach_d2, free_d2)
+                            known[end, third] = known[third, end] = line
+                    if known[one, third] > 0 and known[third, two] > 0:
+                        stays = False
+                        break
+            if stays:
+                pairs[found, 0], pairs[found, 1], clearances[found] = one, two, known[one, two]
+                found += 1
+    return pairs[:found], clearances[:found]
 
 
 @compiled()

@@ -76,14 +76,14 @@ def extract(grid: VoxelGrid, box: Box, rules: ExtractionRules) -> Extraction:
         "basis_points": (group_basis, group_d2),
         "distance": (group_d2, group_basis),
     }
-    pairs = _unique_pairs(_touching(members, labels))
+    pairs = _unique_pairs(_touching(members, labels), groups)
     root = _merge(local, *ranks[rules.policy], pairs, rules.merge**2)
     kept = np.flatnonzero(root == np.arange(groups))
     index = np.full(groups, -1, np.int64)
     index[kept] = np.arange(len(kept))
     place_of = index[root] if groups else index
     labels[tuple(members.T)] = place_of[labels[tuple(members.T)]]
-    touching = _unique_pairs(place_of[pairs])
+    touching = _unique_pairs(place_of[pairs], groups)
     local, shifts, clear_d2 = local[kept], shifts[kept], group_d2[kept].astype(np.float64)
     if shifts.any():
         _between_voxels(d2, grid.gather("offset", box), local, shifts, clear_d2, rules.min_radius**2)
@@ -92,13 +92,16 @@ def extract(grid: VoxelGrid, box: Box, rules: ExtractionRules) -> Extraction:
 
 def _member_voxels(basis: np.ndarray, d2: np.ndarray, min_d2: float) -> np.ndarray:
     """GVD voxels (n, 3) with room enough around them, in ascending order."""
-    return np.argwhere((basis > 0) & (d2 >= min_d2))
+    found = np.flatnonzero(basis.reshape(-1) > 0)
+    found = found[d2.reshape(-1)[found] >= min_d2]
+    return np.stack(np.unravel_index(found, basis.shape), axis=1)
 
 
-def _unique_pairs(pairs: np.ndarray) -> np.ndarray:
-    """Pairs (n, 2) of different indices, smaller first, sorted, once each."""
-    ordered = np.sort(pairs[pairs[:, 0] != pairs[:, 1]], axis=1)
-    return np.unique(ordered, axis=0).reshape(-1, 2)
+def _unique_pairs(pairs: np.ndarray, count: int) -> np.ndarray:
+    """Pairs (n, 2) of different indices below `count`, smaller first, sorted, once each."""
+    one, two = pairs[pairs[:, 0] != pairs[:, 1]].T
+    keys = np.unique(np.minimum(one, two) * count + np.maximum(one, two))
+    return np.stack(np.divmod(keys, max(count, 1)), axis=1)
 
 
 @compiled()
