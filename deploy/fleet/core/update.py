@@ -165,7 +165,7 @@ def _numbers(memory: Memory) -> bytes:
 def _note_frames(memory: Memory, related: list[Member]) -> bool:
     """Remember how the maps lie; whether any lies otherwise than remembered."""
     now = {one.written: one.relation.fleet_from_own for one in related if one.relation is not None}
-    moved = any(not np.array_equal(pose, memory.frames.get(key)) for key, pose in now.items())
+    moved = any(key not in memory.frames or not np.array_equal(pose, memory.frames[key]) for key, pose in now.items())
     memory.frames |= now
     return moved
 

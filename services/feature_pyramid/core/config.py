@@ -11,7 +11,7 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
     """Settings of the feature pyramid; one embedding space per worker."""
 
     space: str = DEFAULT_SPACE  # the encoder: conse/…, open_clip/MODEL/PRETRAINED, onnx:FOLDER
-    runtime: str = "onnx"  # or torch: what runs the networks of conse
+    runtime: str = "auto"  # what runs the networks of conse: onnx, onnx-int8, torch, or auto: the fastest of them here
     device: str = "auto"  # cpu, cuda, or auto: cuda where there is one
     smallest_crop_px: int = 0  # side of layer 0; smaller images use their shorter side; 0 = what suits the encoder
     layers: int = 3  # sides grow linearly from the smallest crop to the shorter side of the image

@@ -27,7 +27,7 @@ class Options(NamedTuple):
 
     threads: int = 0  # 0 = the library's own choice (OMP_NUM_THREADS)
     batch_size: int = 0  # crops per forward pass; 0 = what suits the device
-    runtime: str = "onnx"  # or torch, where a family has both
+    runtime: str = "auto"  # of a family that has several
     device: str = "auto"  # cpu, cuda, or auto: cuda where there is one
 
     def batch_on(self, device: str) -> int:

@@ -16,9 +16,10 @@ import numpy as np
 from tokenizers import Tokenizer
 
 from prior_sg.schemas.features import TextEmbeddings
-from prior_sg.services.feature_pyramid.encoders import onnx_session
+from prior_sg.services.feature_pyramid.encoders import onnx_session, quantised
 from prior_sg.services.feature_pyramid.encoders.base import EncoderUnavailable, Options, package, unit
 
+RUNTIMES = ("auto", "onnx", "onnx-int8", "torch")
 CLASSES = 1000
 INPUT_PX = {"efficientnet-lite0": 224, "efficientnet-lite1": 240, "efficientnet-lite2": 260}
 AVERAGED_FROM = 1.5  # times smaller, from which pixels are averaged: below, interpolation is as good and much faster
@@ -73,17 +74,27 @@ def check(choice: str) -> None:
 
 def load(choice: str, options: Options) -> "ConseEncoder":
     """The encoder of a space with its weights. Raises EncoderUnavailable."""
-    if options.runtime not in ("onnx", "torch"):
-        raise EncoderUnavailable(f"feature_pyramid.runtime is onnx or torch, not {options.runtime!r}.")
+    runtime = runtime_of(options.runtime)
     name = _network_of(choice)
-    networks = _torch_networks if options.runtime == "torch" else _onnx_networks
-    classify, embed = networks(name, options.threads)
+    if runtime == "torch":
+        classify, embed = _torch_networks(name, options.threads)
+    else:
+        classify, embed = _onnx_networks(name, options.threads, rounded=runtime == "onnx-int8")
     sentences = SentenceModel(embed)
-    kept = kept_embeddings if options.runtime == "onnx" else SentenceModel.embed
+    kept = SentenceModel.embed if runtime == "torch" else kept_embeddings
     classes, scenes = kept(sentences, class_names()), kept(sentences, list(SCENES))
-    lanes = onnx_session.threads_of(options.threads) if options.runtime == "onnx" else 1
+    lanes = 1 if runtime == "torch" else onnx_session.threads_of(options.threads)
     classifier = Classifier(name, classify, options.batch_size or BATCH, lanes)
     return ConseEncoder(choice, classifier, sentences, classes, scenes)
+
+
+def runtime_of(chosen: str) -> str:
+    """What runs the networks: the choice itself, or for auto what is fastest here. Raises EncoderUnavailable."""
+    if chosen not in RUNTIMES:
+        raise EncoderUnavailable(f"feature_pyramid.runtime is one of {', '.join(RUNTIMES)}, not {chosen!r}.")
+    if chosen == "auto":
+        return "onnx-int8" if quantised.multiplies_bytes() else "onnx"
+    return chosen
 
 
 def _network_of(space: str) -> str:
@@ -107,8 +118,9 @@ def _torch_networks(name: str, threads: int) -> tuple[Classify, Embed]:
     return TorchClassifier(name, threads), Sentences(threads)
 
 
-def _onnx_networks(name: str, threads: int) -> tuple[Classify, Embed]:
+def _onnx_networks(name: str, threads: int, rounded: bool) -> tuple[Classify, Embed]:
     """Both networks in ONNX Runtime; PyTorch is imported only when one has yet to be exported."""
+    classifier = rounded_classifier_file(name, threads) if rounded else classifier_file(name, threads)
 
     def export_sentences(path: Path) -> None:
         from prior_sg.services.feature_pyramid.encoders.conse_torch import Sentences
@@ -117,7 +129,7 @@ def _onnx_networks(name: str, threads: int) -> tuple[Classify, Embed]:
 
     sentences = onnx_session.cached("minilm-l6-v2", [EXPORT, *_versions(*SENTENCE_PACKAGES)], export_sentences)
     # Crops run side by side, each on one thread. Of the two, only the classifier is at work all the time.
-    return onnx_session.Session(classifier_file(name, threads), 1), onnx_session.AtFirstCall(sentences, threads)
+    return onnx_session.Session(classifier, 1), onnx_session.AtFirstCall(sentences, threads)
 
 
 def classifier_file(name: str, threads: int) -> Path:
@@ -129,6 +141,15 @@ def classifier_file(name: str, threads: int) -> Path:
         TorchClassifier(name, threads).export(path, INPUT_PX[name])
 
     return onnx_session.cached(name, [EXPORT, *_versions(*_packages(name))], export)
+
+
+def rounded_classifier_file(name: str, threads: int) -> Path:
+    """The same with convolutions in 8-bit integers. Raises EncoderUnavailable."""
+
+    def export(path: Path) -> None:
+        quantised.quantise(classifier_file(name, threads), path, INPUT_PX[name])
+
+    return onnx_session.cached(f"{name}-int8", [EXPORT, *_versions(*_packages(name), "onnxruntime")], export)
 
 
 def _packages(name: str) -> tuple[str, ...]:

@@ -20,7 +20,9 @@ from prior_sg.schemas.topics import DETECTIONS, ENCODE, PRIOR, PYRAMID, TASK, TE
 from prior_sg.services.feature_pyramid import service
 from prior_sg.services.feature_pyramid.core import crops as core
 from prior_sg.services.feature_pyramid.core.config import Config
+from prior_sg.services.feature_pyramid.encoders import quantised
 from prior_sg.services.feature_pyramid.encoders.base import EncoderUnavailable, Options, load_encoder
+from prior_sg.services.feature_pyramid.encoders.conse import runtime_of
 from prior_sg.services.feature_pyramid.worker import NOT_ENCODED
 from prior_sg.services.runtime.service import Identity
 from tests.help.paths import SHARED_DATA
@@ -28,7 +30,7 @@ from tests.help.paths import SHARED_DATA
 DATA = SHARED_DATA
 CAMERA = Intrinsics(640, 480, 500.0, 400.0, 320.0, 240.0)
 SPACE = "conse/efficientnet-lite0/minilm-l6-v2"  # the fastest
-CFG = Config(space=SPACE, threads=1, smallest_crop_px=224)
+CFG = Config(space=SPACE, threads=1, smallest_crop_px=224, runtime="onnx")
 
 
 @pytest.fixture(scope="session")
@@ -230,6 +232,32 @@ def test_onnx_gives_the_numbers_of_pytorch(worker):
     ours, theirs = worker.encoder.encode_text(concepts), original.encode_text(concepts)
     for name in ("embeddings", "background_mean", "background_std"):
         assert getattr(ours, name) == pytest.approx(getattr(theirs, name), abs=1e-3)
+
+
+def test_rounded_convolutions_give_nearly_the_same_embeddings(worker):
+    """In 8-bit integers: of pictures that its ranges were not found on."""
+    rounded = load_encoder(SPACE, Options(threads=1, runtime="onnx-int8"))
+    image = checkered()
+    crops = [image[:224, :224], image[10:400, 30:420], image[200:300, 60:160]]
+    crops += [quantised.dead_leaves(np.random.default_rng(seed), 224) for seed in range(100, 110)]
+    full, found = worker.encoder.encode_images(crops), rounded.encode_images(crops)
+    likeness = (full * found).sum(axis=1)
+    others = (full @ full.T)[np.triu_indices(len(full), 1)]
+    assert np.median(likeness) > 0.97 > np.quantile(others, 0.9)
+    assert not np.array_equal(full, found)
+
+
+@pytest.mark.parametrize(
+    ("flags", "runtime"), [("fpu avx2 avx512_vnni", "onnx-int8"), ("fpu avx2", "onnx"), (None, "onnx")]
+)
+def test_bytes_are_multiplied_where_the_processor_has_instructions_for_it(flags, runtime, tmp_path, monkeypatch):
+    monkeypatch.setattr(quantised, "PROCESSOR_FILE", tmp_path / "cpuinfo")
+    if flags is not None:
+        (tmp_path / "cpuinfo").write_text(f"flags\t\t: {flags}\n")
+    assert runtime_of("auto") == runtime
+    assert runtime_of("torch") == "torch"
+    with pytest.raises(EncoderUnavailable, match="one of auto, onnx, onnx-int8, torch"):
+        runtime_of("tensorrt")
 
 
 def test_an_export_is_made_once_per_version_and_never_seen_half(tmp_path, monkeypatch):
