@@ -10,9 +10,15 @@ from collections.abc import Set
 
 import numpy as np
 
-from prior_sg.schemas.frames import Intrinsics
 from prior_sg.services.geometry import inverse
-from prior_sg.services.segmenter.core.evidence.kernel import Evidence, Frame, KernelConfig, Targets, integrate
+from prior_sg.services.segmenter.core.evidence.kernel import (
+    Evidence,
+    Frame,
+    KernelConfig,
+    Targets,
+    frustum_tangents,
+    integrate,
+)
 
 PAIRS_PER_BLOCK = 1 << 19  # frame-place pairs tested at once; bounds the memory of the visibility test
 SPOT_M = 0.5  # side of a spot that frames look from
@@ -96,7 +102,7 @@ class FrameArchive:
         if not frames or not len(positions_m):
             return np.zeros(0, dtype=np.int64)
         poses = np.stack([frame.camera_from_world for frame in frames])
-        limits = np.array([_frustum_tangents(frame.intrinsics) for frame in frames])
+        limits = np.array([frustum_tangents(frame.intrinsics) for frame in frames])
         block = max(PAIRS_PER_BLOCK // len(positions_m), 1)
         found = []
         for start in range(0, len(poses), block):
@@ -127,13 +133,3 @@ def view_of(frame: Frame) -> View:
 def size_bytes(frame: Frame) -> int:
     """Memory that a frame takes, but for a few hundred bytes."""
     return frame.embeddings.nbytes + frame.centers_px.nbytes + frame.sigmas_px.nbytes + frame.surface_m.nbytes
-
-
-def _frustum_tangents(camera: Intrinsics) -> tuple[float, float, float, float]:
-    """Bounds of x / z and y / z inside the image, and one pixel more so that rounding leaves nothing out."""
-    return (
-        (-1.5 - camera.cx_px) / camera.fx_px,
-        (camera.width_px + 0.5 - camera.cx_px) / camera.fx_px,
-        (-1.5 - camera.cy_px) / camera.fy_px,
-        (camera.height_px + 0.5 - camera.cy_px) / camera.fy_px,
-    )

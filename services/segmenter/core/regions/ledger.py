@@ -101,9 +101,9 @@ class Ledger:
         """
         self._reserve(int(slots.max(initial=-1)) + 1, len(head.labels), everything)
         sent = np.flatnonzero(~self.told[slots] | self._differs(slots, now, tolerance))
-        upserts = [region for _, region in sorted(regions.items()) if self.regions.get(region.id) != region]
+        upserts = [region for _, region in sorted(regions.items()) if _is_news(region, self.regions.get(region.id))]
         gone_regions = sorted(self.regions.keys() - regions.keys())
-        moved_nodes = [node for key, node in nodes.items() if self.nodes.get(key) != node]
+        moved_nodes = [node for key, node in nodes.items() if _is_news(node, self.nodes.get(key))]
         gone_nodes = sorted(self.nodes.keys() - nodes.keys())
         moved_on = self.head is not None and head.space != self.head.space
         changed = len(sent) or upserts or gone_regions or self.gone or events or moved_nodes or gone_nodes
@@ -205,6 +205,11 @@ class Ledger:
             grown.append(room)
         self.beliefs = Beliefs(*grown)
         self.told = np.concatenate((self.told, np.zeros(size - have, dtype=bool)))
+
+
+def _is_news(now: Region | LevelNode, told: Region | LevelNode | None) -> bool:
+    """Whether `now` says something else; most regions are the very ones that were told."""
+    return now is not told and now != told
 
 
 def _moved(now: np.ndarray, before: np.ndarray, tolerance: float) -> np.ndarray:
