@@ -29,6 +29,8 @@ class Held(NamedTuple):
 
     belief: np.ndarray  # (label,) mean over its places
     ground_m2: np.ndarray  # (storey,) of its places
+    others: np.ndarray  # (other,) ids, ascending, of regions of higher id that ways lead to
+    ways: np.ndarray  # (other,) how wide these are together, as `alignment.Members` counts
 
 
 @dataclass
@@ -63,9 +65,14 @@ class LayerMap:
         """Find all levels of these regions, of which only `changed` hold other places or beliefs than before; None =
         all may."""
         listed = [region for _, region in sorted(regions.items()) if region.place_count]
-        self._hold(listed, places, storeys, changed)
-        members = _members(listed, [self.held[region.id] for region in listed], graph, places, cfg)
-        layers = layers_of(members, _storeys(listed, self.held), levels, cfg.alignment)
+        if changed is None or not np.array_equal(storeys.floors_m, self.floors_m):
+            self.held, self.floors_m = {}, storeys.floors_m
+        self.forget(changed or frozenset())
+        asked = [region for region in listed if region.id not in self.held]
+        self.held |= _held(asked, places, storeys, cfg.alignment.way_m)
+        self.held = {region.id: self.held[region.id] for region in listed}
+        members = _members(listed, list(self.held.values()), graph, places, cfg)
+        layers = layers_of(members, _storeys(self.held), levels, cfg.alignment)
         counts = np.minimum([region.place_count for region in listed], MOST_COUNTED).astype(np.int64)
         former, self.node_of, ids = self.node_of, {}, {}
         for layer in layers:
@@ -78,16 +85,6 @@ class LayerMap:
             )
         self.known = {(node.level, node.id): node for node in _nodes(listed, layers, ids)}
 
-    def _hold(self, regions: list[Region], places: Places, storeys: Storeys, changed: Set[int] | None) -> None:
-        """Sum up the places of those regions that have changed."""
-        if changed is None or not np.array_equal(storeys.floors_m, self.floors_m):
-            self.held, self.floors_m = {}, storeys.floors_m
-        self.forget(changed or frozenset())
-        self.held = {region.id: self.held[region.id] for region in regions if region.id in self.held}
-        asked = [region.id for region in regions if region.id not in self.held]
-        if asked:
-            self.held |= zip(asked, _held(asked, places, storeys), strict=True)
-
     def forget(self, regions: Set[int]) -> None:
         """These regions have changed, though no level was found again."""
         self.held = {number: one for number, one in self.held.items() if number not in regions}
@@ -98,36 +95,48 @@ class LayerMap:
         return "" if node is None else self.known["zone", node].label
 
 
-def _held(ids: list[int], places: Places, storeys: Storeys) -> list[Held]:
-    """What each of the regions `ids` holds."""
+def _held(regions: list[Region], places: Places, storeys: Storeys, way_m: float) -> dict[int, Held]:
+    """What each of the regions holds, by id."""
+    ids = [region.id for region in regions]
     numbers, count = _numbers(ids, places), max(len(storeys.floors_m), 1)
     rows = np.flatnonzero(numbers[places.regions] >= 0)
     of_region = numbers[places.regions[rows]]
     beliefs = _means(places.posteriors[rows].astype(np.float64), of_region, len(ids))
     cells = of_region * count + storeys.of_place[rows]
     ground_m2 = np.bincount(cells, storeys.weights_m2[rows], minlength=len(ids) * count).reshape(-1, count)
-    return [Held(*one) for one in zip(beliefs, ground_m2, strict=True)]
+    return {
+        region.id: Held(belief, ground, *_ways(region, way_m))
+        for region, belief, ground in zip(regions, beliefs, ground_m2, strict=True)
+    }
+
+
+def _ways(region: Region, way_m: float) -> tuple[np.ndarray, np.ndarray]:
+    """The regions of higher id that ways lead to, and how wide these are together."""
+    found: dict[int, float] = {}
+    for way in region.transitions:
+        if region.id < way.region:
+            found[way.region] = found.get(way.region, 0.0) + min(way.clearance_m / way_m, 1.0)
+    others = sorted(found)
+    return np.array(others, np.int64), np.array([found[other] for other in others])
 
 
 def _members(
     regions: list[Region], held: list[Held], graph: ReceivedGraph, places: Places, cfg: LayersConfig
 ) -> Members:
     """Regions as members of the level above: mean beliefs of their places, and the ways between them."""
-    way_m = cfg.alignment.way_m
-    row = {region.id: number for number, region in enumerate(regions)}
-    ways: dict[tuple[int, int], float] = {}
-    for region in regions:
-        for way in region.transitions:
-            if region.id < way.region and way.region in row:
-                pair = row[region.id], row[way.region]
-                ways[pair] = ways.get(pair, 0.0) + min(way.clearance_m / way_m, 1.0)
-    known = np.array(sorted(ways), np.int64).reshape(-1, 2)
+    others = np.concatenate([np.zeros(0, np.int64), *(one.others for one in held)])
+    ways = np.concatenate([np.zeros(0), *(one.ways for one in held)])
+    here = np.repeat(np.arange(len(regions)), [len(one.others) for one in held])
+    ids = np.array([region.id for region in regions], np.int64)
+    there = np.searchsorted(ids, others)
+    listed = np.isin(others, ids)
+    known = np.stack((here[listed], there[listed]), axis=1)
     near = near_regions(graph, _rows(regions, places), known, len(regions), cfg.join_m)
     return Members(
         areas_m2=np.array([region.area_m2 for region in regions]),
         beliefs=np.array([one.belief for one in held]).reshape(len(regions), places.posteriors.shape[1]),
         edges=np.concatenate((known, near)),
-        ways=np.concatenate(([ways[pair] for pair in sorted(ways)], np.zeros(len(near)))),
+        ways=np.concatenate((ways[listed], np.zeros(len(near)))),
     )
 
 
@@ -149,9 +158,9 @@ def _means(values: np.ndarray, rows: np.ndarray, count: int) -> np.ndarray:
     return sums / np.maximum(np.bincount(rows, minlength=count), 1)[:, None]
 
 
-def _storeys(regions: list[Region], held: Mapping[int, Held]) -> np.ndarray:
+def _storeys(held: Mapping[int, Held]) -> np.ndarray:
     """The storey (region,) that most ground of each region is on; the lower of equals."""
-    return np.array([held[region.id].ground_m2.argmax() for region in regions], np.int64)
+    return np.array([one.ground_m2.argmax() for one in held.values()], np.int64)
 
 
 def _nodes(regions: list[Region], layers: list[Layer], ids: dict[LevelName, np.ndarray]) -> list[LevelNode]:
