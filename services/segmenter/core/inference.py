@@ -273,8 +273,10 @@ def settle(state: State, cfg: Config, *, hurried: bool) -> None:
     )
     if not limited:
         labels = solver.drain(budget.expired)
+    given_away = places.labels != places.cut_labels
+    changed = places.unsettled | given_away | (labels != places.cut_labels)
     places.cut_labels, places.solved = labels, rows
-    labels = consolidated(field_of(state), labels, cfg.region_cost)
+    labels = consolidated(field_of(state), labels, cfg.region_cost, changed)
     places.unbelieved |= with_neighbours(state.map.graph, labels != places.labels)
     places.labels = labels
     places.unsettled[:] = False

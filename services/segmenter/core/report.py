@@ -63,8 +63,9 @@ def _renew_layers(state: State, changed: Set[int] | None, cfg: Config) -> None:
     graph, places = state.map.graph, state.map.places
     levels = state.aim.aligned.levels
     state.layers.renew(regions.known, graph, places, regions.storeys, levels=levels, cfg=cfg.layers, changed=changed)
+    zones = state.layers.zones
     for number, region in regions.known.items():
-        zone = state.layers.zone_of(number)
+        zone = zones.get(number, "")
         if zone != region.parent:
             regions.known[number] = msgspec.structs.replace(region, parent=zone)
 

@@ -12,8 +12,10 @@ from prior_sg.schemas.frames import Intrinsics
 from prior_sg.schemas.status import Tick
 from prior_sg.services.runtime.runner import Runner
 from prior_sg.services.runtime.service import Identity
+from prior_sg.services.segmenter.core import inference
 from prior_sg.services.segmenter.core.config import Config
 from prior_sg.services.segmenter.core.energy import swap_moves
+from prior_sg.services.segmenter.core.energy.region_cost import consolidated
 from prior_sg.services.segmenter.core.energy.solver import Solver
 from prior_sg.services.segmenter.core.evidence.kernel import Frame, KernelConfig, project, visible
 from prior_sg.services.segmenter.core.layers.layer_map import LayerMap
@@ -123,9 +125,15 @@ def test_a_segmenter_that_carries_on_tells_what_one_that_starts_anew_tells(budge
     carried, kept = deltas_of(messages, cfg)
     anew = [joined_anew(one) if hasattr(one, "removed_edges") else one for one in messages]
     monkeypatch.setattr(LayerMap, "renew", partialmethod(_all_afresh, LayerMap.renew))
+    monkeypatch.setattr(inference, "consolidated", _consolidated_anew)
     found, kept_anew = deltas_of(anew, cfg)
     assert carried == found and len(carried) > 20
     assert kept - kept_anew > 5
+
+
+def _consolidated_anew(field, labels, cost, _changed):
+    """`consolidated` as if every place had changed."""
+    return consolidated(field, labels, cost)
 
 
 def _all_afresh(layers, renew, *arguments, changed, **named):

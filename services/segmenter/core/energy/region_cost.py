@@ -14,16 +14,18 @@ from prior_sg.services.segmenter.core.energy.mrf import Field
 from prior_sg.services.segmenter.core.regions.components import numbered
 
 
-def consolidated(field: Field, labels: np.ndarray, cost: float) -> np.ndarray:
+def consolidated(field: Field, labels: np.ndarray, cost: float, changed: np.ndarray | None = None) -> np.ndarray:
     """Labels (place,) in which no region gains less than `cost` by its own label against its best neighbour's.
 
     Regions are taken by what they gain, least first, and never two that touch in one pass. A pass weighs those that
-    were relabelled by the one before, and their neighbours: the others have been found to pay for themselves.
+    were relabelled by the one before, and their neighbours: the others have been found to pay for themselves. So does
+    the first with `changed` (place,): where costs, edges or labels are others than at the last call, and where that
+    gave a region away; None = anywhere.
     """
     labels = labels.copy()
     if cost <= 0 or not len(field.edges):
         return labels
-    relabelled = np.ones(len(labels), dtype=bool)
+    relabelled = np.ones(len(labels), dtype=bool) if changed is None else changed
     while relabelled.any():
         before = labels.copy()
         _pass(labels, numbered(labels, field.edges), relabelled, *field, cost)

@@ -65,8 +65,10 @@ class LayerMap:
         """Find all levels of these regions, of which only `changed` hold other places or beliefs than before; None =
         all may."""
         listed = [region for _, region in sorted(regions.items()) if region.place_count]
-        if changed is None or not np.array_equal(storeys.floors_m, self.floors_m):
-            self.held, self.floors_m = {}, storeys.floors_m
+        several = max(len(storeys.floors_m), len(self.floors_m)) > 1
+        if changed is None or (several and not np.array_equal(storeys.floors_m, self.floors_m)):
+            self.held = {}
+        self.floors_m = storeys.floors_m
         self.forget(changed or frozenset())
         asked = [region for region in listed if region.id not in self.held]
         self.held |= _held(asked, places, storeys, cfg.alignment.way_m)
@@ -89,10 +91,10 @@ class LayerMap:
         """These regions have changed, though no level was found again."""
         self.held = {number: one for number, one in self.held.items() if number not in regions}
 
-    def zone_of(self, region: int) -> str:
-        """Label of the zone that a region is in; empty where there are none."""
-        node = self.node_of.get("zone", {}).get(region)
-        return "" if node is None else self.known["zone", node].label
+    @property
+    def zones(self) -> dict[int, str]:
+        """Label of the zone that each region is in, by region id; empty where there are none."""
+        return {region: self.known["zone", node].label for region, node in self.node_of.get("zone", {}).items()}
 
 
 def _held(regions: list[Region], places: Places, storeys: Storeys, way_m: float) -> dict[int, Held]:

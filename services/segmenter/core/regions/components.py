@@ -141,28 +141,28 @@ def events(previous: np.ndarray, now: np.ndarray, before: dict[int, str], labels
     that is gone was merged into the region with most of its places.
     """
     pairs, counts = _pairs(previous, now)
+    new_ones, gone = labels.keys() - before.keys(), before.keys() - labels.keys()
     into: dict[int, tuple[int, int]] = {}  # former id -> (places, id now)
     out_of: dict[int, tuple[int, int]] = {}  # id now -> (places, former id)
     for (old, new), count in zip(pairs.tolist(), counts.tolist(), strict=True):
-        into[old] = max(into.get(old, (0, 0)), (count, new))
-        out_of[new] = max(out_of.get(new, (0, 0)), (count, old))
+        if old in gone:
+            into[old] = max(into.get(old, (0, 0)), (count, new))
+        if new in new_ones:
+            out_of[new] = max(out_of.get(new, (0, 0)), (count, old))
     found = []
-    for region in sorted(labels.keys() - before.keys()):
+    for region in sorted(new_ones):
         origin = out_of.get(region, (0, NO_REGION))[1]
         if origin in labels:
             found.append(RegionEvent(kind="split", region=region, label=labels[region], other=origin))
         else:
             found.append(RegionEvent(kind="appeared", region=region, label=labels[region]))
-    for region in sorted(before.keys() - labels.keys()):
+    for region in sorted(gone):
         if region in into:
             found.append(RegionEvent(kind="merged", region=region, label=before[region], other=into[region][1]))
         else:
             found.append(RegionEvent(kind="removed", region=region, label=before[region]))
-    for region in sorted(before.keys() & labels.keys()):
-        if before[region] != labels[region]:
-            found.append(
-                RegionEvent(kind="relabelled", region=region, label=labels[region], former_label=before[region])
-            )
+    for region in sorted(region for region, label in before.items() if labels.get(region, label) != label):
+        found.append(RegionEvent(kind="relabelled", region=region, label=labels[region], former_label=before[region]))
     return found
 
 
