@@ -11,7 +11,8 @@ from prior_sg.schemas.foresight import Foresight
 from prior_sg.schemas.levels import LevelName, LevelNode, rank
 from prior_sg.schemas.regions import Region, RegionDelta, RegionEvent
 
-K, V = TypeVar("K"), TypeVar("V")
+K = TypeVar("K")
+V = TypeVar("V")
 _NONE = np.zeros(0, dtype=np.int64)
 Nodes = dict[tuple[LevelName, int], LevelNode]
 
