@@ -4,6 +4,8 @@ Times are of this process alone and compiled code is warm. Energies count from e
 constant in the costs flatters no ratio.
 """
 
+import copy
+import functools
 import statistics
 import time
 from collections.abc import Callable
@@ -22,7 +24,9 @@ MAIN_SIZE = 10_000  # the one whose figures carry no suffix
 BOUND_SIZES = (500, 2_000)
 BOUND_FIELDS = 4  # of each size
 REPEATS = 3
+LARGE = 50_000  # from which on a fresh solve is timed once
 STEPS = {1_000: 100, 10_000: 60, 50_000: 12}  # updates of a stream, by places
+COLD_EVERY = {1_000: 1, 10_000: 3, 50_000: 4}  # steps at which one is compared with a fresh solve
 CHANGED_SHARE = 0.01
 CHANGED_PLACES = 100  # of the streams that show whether an update's time depends on the field's size
 
@@ -35,13 +39,17 @@ def swap_bench() -> tuple[dict[str, Any], dict[str, Any]]:
         metrics |= suffixed(cold(places), places)
     metrics |= dual_bound()
     for places, steps in STEPS.items():
-        metrics |= suffixed(stream(places, int(CHANGED_SHARE * places), steps), places)
-        constant = stream(places, CHANGED_PLACES, steps, against_cold=False)
+        settled = Solver()
+        settled.take(bench_field(places, 0), bench_field(places, 0).unary.argmin(axis=1))
+        settled.drain()
+        metrics |= suffixed(stream(settled, int(CHANGED_SHARE * places), steps, cold_every=COLD_EVERY[places]), places)
+        constant = stream(settled, CHANGED_PLACES, steps)
         metrics[f"update_ms_of_{CHANGED_PLACES}_places_{places}"] = constant["incremental_ms_p50"]
-        rewired = stream(places, CHANGED_PLACES, steps, against_cold=False, rewired=True)
+        rewired = stream(settled, CHANGED_PLACES, steps, rewired=True)
         metrics[f"update_ms_of_{CHANGED_PLACES}_places_rewired_{places}"] = rewired["incremental_ms_p50"]
     settings = {"labels": LABELS, "places": SIZES, "changed_share": CHANGED_SHARE, "steps": list(STEPS.values())}
-    return metrics, settings | {"repeats": REPEATS, "bound_fields": BOUND_FIELDS}
+    settings |= {"repeats": REPEATS, "repeats_of_large": 1, "cold_every": list(COLD_EVERY.values())}
+    return metrics, settings | {"bound_fields": BOUND_FIELDS}
 
 
 def suffixed(metrics: dict[str, float], places: int) -> dict[str, float]:
@@ -49,6 +57,7 @@ def suffixed(metrics: dict[str, float], places: int) -> dict[str, float]:
     return metrics if places == MAIN_SIZE else {f"{name}_{places}": value for name, value in metrics.items()}
 
 
+@functools.cache
 def bench_field(places: int, seed: int) -> Field:
     """A random field whose costs count from each place's cheapest label."""
     field = place_field(places, np.random.default_rng([places, seed]))
@@ -56,7 +65,7 @@ def bench_field(places: int, seed: int) -> Field:
 
 
 def cold(places: int) -> dict[str, float]:
-    """One field from scratch, ours and gco's in turn; medians."""
+    """One field from scratch, ours and gco's in turn; medians of several where it is not large."""
     import gco
 
     field = bench_field(places, 0)
@@ -68,7 +77,7 @@ def cold(places: int) -> dict[str, float]:
         return np.asarray(gco.cut_general_graph(edges, *costs, n_iter=-1, algorithm="swap", init_labels=start_32))
 
     spent: dict[str, list[float]] = {"ours": [], "theirs": []}
-    for _ in range(REPEATS):
+    for _ in range(1 if places >= LARGE else REPEATS):
         seconds, our_labels = timed(lambda: minimise(field, start))
         spent["ours"].append(seconds)
         seconds, their_labels = timed(theirs)
@@ -100,17 +109,20 @@ def dual_bound() -> dict[str, float]:
     }
 
 
-def stream(places: int, changed: int, steps: int, against_cold: bool = True, rewired: bool = False) -> dict[str, float]:
+def stream(
+    settled: Solver, changed: int, steps: int, *, cold_every: int = 0, rewired: bool = False
+) -> dict[str, float]:
     """Updates that each change the costs of `changed` places around one; the solver is drained between two updates.
 
-    `rewired`, the weights of their edges change too, so that the solver has to take up the whole graph again.
+    `settled` has solved the field that they start from. Every `cold_every` steps a fresh solve is made as well, 0 =
+    never. `rewired`, the weights of their edges change too, so that the solver has to take up the whole graph again.
     """
-    rng, field = np.random.default_rng([places, changed]), bench_field(places, 0)
-    graph, solver = arcs_of(places, field.edges, field.weights), Solver()
-    solver.take(field, field.unary.argmin(axis=1))
-    labels = solver.drain()
+    solver, places = copy.deepcopy(settled), len(settled.labels)
+    rng, field, labels = np.random.default_rng([places, changed]), bench_field(places, 0), solver.labels.copy()
+    graph = arcs_of(places, field.edges, field.weights)
+    solver.take(field, labels, dirty=np.zeros(0, np.int64))  # these very arrays, which the copy does not have
     update_s, cold_s, drain_s, gaps = [], [], [], []
-    for _step in range(steps):
+    for step in range(steps):
         rows = around(int(rng.integers(places)), changed, graph)
         field = field._replace(unary=revised(field.unary, rows, rng))
         if rewired:
@@ -122,7 +134,7 @@ def stream(places: int, changed: int, steps: int, against_cold: bool = True, rew
             dirty = rows
         seconds, updated = timed(lambda: solver.update(field, labels, dirty=dirty))  # noqa: B023 (called at once)
         update_s.append(seconds)
-        if against_cold:
+        if cold_every and step % cold_every == 0:
             seconds, fresh = timed(lambda: minimise(field, field.unary.argmin(axis=1)))  # noqa: B023 (at once)
             cold_s.append(seconds)
             gaps.append(energy(field, updated) / energy(field, fresh) - 1.0)
@@ -133,7 +145,7 @@ def stream(places: int, changed: int, steps: int, against_cold: bool = True, rew
         "incremental_ms_p99": 1e3 * float(np.percentile(update_s, 99)),
         "drain_ms_p50": 1e3 * statistics.median(drain_s),
     }
-    if against_cold:
+    if cold_every:
         figures["incremental_time_ratio"] = statistics.median(update_s) / statistics.median(cold_s)
         figures["incremental_energy_gap"] = float(np.percentile(gaps, 99))
         figures["incremental_energy_gap_mean"] = statistics.mean(gaps)

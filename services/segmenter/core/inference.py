@@ -66,7 +66,7 @@ def context_of(state: State, rows: np.ndarray, cfg: Config) -> Context:
     return Context(
         prior=aligned.prior,
         text=aligned.text,
-        similarity=state.map.places.looks[rows],
+        similarity=state.map.places.looks(rows),
         frames=state.seen.evidence.frames[state.map.places.slots[rows]],
         bias=state.labelling.bias,
         positions_m=state.map.graph.positions_m[rows],
@@ -112,8 +112,8 @@ def adapt(state: State, cfg: Config) -> None:
 
 def _visual_labels(state: State, own: np.ndarray, rows: np.ndarray, cfg: Config) -> np.ndarray:
     """The label (row,) that each of some places looks most like, from the own similarities (place, label) of all."""
-    trust, near = state.seen.evidence.trust[state.map.places.slots], state.map.graph.arcs
-    around = smoothing.shared(own, trust, near, state.map.weights, rows=rows, cfg=cfg.sharing)
+    trust = state.seen.evidence.trust[state.map.places.slots]
+    around = smoothing.shared(own, trust, state.map.ties, rows=rows, cfg=cfg.sharing)
     scores = state.aim.aligned.text.temperature * around
     return np.argmax(scores + _bias(state, scores, cfg), axis=1)
 
@@ -147,9 +147,7 @@ def tell_apart(state: State, crops: Crops, cfg: Config) -> None:
     now = np.zeros_like(places.similarity)
     if crops.frames and cfg.unmixing.rounds and counts > 0:
         shares = unmixing.shown(list(crops.frames), graph.positions_m, graph.radii_m)
-        apart = unmixing.unmixed(
-            places.similarity, crops.looks, shares, graph.arcs, state.map.weights, cfg=cfg.unmixing
-        )
+        apart = unmixing.unmixed(places.similarity, crops.looks, shares, state.map.ties, cfg.unmixing)
         now = counts * (apart - places.similarity)
     moved = (np.abs(now - places.correction) > CORRECTION_TOLERANCE).any(axis=1)
     places.correction[moved] = now[moved]
@@ -175,12 +173,10 @@ def compare(state: State) -> None:
 
 def share(state: State, cfg: Config) -> None:
     """Average similarity around the places whose own, or whose edges, changed."""
-    places, near = state.map.places, state.map.graph.arcs
-    rows = smoothing.reached(near, places.unshared, cfg.sharing.steps)
+    places, ties = state.map.places, state.map.ties
+    rows = smoothing.reached(ties, places.unshared, cfg.sharing.steps)
     trust = state.seen.evidence.trust[places.slots]
-    places.similarity[rows] = smoothing.shared(
-        places.own_similarity, trust, near, state.map.weights, rows=rows, cfg=cfg.sharing
-    )
+    places.similarity[rows] = smoothing.shared(places.own_similarity, trust, ties, rows=rows, cfg=cfg.sharing)
     places.unshared[:], places.doubtful[rows] = False, True
     state.labelling.compared += len(rows)
 
@@ -212,7 +208,7 @@ def rebalance(state: State, idle: bool, cfg: Config) -> None:
     seen = np.flatnonzero(state.seen.evidence.frames[places.slots] > 0)
     if not labelling.bias_due(len(seen), idle, cfg.balance.patience):
         return
-    bias = _bias(state, state.aim.aligned.text.temperature * places.looks[seen], cfg)
+    bias = _bias(state, state.aim.aligned.text.temperature * places.looks(seen), cfg)
     if np.abs(bias - labelling.bias).max(initial=0.0) > cfg.balance.tolerance:
         labelling.bias = bias
         places.doubtful[seen] = True
@@ -276,11 +272,14 @@ def settle(state: State, cfg: Config, *, hurried: bool) -> None:
         budget.expired,
         dirty=np.flatnonzero(places.unsettled),
         previous=None if same_rows else places.solved,
+        ties=state.map.ties,
     )
     if not limited:
         labels = solver.drain(budget.expired)
+    given_away = places.labels != places.cut_labels
+    changed = places.unsettled | given_away | (labels != places.cut_labels)
     places.cut_labels, places.solved = labels, rows
-    labels = consolidated(field_of(state), labels, cfg.region_cost)
+    labels = consolidated(field_of(state), labels, cfg.region_cost, changed)
     places.unbelieved |= with_neighbours(state.map.graph, labels != places.labels)
     places.labels = labels
     places.unsettled[:] = False
@@ -296,6 +295,6 @@ def temperature(state: State, cfg: Config) -> float:
 def believe(state: State, cfg: Config) -> None:
     """Posteriors of the places whose costs, or whose neighbours' labels, changed."""
     places, rows = state.map.places, np.flatnonzero(state.map.places.unbelieved)
-    costs = posteriors.conditional_costs(field_of(state), state.map.graph.arcs, places.labels, rows)
+    costs = posteriors.conditional_costs(field_of(state), state.map.ties, places.labels, rows)
     places.posteriors[rows] = posteriors.posteriors(costs, temperature(state, cfg))
     state.regions.disturb(places.regions[rows])

@@ -1,5 +1,6 @@
 """What the segmenter tells: deltas of regions and beliefs, and why a place carries its label (pure)."""
 
+from collections.abc import Set
 from typing import Any
 
 import msgspec
@@ -32,9 +33,12 @@ def publish(
     """What followers do not know yet; with `everything`, all. What lies beyond is told if `idle`."""
     places, regions = state.map.places, state.regions
     changed = everything or bool(regions.disturbed)
+    others = frozenset(regions.disturbed | regions.reformed)
     regions.describe(_described(state, everything, cfg))
     if changed:
-        _renew_layers(state, cfg)
+        _renew_layers(state, None if everything else others, cfg)
+    else:
+        state.layers.forget(others)
     fresh = np.arange(len(places.labels)) if everything else np.flatnonzero(places.unbelieved)
     places.unbelieved[:] = False
     foreseen = _foreseen(state, cfg) if (idle or everything) and cfg.foresight.enabled else None
@@ -51,15 +55,17 @@ def publish(
     )
 
 
-def _renew_layers(state: State, cfg: Config) -> None:
-    """Find the levels above the regions again, and name each region's zone."""
+def _renew_layers(state: State, changed: Set[int] | None, cfg: Config) -> None:
+    """Find the levels above the regions again, of which only `changed` are others, None = all; and name each region's
+    zone."""
     regions = state.regions
     assert regions.storeys is not None
     graph, places = state.map.graph, state.map.places
     levels = state.aim.aligned.levels
-    state.layers.renew(regions.known, graph, places, regions.storeys, levels=levels, cfg=cfg.layers)
+    state.layers.renew(regions.known, graph, places, regions.storeys, levels=levels, cfg=cfg.layers, changed=changed)
+    zones = state.layers.zones
     for number, region in regions.known.items():
-        zone = state.layers.zone_of(number)
+        zone = zones.get(number, "")
         if zone != region.parent:
             regions.known[number] = msgspec.structs.replace(region, parent=zone)
 
@@ -166,7 +172,7 @@ def explain(state: State, request: PosteriorRequest, cfg: Config) -> PosteriorRe
     row = int(state.map.graph.rows(np.array([request.place_id]))[0])
     if row < 0 or state.aim.in_force is None or state.map.places.labels[row] == UNLABELLED:
         return PosteriorReply(robot=state.robot, place_id=request.place_id, found=False)
-    places, names, near = state.map.places, state.aim.in_force.labels, state.map.graph.arcs
+    places, names, near = state.map.places, state.aim.in_force.labels, state.map.ties
     rows, slot = np.array([row]), int(places.slots[row])
     answers = votes(state, rows, cfg)
     unary = sum(-cfg.experts[name] * sure[0] * log[0] for name, (log, sure) in answers.items())
@@ -198,7 +204,7 @@ def explain(state: State, request: PosteriorRequest, cfg: Config) -> PosteriorRe
             NeighbourPull(
                 place_id=int(state.map.graph.ids[near.neighbours[at]]),
                 label=names[places.labels[near.neighbours[at]]],
-                weight=float(state.map.weights[near.edges[at]]),
+                weight=float(near.weights[at]),
             )
             for at in arcs
         ],

@@ -173,7 +173,7 @@ def test_nodes_keep_their_ids_while_regions_come_and_go():
         ("zone", 0): [0, 1, 2],
         ("zone", 1): [3, 4, 5],
     }
-    assert layers.known["zone", 1].label == layers.zone_of(4) == "surgery"
+    assert layers.known["zone", 1].label == layers.zones[4] == "surgery"
     assert layers.known["floor", 0].members == "zone" and layers.known["floor", 0].member_ids == [0, 1]
     assert layers.known["zone", 0].parent_id == 0 and layers.known["zone", 0].area_m2 == 180
     layers.renew(*known([1, 0, 2, 1, 2, 2], first_id=1), levels=levels, cfg=LayersConfig())  # 0 is gone, 6 is new

@@ -22,7 +22,7 @@ def test_conditional_costs_are_differences_of_the_energy(seed):
         rng.normal(size=(count, labels)), graph.edges, rng.uniform(0, 2, len(graph.edges)), pairwise + pairwise.T
     )
     taken, rows = rng.integers(0, labels, count), rng.choice(count, 6, replace=False)
-    costs = conditional_costs(field, graph.arcs, taken, rows)
+    costs = conditional_costs(field, graph.arcs.weighing(field.weights), taken, rows)
     for index, row in enumerate(rows.tolist()):
         for label in range(labels):
             changed = taken.copy()

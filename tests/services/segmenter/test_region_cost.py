@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from prior_sg.services.segmenter.core.energy.mrf import Field, energy
-from prior_sg.services.segmenter.core.energy.region_cost import consolidated
+from prior_sg.services.segmenter.core.energy.region_cost import _pass, consolidated
 from prior_sg.services.segmenter.core.energy.solver import minimise
 from prior_sg.services.segmenter.core.regions.components import numbered
 
@@ -50,6 +50,17 @@ def test_without_cost_or_neighbours_nothing_changes():
     np.testing.assert_array_equal(consolidated(field, labels, 0.0), labels)
     alone = Field(np.ones((2, 3)), np.zeros((0, 2), np.int64), np.zeros(0), POTTS)
     assert consolidated(alone, np.array([0, 2]), 100.0).tolist() == [0, 2]
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_passes_over_what_was_relabelled_equal_passes_over_all(seed):
+    field = random_field(seed)
+    labels = field.unary.argmin(axis=1)
+    expected, before = labels.copy(), None
+    while before is None or (expected != before).any():
+        before = expected.copy()
+        _pass(expected, numbered(expected, field.edges), np.ones(len(expected), bool), *field, 2.0)
+    np.testing.assert_array_equal(consolidated(field, labels, 2.0), expected)
 
 
 @pytest.mark.parametrize("cost", [0.5, 2.0, 8.0])

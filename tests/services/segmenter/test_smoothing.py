@@ -34,10 +34,12 @@ def test_sharing_equals_powers_of_the_walk(seed, steps):
     mass = np.minimum(trust, 5.0)
     sums, total = spread @ (mass[:, None] * own), (spread @ mass)[:, None]
     expected = 2.0 * np.divide(sums, total, out=np.zeros_like(own), where=total > 0) if steps else own
-    found = shared(own, trust, graph.arcs, weights, rows=np.arange(count), cfg=cfg)
+    found = shared(own, trust, graph.arcs.weighing(weights), rows=np.arange(count), cfg=cfg)
     np.testing.assert_allclose(found, expected, atol=1e-12)
     some = np.random.default_rng(seed).choice(count, 5, replace=False)
-    np.testing.assert_allclose(shared(own, trust, graph.arcs, weights, rows=some, cfg=cfg), expected[some], atol=1e-12)
+    np.testing.assert_allclose(
+        shared(own, trust, graph.arcs.weighing(weights), rows=some, cfg=cfg), expected[some], atol=1e-12
+    )
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -48,8 +50,8 @@ def test_a_change_reaches_as_many_edges_as_there_are_steps(seed):
     rows = reached(graph.arcs, mask, 2)
     changed = own + np.where(mask[:, None], 5.0, 0.0)
     everyone = np.arange(len(trust))
-    before = shared(own, trust, graph.arcs, weights, rows=everyone, cfg=cfg)
-    after = shared(changed, np.where(mask, trust + 1, trust), graph.arcs, weights, rows=everyone, cfg=cfg)
+    before = shared(own, trust, graph.arcs.weighing(weights), rows=everyone, cfg=cfg)
+    after = shared(changed, np.where(mask, trust + 1, trust), graph.arcs.weighing(weights), rows=everyone, cfg=cfg)
     rest = np.setdiff1d(everyone, rows)
     assert len(rest)
     np.testing.assert_array_equal(before[rest], after[rest])

@@ -18,7 +18,7 @@ LONG = UnmixingConfig(rounds=4000, steps=0, ridge=1e-9)
 def apart(similarity, looks, shares, cfg):
     """On a graph without edges."""
     near = arcs_of(len(similarity), np.zeros((0, 2), np.int64), np.zeros(0))
-    return unmixed(similarity, looks, sparse.csr_matrix(shares), near, np.zeros(0), cfg=cfg)
+    return unmixed(similarity, looks, sparse.csr_matrix(shares), near, cfg)
 
 
 def frame(surface_m: np.ndarray, centers_px, sigmas_px, dim: int = 3) -> Frame:

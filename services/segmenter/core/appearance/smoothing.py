@@ -29,15 +29,13 @@ class SharingConfig(msgspec.Struct, frozen=True, kw_only=True):
             raise ValueError("steps, share, trust_limit or gain is out of range")
 
 
-def shared(
-    own: np.ndarray, trust: np.ndarray, near: Arcs, weights: np.ndarray, *, rows: np.ndarray, cfg: SharingConfig
-) -> np.ndarray:
+def shared(own: np.ndarray, trust: np.ndarray, ties: Arcs, *, rows: np.ndarray, cfg: SharingConfig) -> np.ndarray:
     """Averages (row, column) of `own` (place, column) around the places `rows`, times the gain; `trust` (place,)
-    weighs places, `weights` (edge,) weigh edges. Where nothing around has trust, zeros; without steps, `own`."""
+    weighs places, `ties` weigh edges. Where nothing around has trust, zeros; without steps, `own`."""
     if not cfg.steps:
         return own[rows]
     masses = np.minimum(trust, cfg.trust_limit)
-    averages = _shared(own, masses, near.starts, near.neighbours, weights[near.edges], rows, cfg.steps, cfg.share)
+    averages = _shared(own, masses, ties.starts, ties.neighbours, ties.weights, rows, cfg.steps, cfg.share)
     return cfg.gain * averages
 
 

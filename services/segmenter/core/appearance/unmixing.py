@@ -57,12 +57,11 @@ def shown(frames: list[Frame], positions_m: np.ndarray, radii_m: np.ndarray) -> 
 
 
 def unmixed(
-    similarity: np.ndarray, looks: np.ndarray, shares: "scipy.sparse.csr_matrix", near: Arcs, weights: np.ndarray, *,
-    cfg: UnmixingConfig,
-) -> np.ndarray:  # fmt: skip
+    similarity: np.ndarray, looks: np.ndarray, shares: "scipy.sparse.csr_matrix", ties: Arcs, cfg: UnmixingConfig
+) -> np.ndarray:
     """Similarities (place, label) that explain those of the crops, `looks` (crop, label), starting from `similarity`.
 
-    `shares` (crop, place) as in `shown`; `near` and `weights` (edge,) are the place graph.
+    `shares` (crop, place) as in `shown`; `ties` are the place graph.
     """
     covered = np.asarray(shares.sum(axis=1)).reshape(-1)
     kept = np.flatnonzero(covered > LEAST_SHOWN)
@@ -75,7 +74,7 @@ def unmixed(
     for _ in range(cfg.rounds):
         missing = looks - shares @ found / covered
         correction = back @ missing / (seen + cfg.ridge)[:, None]
-        found = found + smoothing.shared(correction, masses, near, weights, rows=everywhere, cfg=smooth)
+        found = found + smoothing.shared(correction, masses, ties, rows=everywhere, cfg=smooth)
     return found
 
 

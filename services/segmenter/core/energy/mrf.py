@@ -10,6 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from prior_sg.services.compiled import compiled
+
 RELATIVE_GAIN = 1e-12  # of the energy's magnitude; a smaller gain is rounding
 
 
@@ -24,9 +26,18 @@ class Field(NamedTuple):
 
 def energy(field: Field, labels: np.ndarray) -> float:
     """E(L) (eq. mrf_energy)."""
-    first, second = labels[field.edges[:, 0]], labels[field.edges[:, 1]]
-    unary = field.unary[np.arange(len(labels)), labels].sum()
-    return float(unary + (field.weights * field.pairwise[first, second]).sum())
+    of_places, of_edges = _terms(*field, labels)
+    return float(of_places.sum() + of_edges.sum())
+
+
+@compiled()
+def _terms(unary, edges, weights, pairwise, labels):  # noqa: ANN001, ANN202
+    of_places, of_edges = np.empty(len(labels)), np.empty(len(edges))
+    for place in range(len(labels)):
+        of_places[place] = unary[place, labels[place]]
+    for edge in range(len(edges)):
+        of_edges[edge] = weights[edge] * pairwise[labels[edges[edge, 0]], labels[edges[edge, 1]]]
+    return of_places, of_edges
 
 
 def least_gain(unary: np.ndarray) -> float:

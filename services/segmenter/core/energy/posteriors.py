@@ -14,11 +14,10 @@ from prior_sg.services.segmenter.core.energy.swap_moves import conditional
 from prior_sg.services.segmenter.core.map.arcs import Arcs
 
 
-def conditional_costs(field: Field, arcs: Arcs, labels: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """Cost (row, label) of each label at the places `rows` while all others keep theirs; `arcs` of the field's edges,
-    whatever their weights."""
-    weights = field.weights[arcs.edges]
-    return _conditional_costs(field.unary, arcs.starts, arcs.neighbours, weights, field.pairwise, labels, rows)
+def conditional_costs(field: Field, ties: Arcs, labels: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Cost (row, label) of each label at the places `rows` while all others keep theirs; `ties` are the field's edges
+    with their weights, as arcs."""
+    return _conditional_costs(field.unary, ties.starts, ties.neighbours, ties.weights, field.pairwise, labels, rows)
 
 
 def posteriors(costs: np.ndarray, temperature: float) -> np.ndarray:

@@ -6,6 +6,8 @@
 
 The caller says which places changed (`dirty`: those with another unary cost, other edges, other weights or a
 neighbour that is gone; new places too), or leaves it to the solver, which then compares the field with the last one.
+`ties` are the field's edges with their weights as arcs, where the caller has them; if only weights differ from those of
+the last field and its arrays are the same, nothing is laid out anew.
 Row numbers may change between updates: `previous` says which row each place had (-1: a new place), as
 `map.received.Step.previous` does. A place without a label yet has label -1; labels may be others than the solver's
 last. The solver keeps references to the field's arrays, not copies: where they are changed in place, `dirty` must be
@@ -93,9 +95,10 @@ class Solver:
         *,
         dirty: np.ndarray | None = None,
         previous: np.ndarray | None = None,
+        ties: Arcs | None = None,
     ) -> np.ndarray:
         """Labels (place,) for `field`, starting from `labels`, by work near the change only; see the module."""
-        self.take(field, labels, dirty=dirty, previous=previous)
+        self.take(field, labels, dirty=dirty, previous=previous, ties=ties)
         self._propose_near(expired)
         self._swap(swap_moves.NEAR, expired)
         return self.labels.copy()
@@ -128,6 +131,7 @@ class Solver:
         *,
         dirty: np.ndarray | None = None,
         previous: np.ndarray | None = None,
+        ties: Arcs | None = None,
     ) -> None:
         """Only note the change; `drain` does the work."""
         before, count = self._field, len(field.unary)
@@ -135,8 +139,10 @@ class Solver:
             before = None
         if before is not None and previous is None and len(before.unary) != count:
             raise ValueError("the number of places changed: `previous` must say which row each place had")
-        same_edges = before is not None and previous is None and _same_edges(before, field)
-        graph = self._graph if same_edges else arcs_of(count, field.edges, field.weights)
+        same_rows = before is not None and previous is None
+        same_edges = before is not None and same_rows and _same_edges(before, field)
+        given_arcs = self._graph if same_edges else ties
+        graph = arcs_of(count, field.edges, field.weights) if given_arcs is None else given_arcs
         unary = np.ascontiguousarray(field.unary, dtype=np.float64)
         pairwise = np.ascontiguousarray(field.pairwise, dtype=np.float64)
         everything = before is None or not np.array_equal(self._pairwise, pairwise)
@@ -148,14 +154,18 @@ class Solver:
         elif dirty.dtype == np.bool_:
             dirty = np.flatnonzero(dirty)
         if not same_edges:
-            self._carry(before, origin, field, graph)
+            if same_rows and graph.neighbours is self._graph.neighbours:
+                swap_moves.sort_queues(self._work)
+            else:
+                self._carry(before, origin, field, graph)
         given, found = np.asarray(labels), self.labels
         self._graph, self._unary, self._pairwise, self._field = graph, unary, pairwise, field
         self.labels = np.array(given, dtype=np.int64)
         label_new(self.labels, graph, unary, pairwise)
         if not everything:
             known = np.flatnonzero(origin >= 0)
-            swap_moves.flag_around(known[given[known] != found[origin[known]]], swap_moves.NEAR, graph, self._work)
+            others = np.flatnonzero(given != found) if same_rows else known[given[known] != found[origin[known]]]
+            swap_moves.flag_around(others, swap_moves.NEAR, graph, self._work)
         swap_moves.flag_all(dirty, swap_moves.DEEP if before is None else swap_moves.NEAR, self._work)
         self._unproposed = np.union1d(self._unproposed, dirty).astype(np.int64)
         self._changes += len(dirty)

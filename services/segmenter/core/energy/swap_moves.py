@@ -148,6 +148,25 @@ def requeue(work):  # noqa: ANN001, ANN201
 
 
 @compiled()
+def sort_queues(work):  # noqa: ANN001, ANN201
+    """Put the queues in the order of the rows, as `requeue` does: no place has a flag and is in no queue."""
+    queues, queued, rings = work.queues, work.queued, work.rings
+    places = np.empty(rings[0, COUNT] + rings[1, COUNT], np.int64)
+    count = 0
+    for ring in range(2):
+        for step in range(rings[ring, COUNT]):
+            place = queues[ring, (rings[ring, HEAD] + step) % queues.shape[1]]
+            queued[ring, place] = 0
+            places[count] = place
+            count += 1
+        rings[ring, HEAD] = rings[ring, COUNT] = 0
+    for place in np.sort(places):
+        for label in range(work.pending.shape[1]):
+            if work.pending[place, label] != NOT_PENDING:
+                enqueue(place, work.pending[place, label] - 1, queues, queued, rings)
+
+
+@compiled()
 def settle(graph, unary, pairwise, labels, work, limits):  # noqa: PLR0917, ANN001, ANN201
     """Take places from the queues and try their pending swaps, as `run_swaps` says."""
     core, rings, queues, queued = work.core, work.rings, work.queues, work.queued

@@ -7,17 +7,37 @@ frame that goes stays with it.
 """
 
 from collections.abc import Set
+from typing import NamedTuple
 
 import numpy as np
 
-from prior_sg.schemas.frames import Intrinsics
 from prior_sg.services.geometry import inverse
-from prior_sg.services.segmenter.core.evidence.kernel import Evidence, Frame, KernelConfig, Targets, integrate
+from prior_sg.services.segmenter.core.evidence.kernel import (
+    Evidence,
+    Frame,
+    KernelConfig,
+    Targets,
+    frustum_tangents,
+    frustums_with_any,
+    integrate,
+)
 
-PAIRS_PER_BLOCK = 1 << 19  # frame-place pairs tested at once; bounds the memory of the visibility test
 SPOT_M = 0.5  # side of a spot that frames look from
 DIRECTIONS = 2  # steps from the middle of an axis to its end: directions are told apart by about 30 degrees
 View = tuple[int, ...]  # a spot and a direction
+
+
+class Frustums(NamedTuple):
+    """Where frames look."""
+
+    cameras_from_world: np.ndarray  # (frame, 4, 4)
+    tangents: np.ndarray  # (frame, 4) bounds of the image
+
+
+def frustums_of(frames: list[Frame]) -> Frustums:
+    """Those of at least one frame."""
+    tangents = [frustum_tangents(frame.intrinsics) for frame in frames]
+    return Frustums(np.stack([frame.camera_from_world for frame in frames]), np.stack(tangents))
 
 
 class FrameArchive:
@@ -28,6 +48,7 @@ class FrameArchive:
         self._kept: dict[int, Frame] = {}  # by frame id
         self._views: dict[View, dict[int, None]] = {}  # ids of the frames that are kept
         self._heard: set[int] = set()  # ids of all frames, kept or not
+        self._frustums: Frustums | None = None  # of the frames that are kept, None = to be laid out
 
     def get(self, frame_id: int) -> Frame:
         """A frame that is kept. Raises KeyError."""
@@ -52,6 +73,7 @@ class FrameArchive:
         after = before._replace(camera_from_world=camera_from_world)
         self._leave(frame_id, before)
         self._kept[frame_id] = after  # in its former place
+        self._frustums = None
         self._views.setdefault(view_of(after), {})[frame_id] = None
         return before, after
 
@@ -75,11 +97,15 @@ class FrameArchive:
 
     def _put(self, frame_id: int, frame: Frame) -> None:
         self._kept[frame_id] = frame
+        if self._frustums is not None:
+            news = frustums_of([frame])
+            self._frustums = Frustums(*(np.concatenate(pair) for pair in zip(self._frustums, news, strict=True)))
         self._views.setdefault(view_of(frame), {})[frame_id] = None
         self.size_bytes += size_bytes(frame)
 
     def _take(self, frame_id: int) -> None:
         frame = self._kept.pop(frame_id)
+        self._frustums = None
         self._leave(frame_id, frame)
         self.size_bytes -= size_bytes(frame)
 
@@ -92,20 +118,11 @@ class FrameArchive:
     def candidates(self, positions_m: np.ndarray, cfg: KernelConfig) -> np.ndarray:
         """Frames whose frustum may hold any of the positions, as indices into `frames`, ascending; never leaves out one
         that does."""
-        frames = self.frames
-        if not frames or not len(positions_m):
+        if not self._kept or not len(positions_m):
             return np.zeros(0, dtype=np.int64)
-        poses = np.stack([frame.camera_from_world for frame in frames])
-        limits = np.array([_frustum_tangents(frame.intrinsics) for frame in frames])
-        block = max(PAIRS_PER_BLOCK // len(positions_m), 1)
-        found = []
-        for start in range(0, len(poses), block):
-            pose, limit = poses[start : start + block], limits[start : start + block, :, None]
-            x, y, z = np.moveaxis(pose[:, :3, :3] @ positions_m.T + pose[:, :3, 3:], 1, 0)
-            inside = (z >= cfg.min_depth_m) & (z <= cfg.max_depth_m)
-            inside &= (x >= limit[:, 0] * z) & (x <= limit[:, 1] * z) & (y >= limit[:, 2] * z) & (y <= limit[:, 3] * z)
-            found.append(np.flatnonzero(inside.any(axis=1)) + start)
-        return np.concatenate(found)
+        if self._frustums is None:
+            self._frustums = frustums_of(self.frames)
+        return frustums_with_any(*self._frustums, positions_m, cfg.min_depth_m, cfg.max_depth_m)
 
 
 def integrate_all(
@@ -127,13 +144,3 @@ def view_of(frame: Frame) -> View:
 def size_bytes(frame: Frame) -> int:
     """Memory that a frame takes, but for a few hundred bytes."""
     return frame.embeddings.nbytes + frame.centers_px.nbytes + frame.sigmas_px.nbytes + frame.surface_m.nbytes
-
-
-def _frustum_tangents(camera: Intrinsics) -> tuple[float, float, float, float]:
-    """Bounds of x / z and y / z inside the image, and one pixel more so that rounding leaves nothing out."""
-    return (
-        (-1.5 - camera.cx_px) / camera.fx_px,
-        (camera.width_px + 0.5 - camera.cx_px) / camera.fx_px,
-        (-1.5 - camera.cy_px) / camera.fy_px,
-        (camera.height_px + 0.5 - camera.cy_px) / camera.fy_px,
-    )

@@ -84,7 +84,9 @@ def visible(frame: Frame, positions_m: np.ndarray, cfg: KernelConfig) -> np.ndar
     A place counts as hidden when its centre lies behind the surface at its pixel by more than the tolerance, which
     covers the errors of depth and of the coarse surface.
     """
-    pixels, depths_m = project(frame, positions_m)
+    tangents = frustum_tangents(frame.intrinsics)
+    near = in_frustum(frame.camera_from_world, tangents, positions_m, cfg.min_depth_m, cfg.max_depth_m)
+    pixels, depths_m = project(frame, positions_m[near])
     size = np.array((frame.intrinsics.width_px, frame.intrinsics.height_px))
     border = cfg.border_share * size
     seen = (depths_m >= cfg.min_depth_m) & (depths_m <= cfg.max_depth_m)
@@ -92,7 +94,54 @@ def visible(frame: Frame, positions_m: np.ndarray, cfg: KernelConfig) -> np.ndar
     rows = np.flatnonzero(seen)
     cells = ((pixels[rows] + 0.5) / size * frame.surface_m.shape[::-1]).astype(np.int64)
     surface_m = frame.surface_m[cells[:, 1], cells[:, 0]]
-    return rows[(surface_m > 0) & (depths_m[rows] - cfg.occlusion_tolerance_m <= surface_m)]
+    return near[rows[(surface_m > 0) & (depths_m[rows] - cfg.occlusion_tolerance_m <= surface_m)]]
+
+
+def frustum_tangents(camera: Intrinsics) -> np.ndarray:
+    """Bounds (4,) of x / z and y / z inside the image, and one pixel more so that rounding leaves nothing out."""
+    left, right = (-1.5 - camera.cx_px) / camera.fx_px, (camera.width_px + 0.5 - camera.cx_px) / camera.fx_px
+    top, bottom = (-1.5 - camera.cy_px) / camera.fy_px, (camera.height_px + 0.5 - camera.cy_px) / camera.fy_px
+    return np.array((left, right, top, bottom))
+
+
+@compiled()
+def in_frustum(camera_from_world, tangents, positions_m, min_depth_m, max_depth_m):  # noqa: ANN001, ANN201
+    """Rows, ascending, of the positions in a frustum; rounding leaves none out that is in it, but takes some beside."""
+    found = np.empty(len(positions_m), np.int64)
+    count = 0
+    for row in range(len(positions_m)):
+        if _is_inside(camera_from_world, tangents, positions_m[row], min_depth_m, max_depth_m):
+            found[count] = row
+            count += 1
+    return found[:count].copy()
+
+
+@compiled()
+def frustums_with_any(cameras_from_world, tangents, positions_m, min_depth_m, max_depth_m):  # noqa: ANN001, ANN201
+    """Which frustums, ascending, hold any of the positions, as `in_frustum` tells."""
+    found = np.empty(len(cameras_from_world), np.int64)
+    count = 0
+    for camera in range(len(cameras_from_world)):
+        for row in range(len(positions_m)):
+            if _is_inside(cameras_from_world[camera], tangents[camera], positions_m[row], min_depth_m, max_depth_m):
+                found[count] = camera
+                count += 1
+                break
+    return found[:count].copy()
+
+
+@compiled()
+def _is_inside(pose, tangents, point_m, min_depth_m, max_depth_m):  # noqa: ANN001, ANN202
+    slack_m = 1e-6
+    u, v, w = point_m
+    z_m = pose[2, 0] * u + pose[2, 1] * v + pose[2, 2] * w + pose[2, 3]
+    if z_m < min_depth_m - slack_m or z_m > max_depth_m + slack_m:
+        return False
+    x_m = pose[0, 0] * u + pose[0, 1] * v + pose[0, 2] * w + pose[0, 3]
+    y_m = pose[1, 0] * u + pose[1, 1] * v + pose[1, 2] * w + pose[1, 3]
+    beside = x_m < tangents[0] * z_m - slack_m or x_m > tangents[1] * z_m + slack_m
+    above = y_m < tangents[2] * z_m - slack_m or y_m > tangents[3] * z_m + slack_m
+    return not (beside or above)
 
 
 def kernel(frame: Frame, positions_m: np.ndarray, query_radius_m: float, gamma: float) -> tuple[np.ndarray, np.ndarray]:

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
+from prior_sg.services.compiled import compiled
 from prior_sg.services.segmenter.core.map.received import ReceivedGraph
 from prior_sg.services.segmenter.core.regions.components import numbered
 
@@ -58,10 +59,23 @@ def storeys_of(graph: ReceivedGraph, cfg: StoreyConfig) -> Storeys:
     bottoms_m = heights_m if graph.on_ground else heights_m - graph.radii_m
     weights_m2 = np.pi * radii_m**2
     floors_m = floors_of(bottoms_m, weights_m2, cfg)
-    storey = np.maximum(np.searchsorted(floors_m, bottoms_m + cfg.tolerance_m, side="right") - 1, 0)
-    above_m = bottoms_m - floors_m[storey] if len(floors_m) else np.zeros(0)
-    grounded = above_m <= cfg.clutter_m
-    return Storeys(floors_m, storey, grounded, ~grounded & (storey < len(floors_m) - 1), weights_m2)
+    storey, grounded, between = _standing(bottoms_m, floors_m, cfg.tolerance_m, cfg.clutter_m)
+    return Storeys(floors_m, storey, grounded, between, weights_m2)
+
+
+@compiled()
+def _standing(bottoms_m, floors_m, tolerance_m, clutter_m):  # noqa: ANN001, ANN202
+    """Storey (place,), the highest whose floor lies below, and whether the place is on its floor, or above that and
+    below the next."""
+    storey = np.zeros(len(bottoms_m), np.int64)
+    grounded, between = np.empty(len(bottoms_m), np.bool_), np.empty(len(bottoms_m), np.bool_)
+    for place in range(len(bottoms_m)):
+        reach_m = bottoms_m[place] + tolerance_m
+        while storey[place] + 1 < len(floors_m) and floors_m[storey[place] + 1] <= reach_m:
+            storey[place] += 1
+        grounded[place] = bottoms_m[place] - floors_m[storey[place]] <= clutter_m
+        between[place] = not grounded[place] and storey[place] < len(floors_m) - 1
+    return storey, grounded, between
 
 
 def floors_of(bottoms_m: np.ndarray, weights_m2: np.ndarray, cfg: StoreyConfig) -> np.ndarray:
@@ -89,10 +103,18 @@ def floors_of(bottoms_m: np.ndarray, weights_m2: np.ndarray, cfg: StoreyConfig) 
 
 def _profile(heights_m: np.ndarray, weights_m2: np.ndarray, cells: int) -> np.ndarray:
     """Density (cell,) of the ground by height, m2 per m, smoothed."""
-    counts = np.bincount(np.rint(heights_m / CELL_M).astype(np.int64), weights_m2, minlength=cells) / CELL_M
+    counts = _by_height(heights_m, weights_m2, cells) / CELL_M
     reach = round(3 * SMOOTH_M / CELL_M)
     kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) * CELL_M / SMOOTH_M) ** 2)
     return np.convolve(counts, kernel / kernel.sum())[reach : reach + len(counts)]
+
+
+@compiled()
+def _by_height(heights_m, weights_m2, cells):  # noqa: ANN001, ANN202
+    counts = np.zeros(cells)
+    for place in range(len(heights_m)):
+        counts[int(np.rint(heights_m[place] / CELL_M))] += weights_m2[place]
+    return counts
 
 
 def _valleys(profile: np.ndarray, mode: int, floors: list[int], cfg: StoreyConfig) -> bool:

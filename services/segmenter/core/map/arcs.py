@@ -16,11 +16,30 @@ class Arcs(NamedTuple):
     twins: np.ndarray  # (arc,) int32 number of the opposite arc
     edges: np.ndarray  # (arc,) int32 number of its edge
 
+    def weighing(self, weights: np.ndarray) -> "Arcs":
+        """The same arcs with the weights (edge,) of their edges."""
+        return self._replace(weights=weights[self.edges])
+
 
 def arcs_of(places: int, edges: np.ndarray, weights: np.ndarray) -> Arcs:
     """The arcs of `edges` (edge, 2) with their `weights` (edge,); linear in places and edges."""
     edges = np.ascontiguousarray(edges, dtype=np.int64).reshape(-1, 2)
     return Arcs(*_build(places, edges, np.ascontiguousarray(weights, dtype=np.float64)))
+
+
+def arcs_from(near: Arcs, rows: np.ndarray) -> np.ndarray:
+    """Numbers (n,) of the arcs that leave the places `rows`, place after place."""
+    return _arcs_from(near.starts, rows)
+
+
+def edges_between(near: Arcs, pairs: np.ndarray) -> np.ndarray:
+    """Number (n,) of the edge between the rows of each of `pairs` (n, 2), -1 where there is none."""
+    return _edges_between(near.starts, near.neighbours, near.edges, np.ascontiguousarray(pairs, dtype=np.int64))
+
+
+def grown(near: Arcs, mask: np.ndarray) -> np.ndarray:
+    """Mask (place,) of the places in `mask` and their neighbours."""
+    return _grown(near.starts, near.neighbours, mask)
 
 
 def no_arcs() -> Arcs:
@@ -56,6 +75,41 @@ def _build(places, edges, weights):  # noqa: ANN001, ANN202
         twins[there], twins[back] = back, there
         numbers[there], numbers[back] = edge, edge
     return starts, neighbours, arc_weights, twins, numbers
+
+
+@compiled()
+def _arcs_from(starts, rows):  # noqa: ANN001, ANN202
+    count = 0
+    for row in rows:
+        count += starts[row + 1] - starts[row]
+    found = np.empty(count, np.int64)
+    count = 0
+    for row in rows:
+        for arc in range(starts[row], starts[row + 1]):
+            found[count] = arc
+            count += 1
+    return found
+
+
+@compiled()
+def _edges_between(starts, neighbours, edges, pairs):  # noqa: ANN001, ANN202
+    found = np.full(len(pairs), -1, np.int64)
+    for index in range(len(pairs)):
+        place, other = pairs[index]
+        for arc in range(starts[place], starts[place + 1]):
+            if neighbours[arc] == other:
+                found[index] = edges[arc]
+    return found
+
+
+@compiled()
+def _grown(starts, neighbours, mask):  # noqa: ANN001, ANN202
+    after = mask.copy()
+    for place in range(len(mask)):
+        if mask[place]:
+            for arc in range(starts[place], starts[place + 1]):
+                after[neighbours[arc]] = True
+    return after
 
 
 @compiled()

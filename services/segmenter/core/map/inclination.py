@@ -67,6 +67,9 @@ def disturbed(before: ReceivedGraph, step: Step, limit_m: float) -> np.ndarray:
     """Mask (place,) of the places whose neighbourhood may differ from what it was before the step."""
     mask = np.zeros(len(step.graph.ids), dtype=bool)
     mask[reach(step.graph, np.flatnonzero(step.touched), limit_m)] = True
+    if step.same_rows:
+        mask[reach(before, np.flatnonzero(step.touched), limit_m)] = True
+        return mask
     old = step.previous >= 0
     changed = np.concatenate((step.removed, step.previous[step.touched & old]))
     row_after = np.full(len(before.ids), -1)

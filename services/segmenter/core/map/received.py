@@ -3,13 +3,13 @@
 A delta is small beside the map, so what it does not touch is only copied, never sorted, searched or compared.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
 
 from prior_sg.schemas.places import PlaceDelta
-from prior_sg.services.segmenter.core.map.arcs import Arcs, arcs_of
+from prior_sg.services.segmenter.core.map.arcs import Arcs, arcs_from, arcs_of, edges_between, grown
 
 
 def _empty(dtype: str, *shape: int) -> np.ndarray:
@@ -57,6 +57,11 @@ class Step:
     upserted: np.ndarray  # (upserted,) rows of the graph that the delta names
     removed: np.ndarray  # (removed,) rows of the former graph that are gone
 
+    @cached_property
+    def same_rows(self) -> bool:
+        """Whether every place is where it was, and none is new."""
+        return not len(self.removed) and np.array_equal(self.previous, np.arange(len(self.previous)))
+
 
 def apply(graph: ReceivedGraph, delta: PlaceDelta, replaces: bool) -> Step:
     """The graph after `delta`, in the order that the delta's schema states; with `replaces`, the delta is all of it.
@@ -66,6 +71,10 @@ def apply(graph: ReceivedGraph, delta: PlaceDelta, replaces: bool) -> Step:
     merged = [(gone, into) for gone, into in delta.merged_ids.tolist() if gone != into]
     upserted, first = np.unique(delta.place_ids, return_index=True)
     known = graph.rows(upserted)
+    if not (replaces or merged or len(delta.removed_ids) or len(delta.removed_edges) or (known < 0).any()):
+        step = _told_anew(graph, delta, known, first)
+        if step is not None:
+            return step
     kept = np.full(len(graph.ids), not replaces)
     gone = graph.rows(np.concatenate((delta.removed_ids, np.array([pair[0] for pair in merged], dtype=np.int64))))
     kept[gone[gone >= 0]] = False
@@ -91,13 +100,47 @@ def apply(graph: ReceivedGraph, delta: PlaceDelta, replaces: bool) -> Step:
     return Step(after, previous, moved, touched, upserted=rows, removed=np.flatnonzero(~kept))
 
 
+def _told_anew(graph: ReceivedGraph, delta: PlaceDelta, rows: np.ndarray, first: np.ndarray) -> Step | None:
+    """The step of a delta after which the same places are joined by the same edges; None where it is another.
+
+    Arrays that it cannot change are those of `graph` themselves, and of lengths only the changed ones are computed.
+    `rows` are those of the places that the delta names, each of which it says first at `first`.
+    """
+    told = graph.rows(delta.edges.reshape(-1)).reshape(-1, 2)
+    valid = (told >= 0).all(axis=1) & (told[:, 0] != told[:, 1])
+    told, numbers = told[valid], edges_between(graph.arcs, told[valid])
+    if (numbers < 0).any():
+        return None
+    after = replace(
+        graph,
+        positions_m=graph.positions_m.copy(),
+        radii_m=graph.radii_m.copy(),
+        clearances_m=graph.clearances_m.copy(),
+        on_ground=len(delta.surface_ids) > 0 or graph.on_ground,
+    )
+    moved = np.zeros(len(graph.ids), dtype=bool)
+    moved[rows] = (graph.positions_m[rows] != delta.positions_m[first]).any(axis=1)
+    after.positions_m[rows], after.radii_m[rows] = delta.positions_m[first], delta.radii_m[first]
+    after.clearances_m[numbers[::-1]] = delta.clearances_m[valid][::-1]  # of a pair told twice, the first counts
+    after.arcs = _lengthened(graph.arcs, after.positions_m, np.flatnonzero(moved))
+    touched = moved.copy()
+    touched[told.reshape(-1)] = True
+    none = np.zeros(0, dtype=np.int64)
+    return Step(after, np.arange(len(graph.ids)), moved, touched, upserted=rows, removed=none)
+
+
+def _lengthened(near: Arcs, positions_m: np.ndarray, rows: np.ndarray) -> Arcs:
+    """The same arcs after the places `rows` have moved."""
+    at, lengths_m = arcs_from(near, rows), near.weights.copy()
+    sources = np.repeat(rows, near.starts[rows + 1] - near.starts[rows])
+    lengths_m[at] = np.linalg.norm(positions_m[sources] - positions_m[near.neighbours[at]], axis=1)
+    lengths_m[near.twins[at]] = lengths_m[at]
+    return near._replace(weights=lengths_m)
+
+
 def with_neighbours(graph: ReceivedGraph, mask: np.ndarray) -> np.ndarray:
     """Mask (place,) grown by one edge."""
-    grown = mask.copy()
-    if mask.any():
-        grown[graph.edges[mask[graph.edges[:, 0]], 1]] = True
-        grown[graph.edges[mask[graph.edges[:, 1]], 0]] = True
-    return grown
+    return grown(graph.arcs, mask)
 
 
 def _join_edges(

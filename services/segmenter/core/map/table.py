@@ -62,10 +62,9 @@ class Places:
     unsettled: np.ndarray  # costs changed: look for a better label
     unbelieved: np.ndarray  # costs or a neighbour's label changed: find the posterior again
 
-    @property
-    def looks(self) -> np.ndarray:
-        """(place, label) How much each place looks like each label, all considered."""
-        return self.similarity + self.correction
+    def looks(self, rows: np.ndarray) -> np.ndarray:
+        """How much (row, label) the places `rows` look like each label, all considered."""
+        return self.similarity[rows] + self.correction[rows]
 
     @classmethod
     def none(cls) -> "Places":
@@ -74,9 +73,9 @@ class Places:
 
     def realigned(self, step: Step) -> "Places":
         """The same on the rows of the next graph."""
-        old = step.previous >= 0
-        if old.all() and not len(step.removed):
+        if step.same_rows:
             return self
+        old = step.previous >= 0
         columns = {
             name: _realigned(getattr(self, name), step.previous, old, fill) for name, (fill, _) in _FILLS.items()
         }

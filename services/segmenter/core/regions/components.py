@@ -49,15 +49,23 @@ def _numbered(labels, edges):  # noqa: ANN001, ANN202
     return numbers
 
 
-def track(component: np.ndarray, previous: np.ndarray, next_id: int) -> tuple[np.ndarray, int]:
+def first_rows(component: np.ndarray) -> np.ndarray:
+    """First place (component,) of each component, `component` (place,) from `numbered`."""
+    return np.flatnonzero(np.diff(np.maximum.accumulate(component), prepend=-1))
+
+
+def track(
+    component: np.ndarray, previous: np.ndarray, next_id: int, sizes: np.ndarray | None = None
+) -> tuple[np.ndarray, int]:
     """Region id (place,) of each place, and the next unused id.
 
     `component` (place,) from `numbered`, places in the order of their ids; `previous` (place,) holds the region ids
     before, NO_REGION for new places. An id follows the component that keeps most of its places (a split: the larger
     part), and a component that several ids would follow takes the one that brings most places (a merge); ties go to the
-    older id and to the component of the older place. Components without an heir get new ids, in order.
+    older id and to the component of the older place. Components without an heir get new ids, in order. With `sizes`
+    (place,), a place counts as so many.
     """
-    pairs, counts = _pairs(previous, component)
+    pairs, counts = _pairs(previous, component, sizes)
     heir: dict[int, tuple[int, int]] = {}  # old id -> (places kept, component)
     for (old, number), count in zip(pairs.tolist(), counts.tolist(), strict=True):
         if old not in heir or count > heir[old][0]:
@@ -76,17 +84,30 @@ def track(component: np.ndarray, previous: np.ndarray, next_id: int) -> tuple[np
     return ids[component], next_id
 
 
-def _pairs(previous: np.ndarray, now: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _pairs(previous: np.ndarray, now: np.ndarray, sizes: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Pairs (n, 2) of a former and a present number that some place has, sorted, and how many places have each.
 
     Runs of places with one pair are taken together first, for neighbours in the order of ids mostly share it.
     """
-    known = previous != NO_REGION
-    keys = previous[known] * (int(now.max(initial=0)) + 1) + now[known]
-    starts = np.flatnonzero(np.diff(keys, prepend=-1))
-    found, inverse = np.unique(keys[starts], return_inverse=True)
-    counts = np.bincount(inverse, np.diff(starts, append=len(keys)), minlength=len(found)).astype(np.int64)
+    first, lengths = _runs(previous, now, np.ones(len(now), np.int64) if sizes is None else sizes)
+    known = previous[first] != NO_REGION
+    first, lengths = first[known], lengths[known]
+    found, inverse = np.unique(previous[first] * (int(now.max(initial=0)) + 1) + now[first], return_inverse=True)
+    counts = np.bincount(inverse, lengths, minlength=len(found)).astype(np.int64)
     return np.stack(np.divmod(found, int(now.max(initial=0)) + 1), axis=1), counts
+
+
+@compiled()
+def _runs(one, other, sizes):  # noqa: ANN001, ANN202
+    """First row and sum of sizes of each run of rows with the same two numbers."""
+    first, lengths = np.empty(len(one), np.int64), np.empty(len(one), np.int64)
+    count = 0
+    for row in range(len(one)):
+        if not row or one[row] != one[row - 1] or other[row] != other[row - 1]:
+            first[count], lengths[count] = row, 0
+            count += 1
+        lengths[count - 1] += sizes[row]
+    return first[:count].copy(), lengths[:count].copy()
 
 
 def footprint_m2(positions_m: np.ndarray, radii_m: np.ndarray, cell_m: float) -> float:
@@ -120,28 +141,28 @@ def events(previous: np.ndarray, now: np.ndarray, before: dict[int, str], labels
     that is gone was merged into the region with most of its places.
     """
     pairs, counts = _pairs(previous, now)
+    new_ones, gone = labels.keys() - before.keys(), before.keys() - labels.keys()
     into: dict[int, tuple[int, int]] = {}  # former id -> (places, id now)
     out_of: dict[int, tuple[int, int]] = {}  # id now -> (places, former id)
     for (old, new), count in zip(pairs.tolist(), counts.tolist(), strict=True):
-        into[old] = max(into.get(old, (0, 0)), (count, new))
-        out_of[new] = max(out_of.get(new, (0, 0)), (count, old))
+        if old in gone:
+            into[old] = max(into.get(old, (0, 0)), (count, new))
+        if new in new_ones:
+            out_of[new] = max(out_of.get(new, (0, 0)), (count, old))
     found = []
-    for region in sorted(labels.keys() - before.keys()):
+    for region in sorted(new_ones):
         origin = out_of.get(region, (0, NO_REGION))[1]
         if origin in labels:
             found.append(RegionEvent(kind="split", region=region, label=labels[region], other=origin))
         else:
             found.append(RegionEvent(kind="appeared", region=region, label=labels[region]))
-    for region in sorted(before.keys() - labels.keys()):
+    for region in sorted(gone):
         if region in into:
             found.append(RegionEvent(kind="merged", region=region, label=before[region], other=into[region][1]))
         else:
             found.append(RegionEvent(kind="removed", region=region, label=before[region]))
-    for region in sorted(before.keys() & labels.keys()):
-        if before[region] != labels[region]:
-            found.append(
-                RegionEvent(kind="relabelled", region=region, label=labels[region], former_label=before[region])
-            )
+    for region in sorted(region for region, label in before.items() if labels.get(region, label) != label):
+        found.append(RegionEvent(kind="relabelled", region=region, label=labels[region], former_label=before[region]))
     return found
 
 
@@ -158,11 +179,10 @@ def border(graph: ReceivedGraph, region_of: np.ndarray, ids: set[int], door_clea
     Edges across a border that lie side by side are one way. It counts as a door where even the widest of them has at
     most `door_clearance_m`.
     """
-    first, second = graph.edges.T
     wanted = np.zeros(int(region_of.max(initial=0)) + 1, dtype=bool)
     wanted[[region for region in ids if region < len(wanted)]] = True
-    crossing = np.flatnonzero(region_of[first] != region_of[second])
-    crossing = crossing[wanted[region_of[first[crossing]]] | wanted[region_of[second[crossing]]]]
+    near = graph.arcs
+    crossing = np.unique(_crossing(near.starts, near.neighbours, near.edges, region_of, wanted))
     ends = graph.edges[crossing]
     sides = region_of[ends]
     middles_m = graph.positions_m[ends].mean(axis=1)
@@ -189,6 +209,18 @@ def border(graph: ReceivedGraph, region_of: np.ndarray, ids: set[int], door_clea
         ways_of.sort(key=lambda way: (way.region, way.edge))
         neighbours[region] = sorted(set(neighbours[region]))
     return Border(neighbours, transitions)
+
+
+@compiled()
+def _crossing(starts, neighbours, edges, region_of, wanted):  # noqa: ANN001, ANN202
+    """Numbers of the edges that leave a wanted region, some twice."""
+    found = [np.int64(0) for _ in range(0)]
+    for place in range(len(region_of)):
+        if wanted[region_of[place]]:
+            for arc in range(starts[place], starts[place + 1]):
+                if region_of[neighbours[arc]] != region_of[place]:
+                    found.append(np.int64(edges[arc]))
+    return np.array(found, np.int64)
 
 
 def _side_by_side(pairs: np.ndarray, middles_m: np.ndarray) -> np.ndarray:

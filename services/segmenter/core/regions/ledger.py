@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import msgspec
 import numpy as np
@@ -11,6 +11,8 @@ from prior_sg.schemas.foresight import Foresight
 from prior_sg.schemas.levels import LevelName, LevelNode, rank
 from prior_sg.schemas.regions import Region, RegionDelta, RegionEvent
 
+K = TypeVar("K")
+V = TypeVar("V")
 _NONE = np.zeros(0, dtype=np.int64)
 Nodes = dict[tuple[LevelName, int], LevelNode]
 
@@ -101,9 +103,9 @@ class Ledger:
         """
         self._reserve(int(slots.max(initial=-1)) + 1, len(head.labels), everything)
         sent = np.flatnonzero(~self.told[slots] | self._differs(slots, now, tolerance))
-        upserts = [region for _, region in sorted(regions.items()) if self.regions.get(region.id) != region]
+        upserts = sorted(_news(regions, self.regions), key=lambda region: region.id)
         gone_regions = sorted(self.regions.keys() - regions.keys())
-        moved_nodes = [node for key, node in nodes.items() if self.nodes.get(key) != node]
+        moved_nodes = _news(nodes, self.nodes)
         gone_nodes = sorted(self.nodes.keys() - nodes.keys())
         moved_on = self.head is not None and head.space != self.head.space
         changed = len(sent) or upserts or gone_regions or self.gone or events or moved_nodes or gone_nodes
@@ -205,6 +207,12 @@ class Ledger:
             grown.append(room)
         self.beliefs = Beliefs(*grown)
         self.told = np.concatenate((self.told, np.zeros(size - have, dtype=bool)))
+
+
+def _news(now: dict[K, V], told: dict[K, V]) -> list[V]:
+    """What is not told yet, or otherwise; most regions are the very ones that were told."""
+    others = [(key, one) for key, one in now.items() if told.get(key) is not one]
+    return [one for key, one in others if told.get(key) != one]
 
 
 def _moved(now: np.ndarray, before: np.ndarray, tolerance: float) -> np.ndarray:

@@ -51,8 +51,9 @@ class RegionMap:
         beside = with_neighbours(graph, moved)  # lists of neighbours name a region that came, went or grew
         self.disturbed.update(previous[moved].tolist(), places.regions[beside].tolist())
         self.reformed.update(previous[moved].tolist(), places.regions[moved].tolist())
-        _, first = np.unique(places.regions, return_index=True)
-        labels = {int(places.regions[row]): names[places.labels[row]] for row in first.tolist()}
+        first = components.first_rows(component)
+        numbers, label_rows = places.regions[first].tolist(), places.labels[first].tolist()
+        labels = {region: names[label] for region, label in zip(numbers, label_rows, strict=True)}
         before = {region.id: region.label for region in self.known.values()}
         if not moved.any() and labels == before:
             return []
