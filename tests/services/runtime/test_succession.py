@@ -95,6 +95,7 @@ def test_a_worker_that_yields_finishes_its_jobs_and_no_job_is_done_twice(endpoin
             first = await here.start(WORKER, "w1", cfg=Config(work_s=0.05))
             client = BusClient(await asyncio.to_thread(ZenohBus, endpoint))
             with client:
+                await until(lambda: "giver" in client.alive(0.1))  # before that it may not hear all
                 for number in range(30):
                     client.publish(KEYFRAME, of("yield1", number))
                 await until(lambda: len(first._state or ()) > 2)
