@@ -7,6 +7,7 @@ import numpy as np
 
 from prior_sg.schemas.codec import Message, Number, NumberOrNone, Part, Shape, Stamp
 from prior_sg.schemas.frames import Intrinsics, Pose, check_pose
+from prior_sg.schemas.members import MapMember
 
 _NO_NAMES = msgspec.field(default_factory=lambda: np.zeros(0, np.int16))
 _NO_MERGES = msgspec.field(default_factory=lambda: np.zeros((0, 2), np.int64))
@@ -58,6 +59,7 @@ class SceneObject(Part, frozen=True, kw_only=True):
     min_m: tuple[float, float, float]  # axis-aligned box
     max_m: tuple[float, float, float]
     frames: int  # keyframes in which it was detected
+    members: list[MapMember] = []  # of a merged map: the robots' objects that it is made of
 
 
 class ObjectDelta(Message, frozen=True, kw_only=True):

@@ -8,6 +8,7 @@ import numpy as np
 from prior_sg.schemas.codec import Message, Number, NumberOrNone, Part, Shape, Stamp
 from prior_sg.schemas.foresight import Foresight
 from prior_sg.schemas.levels import LevelName, LevelNode
+from prior_sg.schemas.members import MapMember
 
 NO_REGION = -1  # in place of a region id: not labelled yet
 _NO_IDS = msgspec.field(default_factory=lambda: np.zeros(0, np.int64))
@@ -39,6 +40,7 @@ class Region(Part, frozen=True, kw_only=True):
     transitions: list[Transition] = []  # the ways there
     object_ids: list[int] = []  # objects that stand in it
     parent: str = ""  # label of the zone that it is in, where there are zones
+    members: list[MapMember] = []  # of a merged map: the robots' regions that it is made of
 
 
 EventKind = Literal["appeared", "split", "merged", "relabelled", "removed"]

@@ -217,9 +217,9 @@ def resumed(outcomes: list[Outcome]) -> dict[str, float]:
         before, _ = merged_of("home", [former], memory)
         after, said = merged_of("home", [present, former], memory)
         regions += _regions_kept(before.scene, after.scene)
-        together = {frozenset(members) for members in after.objects.values() if len(members) > 1}
+        together = [{(Name(m.robot, m.session), m.id) for m in item.members} for item in after.scene.objects]
         pairs = _both_days(one.two)
-        objects += [frozenset(((former.name, a), (present.name, b))) in together for a, b in pairs]
+        objects += [{(former.name, a), (present.name, b)} in together for a, b in pairs]
         changes.append(len(said))
     return {
         "resumed_regions_kept": float(np.mean(regions)) if regions else float("nan"),

@@ -12,10 +12,12 @@ from rich.table import Table
 from prior_sg.deploy.cli.shared import Commands, add_bus, console
 from prior_sg.deploy.errors import UserError
 from prior_sg.schemas.levels import LEVELS
+from prior_sg.schemas.members import said
 
 if TYPE_CHECKING:
     from prior_sg.deploy.api.asking import Asking
     from prior_sg.schemas.foresight import MissingLabel
+    from prior_sg.schemas.members import MapMember
     from prior_sg.schemas.queries import (
         Details,
         Difference,
@@ -230,7 +232,7 @@ def _show_one(found: "dict[str, Any]") -> None:
     if details.region is not None:
         region = details.region
         objects = f"objects {', '.join(map(str, region.object_ids))}" if region.object_ids else "no objects"
-        console.print(f"{region.place_count} places, {region.area_m2:.1f} m², {objects}")
+        console.print(f"{region.place_count} places, {region.area_m2:.1f} m², {objects}{_made_of(region.members)}")
         _show_beliefs(found["beliefs"])
     if details.place is not None:
         place = details.place
@@ -238,12 +240,18 @@ def _show_one(found: "dict[str, Any]") -> None:
         console.print(f"radius {place.radius_m:.2f} m, unknown {place.unknown:.2f}; {beliefs}")
     if details.object is not None:
         low, high = _at(details.object.min_m), _at(details.object.max_m)
-        console.print(f"box from {low} to {high}, seen in {details.object.frames} keyframes")
+        console.print(
+            f"box from {low} to {high}, seen in {details.object.frames} keyframes{_made_of(details.object.members)}"
+        )
     for one in neighbours:
         doors = f", {sum(way.door for way in one.ways)} doors of {len(one.ways)} ways" if one.ways else ""
         length = f", {one.length_m:.2f} m" if one.length_m else ""
         clearance = f", clearance {one.clearance_m:.2f} m" if one.clearance_m else ""
         console.print(f"beside {one.thing.what} {one.thing.id} {one.thing.label}{length}{clearance}{doors}")
+
+
+def _made_of(members: "Sequence[MapMember]") -> str:
+    return f"; made of {', '.join(map(said, members))}" if members else ""
 
 
 def _show_beliefs(found: "RegionBeliefs") -> None:

@@ -147,7 +147,14 @@ def _object_node(scene: Scene, item: SceneObject) -> spark_dsg.ObjectNodeAttribu
     low_m, high_m = np.array(item.min_m), np.array(item.max_m)
     node.bounding_box = spark_dsg.BoundingBox(high_m - low_m, (high_m + low_m) / 2)
     node.registered = True
-    node.metadata.set({"probability": item.probability, "known": item.known, "frames": item.frames})
+    node.metadata.set(
+        {
+            "probability": item.probability,
+            "known": item.known,
+            "frames": item.frames,
+            "members": msgspec.to_builtins(item.members),
+        }
+    )
     return node
 
 

@@ -10,6 +10,7 @@ import spark_dsg
 from prior_sg.deploy.showing.dsg import MESH_PLACES
 from prior_sg.schemas.foresight import Foresight
 from prior_sg.schemas.levels import LevelNode
+from prior_sg.schemas.members import MapMember
 from prior_sg.schemas.objects import SceneObject
 from prior_sg.schemas.regions import NO_REGION, Region
 from prior_sg.schemas.scene import Scene
@@ -222,4 +223,5 @@ def object_of(graph: spark_dsg.DynamicSceneGraph, item: Item) -> SceneObject:
         min_m=low_m,
         max_m=high_m,
         frames=item.told.get("frames", 0),
+        members=msgspec.convert(item.told.get("members", []), list[MapMember]),
     )

@@ -7,14 +7,16 @@
     labels        [label]                         columns of every posterior
     regions       [{id, label, parent, probability, unknown, predicted, area_m2, position_m [x, y, z], hull_m [[x, y]],
                     places [id], objects [id], adjacent [region id],
-                    transitions [{region, edge [place id inside, outside], position_m, clearance_m, door}]}]
+                    transitions [{region, edge [place id inside, outside], position_m, clearance_m, door}],
+                    members [{robot, session, id}]}]      of a merged map: the robots' regions it is made of
     zones         [{label, regions [id]}]         the level above
     levels        [{level, id, label, probability, members, member_ids, area_m2, position_m, parent_id, regions [id]}]
                                                   zone, floor, building, district, from below; members says what
                                                   member_ids are of, parent_id -1 = none
     places        [{id, position_m [x, y, z], radius_m, region, label, posterior {label: p}, unknown, predicted,
                     frontier {direction [x, y, z], area_m2}, ellipse {half_axes_m, angle_rad}, hull_m [[x, y]]}]
-    objects       [{id, label, probability, known, position_m, min_m, max_m, frames, place}]   place = the nearest
+    objects       [{id, label, probability, known, position_m, min_m, max_m, frames, place,    place = the nearest
+                    members [{robot, session, id}]}]
     edges         [{a, b, clearance_m}]           between places
     trajectory_m  [[x, y, z]]                     camera centres in order of time
     foresight     {is_predicted true, openings [{is_predicted true, place_id, position_m, beyond_m, width_m, region,
@@ -75,6 +77,7 @@ def scene_json(scene: Scene) -> dict[str, Any]:
                 "objects": region.object_ids,
                 "transitions": [_plain(way) for way in region.transitions],
                 "adjacent": sorted(b if a == region.id else a for a, b in adjacent if region.id in (a, b)),
+                "members": [_plain(member) for member in region.members],
             }
             for region in scene.regions
         ],
@@ -112,6 +115,7 @@ def _object_json(item: SceneObject, place: int | None) -> dict[str, Any]:
         "max_m": _short(item.max_m),
         "frames": item.frames,
         "place": place,
+        "members": [_plain(member) for member in item.members],
     }
 
 

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from prior_sg.schemas.foresight import Opening
+from prior_sg.schemas.members import said
 from prior_sg.schemas.names import shown
 from prior_sg.schemas.objects import SceneObject
 from prior_sg.schemas.regions import NO_REGION, Region
@@ -97,6 +98,7 @@ def _regions(scene: Scene, budget: Budget) -> list[str]:
         lambda region: _ways(region, names),
         lambda region: _contents(region, objects),
         lambda region: _candidates(scene, region),
+        _members,
     )
     for write in parts:
         for region in listed:
@@ -157,6 +159,13 @@ def _candidates(scene: Scene, region: Region) -> str:
     if region.unknown >= LEAST_BELIEF:
         best.append(f"unknown {region.unknown:.2f}")
     return f"; or {', '.join(best)}" if best else ""
+
+
+def _members(region: Region) -> str:
+    """What a merged region is made of."""
+    told = [_short(said(member)) for member in region.members[:MOST_IDS]]
+    more = f" and {len(region.members) - MOST_IDS} more" if len(region.members) > MOST_IDS else ""
+    return f"; made of {', '.join(told)}{more}" if told else ""
 
 
 def _elsewhere(scene: Scene, budget: Budget) -> Iterator[str]:

@@ -13,6 +13,7 @@ from prior_sg.deploy.viewing.drawing import edges_left_out, level_title
 from prior_sg.deploy.viewing.search import Hit
 from prior_sg.deploy.viewing.ways import Stop, Way
 from prior_sg.schemas.levels import nodes_above
+from prior_sg.schemas.members import said
 from prior_sg.schemas.names import shown
 from prior_sg.schemas.queries import Thing
 from prior_sg.schemas.regions import NO_REGION, PosteriorReply, Region
@@ -108,6 +109,8 @@ def region_story(scene: Scene, region: Region) -> str:
     ]
     if above := nodes_above(scene.nodes).get(region.id):
         lines.append("in " + ", ".join(text_of(level_title(node)) for node in above))
+    if region.members:
+        lines.append("made of " + ", ".join(text_of(said(member)) for member in region.members))
     if region.predicted:
         lines.insert(0, "a prediction from its surroundings: barely seen itself")
     bars = _bars(candidates(scene, region), AGREES)

@@ -8,6 +8,7 @@ from prior_sg.schemas import (
     foresight,
     frames,
     levels,
+    members,
     objects,
     places,
     priors,
@@ -147,6 +148,7 @@ EVIDENCE = priors.PriorEvidence(
     contents=f4([1.0], [0.25]),
     links=np.array([[0, 1]], np.int32),
 )
+MEMBER = members.MapMember(robot="r1", session=1, id=7)
 REGION = regions.Region(
     id=4,
     label="kitchen",
@@ -161,6 +163,7 @@ REGION = regions.Region(
     transitions=[regions.Transition(region=5, edge=(1, 2), position_m=(0.5, 0.25, 1.0), clearance_m=0.4, door=True)],
     object_ids=[9],
     parent="day zone",
+    members=[MEMBER],
 )
 OBJECT = objects.SceneObject(
     id=4,
@@ -171,6 +174,7 @@ OBJECT = objects.SceneObject(
     min_m=(0.5, 1.5, 0.125),
     max_m=(1.5, 2.5, 1.0),
     frames=3,
+    members=[MEMBER],
 )
 SPOT = queries.Spot(point_m=(1.0, 2.0, 3.0), what="region", id=4, label="hall", here=True)
 FORESIGHT = foresight.Foresight(

@@ -124,6 +124,16 @@ def test_what_was_written_before_there_were_levels_has_none(name):
     assert decode(type(message), msgpack.packb(fields)) == msgspec.structs.replace(message, **{f: [] for f in added})
 
 
+@pytest.mark.parametrize(("name", "lists"), [("RegionDelta", ["regions"]), ("Scene", ["regions", "objects"])])
+def test_what_was_written_before_merged_maps_named_their_members_names_none(name, lists):
+    message = next(example for example in EXAMPLES if by_name(example) == name)
+    fields = msgpack.unpackb(encode(message), ext_hook=msgpack.ExtType)
+    for held in lists:
+        del fields[held][0]["members"]
+    bare = {held: [msgspec.structs.replace(getattr(message, held)[0], members=[])] for held in lists}
+    assert decode(type(message), msgpack.packb(fields)) == msgspec.structs.replace(message, **bare)
+
+
 def test_what_was_asked_before_routes_could_begin_here_begins_elsewhere():
     asked = msgpack.packb({"point_m": [1.0, 2.0, 3.0], "what": None, "id": None, "label": ""})
     assert msgspec.msgpack.decode(asked, type=Spot) == Spot(point_m=(1.0, 2.0, 3.0))

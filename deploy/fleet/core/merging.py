@@ -11,6 +11,7 @@ from prior_sg.deploy.fleet.core.believing import Believed, believed
 from prior_sg.deploy.fleet.core.fusing import Fused, Placed, fused, openings
 from prior_sg.deploy.fleet.core.ids import Ids, Name
 from prior_sg.deploy.fleet.core.things import joined, things_of
+from prior_sg.schemas.members import MapMember
 from prior_sg.schemas.objects import SceneObject
 from prior_sg.schemas.regions import NO_REGION, Region
 from prior_sg.schemas.scene import Scene
@@ -21,7 +22,7 @@ from prior_sg.services.segmenter.core.regions import components
 
 DOOR_CLEARANCE_M = 0.6  # widest of a door's ways
 FOOTPRINT_CELL_M = 0.1
-LEAST_MEMBER = 3  # places of a robot's region in a merged one, from which it is a member
+LEAST_MEMBER = 3  # places of a robot's region in a merged one, from which it is a member even where it mostly is not
 
 
 class Source(NamedTuple):
@@ -46,11 +47,9 @@ class Memory:
 
 @dataclass(frozen=True)
 class Merged:
-    """The scene, and which regions and objects of whose map are in each of its own."""
+    """The scene, and what its schema has no room for."""
 
     scene: Scene
-    regions: dict[int, list[tuple[Name, int]]]
-    objects: dict[int, list[tuple[Name, int]]]
     frame_ids: np.ndarray  # (frame,) of the scene's trajectory
 
 
@@ -63,7 +62,8 @@ def merged(robot: str, sources: Sequence[Source], memory: Memory) -> Merged:
     found = fused(maps)
     beliefs = believed(maps, found)
     regions = _regions_of(found, beliefs, memory)
-    objects, members = _objects(maps, memory)
+    objects, members = _objects(maps, memory), _members(maps, found, regions)
+    described = _described(found, beliefs, regions, objects, _parents(maps))
     nodes, directions, areas = openings(maps, found)
     frame_ids, cameras_m = _cameras(sources, memory)
     newest = max((one.scene for one in maps), key=lambda scene: scene.stamp_ns)
@@ -75,7 +75,7 @@ def merged(robot: str, sources: Sequence[Source], memory: Memory) -> Merged:
         prior_digest=newest.prior_digest,
         space=newest.space,
         labels=beliefs.names,
-        regions=_described(found, beliefs, regions, objects, _parents(maps)),
+        regions=[msgspec.structs.replace(region, members=members[region.id]) for region in described],
         place_ids=found.ids,
         positions_m=found.positions_m.astype(np.float32),
         radii_m=found.radii_m.astype(np.float32),
@@ -93,7 +93,7 @@ def merged(robot: str, sources: Sequence[Source], memory: Memory) -> Merged:
         frontier_areas_m2=areas.astype(np.float32),
         origin_m=maps[0].scene.origin_m,
     )
-    return Merged(scene, _members(maps, found, regions), members, frame_ids)
+    return Merged(scene, frame_ids)
 
 
 def _cameras(sources: Sequence[Source], memory: Memory) -> tuple[np.ndarray, np.ndarray]:
@@ -168,27 +168,45 @@ def _parents(maps: Sequence[Placed]) -> dict[str, str]:
     return {region.label: region.parent for one in reversed(maps) for region in one.scene.regions if region.parent}
 
 
-def _objects(maps: Sequence[Placed], memory: Memory) -> tuple[list[SceneObject], dict[int, list[tuple[Name, int]]]]:
+def _objects(maps: Sequence[Placed], memory: Memory) -> list[SceneObject]:
     ids = [memory.ids.of("object", one.name, [item.id for item in one.scene.objects]) for one in maps]
-    items, members = [], {}
+    items = []
     for things in things_of(maps, ids):
-        item = joined(things)
-        items.append(item)
-        members[item.id] = [(maps[thing.map].name, thing.number) for thing in things]
-    return sorted(items, key=lambda item: item.id), members
+        members = _sorted([(*maps[thing.map].name, thing.number) for thing in things])
+        items.append(msgspec.structs.replace(joined(things), members=members))
+    return sorted(items, key=lambda item: item.id)
 
 
-def _members(maps: Sequence[Placed], found: Fused, regions: np.ndarray) -> dict[int, list[tuple[Name, int]]]:
-    """The robots' regions in each merged one."""
-    members: dict[int, list[tuple[Name, int]]] = {}
-    for one, nodes in zip(maps, found.node_of, strict=True):
-        pairs, counts = np.unique(
-            np.column_stack((regions[nodes], one.scene.place_regions)), axis=0, return_counts=True
-        )
-        for (region, own), count in zip(pairs.tolist(), counts.tolist(), strict=True):
-            if NO_REGION not in (region, own) and count >= LEAST_MEMBER:
-                members.setdefault(region, []).append((one.name, own))
-    return members
+def _members(maps: Sequence[Placed], found: Fused, regions: np.ndarray) -> dict[int, list[MapMember]]:
+    """The robots' regions in each merged one: each has one at least, and each robot's region is in one at least."""
+    pairs, counts, owners = [], [], []
+    for number, (one, nodes) in enumerate(zip(maps, found.node_of, strict=True)):
+        own = np.column_stack((regions[nodes], one.scene.place_regions))
+        rows, places = np.unique(own[(own != NO_REGION).all(axis=1)], axis=0, return_counts=True)
+        pairs.append(rows)
+        counts.append(places)
+        owners.append(np.full(len(rows), number))
+    (merged_ids, own_ids), places, owner = np.concatenate(pairs).T, np.concatenate(counts), np.concatenate(owners)
+    listed: dict[int, list[tuple[str, int, int]]] = {}
+    kept = (places >= LEAST_MEMBER) | _most(merged_ids[:, None], places)
+    kept |= _most(np.column_stack((owner, own_ids)), places)
+    for at in np.flatnonzero(kept).tolist():
+        listed.setdefault(int(merged_ids[at]), []).append((*maps[owner[at]].name, int(own_ids[at])))
+    return {region: _sorted(members) for region, members in listed.items()}
+
+
+def _most(keys: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    """Mask (row,) of the first row that has the highest count among those of its key (row, k)."""
+    order = np.lexsort((-counts, *keys.T))
+    _, first = np.unique(keys[order], axis=0, return_index=True)
+    found = np.zeros(len(counts), bool)
+    found[order[first]] = True
+    return found
+
+
+def _sorted(members: list[tuple[str, int, int]]) -> list[MapMember]:
+    """By robot, session and number, so that what has not changed is not told again."""
+    return [MapMember(robot=robot, session=session, id=number) for robot, session, number in sorted(members)]
 
 
 def renamed(scene: Scene, robot: str) -> Scene:

@@ -14,6 +14,7 @@ from prior_sg.deploy.api.vectors import RecentVectors
 from prior_sg.deploy.cli.main import main
 from prior_sg.schemas.codec import decode, encode
 from prior_sg.schemas.features import TextEmbeddings
+from prior_sg.schemas.members import MapMember
 from prior_sg.schemas.priors import PriorList
 from prior_sg.schemas.queries import SceneQuery, Spot
 from prior_sg.schemas.topics import PRIOR, PRIORS, SCENE_QUERY, TEXT
@@ -225,6 +226,17 @@ def test_the_command_answers_in_tables_and_json(capsys, saved):
     for words in (["within", "0", "0", "1", "1"], ["in-box", "0", "0", "0", "2", "2", "2"]):
         status, out, _ = asked(capsys, saved, *words, "--what", "place", "--json")
         assert status == 0 and len(json.loads(out)["answer"]) >= 2
+
+
+def test_the_command_says_what_is_made_of_what(capsys, tmp_path):
+    parts = [MapMember(robot="r1", id=3), MapMember(robot="r2", session=1, id=8)]
+    scene, path = message(), tmp_path / "scene.json"
+    regions = [msgspec.structs.replace(scene.regions[0], members=parts), scene.regions[1]]
+    objects = [msgspec.structs.replace(scene.objects[0], members=parts[1:])]
+    Scene(message(regions=regions, objects=objects)).save(path)
+    assert "; made of r1 #3, r2 (session 1) #8" in asked(capsys, path, "region", "4")[1]
+    assert "; made of r2 (session 1) #8" in " ".join(asked(capsys, path, "object", "9")[1].split())
+    assert "made of" not in asked(capsys, path, "region", "7")[1]
 
 
 def test_the_command_tells_what_was_not_seen(capsys, tmp_path):

@@ -10,7 +10,10 @@ from prior_sg.deploy.fleet.bridge import KEEP_NUMBERS, SERVICE
 from prior_sg.deploy.fleet.core.finding.frames import level
 from prior_sg.deploy.fleet.core.update import Config, NumbersKept
 from prior_sg.deploy.fleet.keeping import keep
+from prior_sg.schemas.members import MapMember
 from prior_sg.schemas.places import PlaceDelta, SnapshotRequest
+from prior_sg.schemas.queries import ById, ByLabel, SceneQuery
+from prior_sg.schemas.regions import RegionDelta
 from prior_sg.schemas.scene import SceneRequest
 from prior_sg.schemas.status import Tick
 from prior_sg.schemas.topics import (
@@ -18,6 +21,7 @@ from prior_sg.schemas.topics import (
     PLACE_SNAPSHOT,
     REGION_SNAPSHOT,
     SCENE,
+    SCENE_QUERY,
     topic_of,
 )
 from prior_sg.services.registry import BY_NAME
@@ -34,11 +38,11 @@ TICK = Tick(stamp_ns=10**18)
 class Fleet:
     """A bridge and a store, joined as on a bus."""
 
-    def __init__(self, cfg=CFG, epoch=5):
+    def __init__(self, cfg=CFG, epoch=5, store=StoreConfig(path=":memory:")):
         self.kept = []
         answers = {KEEP_NUMBERS: self.keep}
         self.bridge = Runner(SERVICE, cfg, Identity("home", "fleet", epoch), answers, wire=True)
-        self.store = Runner(BY_NAME["scene_store"], StoreConfig(path=":memory:"), Identity("*", "store", 1), wire=True)
+        self.store = Runner(BY_NAME["scene_store"], store, Identity("*", "store", 1), wire=True)
         self.pipeline = Pipeline((self.bridge, self.store))
 
     def keep(self, request):
@@ -52,8 +56,8 @@ class Fleet:
     def tick(self):
         return [message for _, message in self.pipeline.feed(self.bridge, TICK)]
 
-    def scene(self, robot="home"):
-        return self.store.answer(SCENE, SceneRequest(robot=robot))
+    def scene(self, robot="home", revision=None):
+        return self.store.answer(SCENE, SceneRequest(robot=robot, revision=revision))
 
 
 def first(**changes):
@@ -79,6 +83,29 @@ def test_two_robots_make_one_map():
     assert {label: after[label] for label in before} == before
     assert len(scene.objects) == len(houses.THINGS) and len(scene.trajectory) == 2
     assert fleet.tick() == []
+
+
+def test_the_store_knows_what_is_made_of_what_at_every_revision(tmp_path):
+    fleet = Fleet(store=StoreConfig(path=str(tmp_path / "scene.sqlite")))
+    fleet.tell(first())
+    fleet.tick()
+    alone = fleet.scene()
+    assert [region.members for region in alone.regions] == [[MapMember(robot="r1", id=n)] for n in range(4)]
+    fleet.tell(second())
+    told = fleet.tick()
+    fleet.store.close()
+    again = Fleet(store=StoreConfig(path=str(tmp_path / "scene.sqlite")))
+    scene, former = again.scene(), again.scene(revision=alone.revision)
+    assert former == alone and scene.revision > alone.revision
+    hallway = next(region for region in scene.regions if region.label == "hallway")
+    assert hallway.members == [MapMember(robot="r1", id=2), MapMember(robot="r2", id=1)]
+    assert hallway in next(m for m in told if isinstance(m, RegionDelta)).regions
+    question = SceneQuery(robot="home", questions=[ById(what="region", id=hallway.id), ByLabel(label="shelf")])
+    details, shelves = again.store.answer(SCENE_QUERY, question).answers
+    assert details.region.members == hallway.members
+    shelf = next(item for item in scene.objects if item.id == shelves.things[0].id)
+    owners = [(one.robot, again.scene(one.robot).objects[one.id].label) for one in shelf.members]
+    assert owners == [("r1", "shelf"), ("r2", "shelf")]
 
 
 def test_the_store_holds_what_snapshots_say():
@@ -176,6 +203,8 @@ def test_the_next_day_goes_on_with_the_same_numbers():
     assert {r.label: r.id for r in after.regions} == {r.label: r.id for r in before.regions}
     numbers = [{i.label: i.id for i in scene.objects if i.label != "sofa"} for scene in (before, after)]
     assert numbers[0] == numbers[1]
+    bedroom = next(region for region in after.regions if region.label == "bedroom")
+    assert {(one.session, one.id) for one in bedroom.members} == {(0, 3), (1, 2)}
     assert len(after.place_ids) == len(before.place_ids)
 
 

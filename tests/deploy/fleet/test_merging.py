@@ -9,6 +9,7 @@ from prior_sg.deploy.fleet.core.fusing import lens_m
 from prior_sg.deploy.fleet.core.ids import Ids, Name
 from prior_sg.deploy.fleet.core.merging import Memory, Source, merged
 from prior_sg.deploy.fleet.core.sessions import Present, remembered, said
+from prior_sg.schemas.members import MapMember
 from prior_sg.services.geometry import inverse
 from tests.help import houses
 
@@ -43,8 +44,38 @@ def test_what_both_saw_is_there_once():
     assert sorted(region.label for region in scene.regions) == houses.LABELS
     assert len(np.unique(scene.edges, axis=0)) == len(scene.edges) and np.isin(scene.edges, scene.place_ids).all()
     bedroom = next(region for region in scene.regions if region.label == "bedroom")
-    assert found.regions[bedroom.id] == [(ONE, 3), (TWO, 1)]
-    assert len(found.objects[next(item.id for item in scene.objects if item.label == "bed")]) == 2
+    assert bedroom.members == [MapMember(robot="r1", id=3), MapMember(robot="r2", id=1)]
+    bed = next(item for item in scene.objects if item.label == "bed")
+    beds = [next(item.id for item in one.objects if item.label == "bed") for one in (first, second)]
+    assert bed.members == [MapMember(robot=robot, id=own) for robot, own in zip(("r1", "r2"), beds, strict=True)]
+
+
+def test_every_region_of_a_robot_is_in_one_and_every_merged_one_has_members():
+    """Also where a robot's region has only two places, or two of them share a merged one."""
+    first, second = houses.scene(), houses.scene("r2", MOVED)
+    kitchen = np.flatnonzero(second.place_regions == 0)
+    split = second.place_regions.copy()
+    split[kitchen[:2]] = 8  # beside others that stay
+    split[kitchen[2:12]] = 9
+    regions = [*second.regions, *(msgspec.structs.replace(second.regions[0], id=number) for number in (8, 9))]
+    second = msgspec.structs.replace(second, place_regions=split, regions=regions)
+    scene = merged("home", [Source(ONE, first, np.eye(4)), Source(TWO, second, inverse(MOVED))], Memory()).scene
+    assert sorted(region.label for region in scene.regions) == houses.LABELS
+    kitchen = next(region for region in scene.regions if region.label == "kitchen")
+    assert [(one.robot, one.id) for one in kitchen.members] == [("r1", 0), ("r2", 0), ("r2", 8), ("r2", 9)]
+    held = {(one.robot, one.id) for region in scene.regions for one in region.members}
+    assert held == {("r1", region.id) for region in first.regions} | {("r2", region.id) for region in regions}
+
+
+def test_a_region_that_only_touches_another_by_a_place_is_no_member_of_it():
+    found, first, second = both()
+    hallway = next(region for region in found.scene.regions if region.label == "hallway")
+    stray = first.place_regions.copy()
+    stray[np.flatnonzero(stray == 2)[:2]] = 3  # two places of the hallway are the bedroom's, the first robot says
+    first = msgspec.structs.replace(first, place_regions=stray)
+    sources = [Source(ONE, first, np.eye(4)), Source(TWO, second, inverse(MOVED))]
+    again = next(r for r in merged("home", sources, Memory()).scene.regions if r.label == "hallway")
+    assert again.place_count == hallway.place_count and again.members == hallway.members
 
 
 def test_what_lies_apart_stays_connected():

@@ -130,6 +130,7 @@ def test_json_by_hand():
         "objects": [],
         "transitions": [],
         "adjacent": [7],
+        "members": [],
     }
     assert hall["adjacent"] == [4] and other["places"] == other["adjacent"] == []
     assert data["edges"][1] == {"a": 13, "b": 16, "clearance_m": 0.375} and len(data["edges"]) == 5
@@ -206,7 +207,8 @@ def test_objects_hang_below_their_nearest_place(tmp_path):
     scene = changed(scene, objects=[item])
     (told,) = scene_json(scene)["objects"]
     assert told == {**fields, "id": 4, "position_m": [1.0, 0.5, 0.25], "min_m": [*low_m], "max_m": [*high_m]} | {
-        "place": int(scene.place_ids[nearest])
+        "place": int(scene.place_ids[nearest]),
+        "members": [],
     }
     save_spark_dsg(scene, tmp_path / "dsg.json")
     graph = spark_dsg.DynamicSceneGraph.load(str(tmp_path / "dsg.json"))

@@ -16,6 +16,7 @@ from prior_sg.deploy.cli.main import main
 from prior_sg.deploy.showing.formats import FORMATS, ExportError, named, save
 from prior_sg.deploy.showing.material import Cloud, Material, Moment
 from prior_sg.deploy.showing.scene_reading import scene_of_json
+from prior_sg.schemas.members import MapMember
 from prior_sg.schemas.objects import SceneObject
 from prior_sg.schemas.regions import Transition
 from tests.deploy.showing.test_export import changed, flat, flat_map, region, with_details
@@ -34,9 +35,10 @@ def told():
         neighbour_ids=[7],
         object_ids=[4],
         transitions=[Transition(region=7, edge=(13, 16), position_m=(2.25, 1.0, 1.0), clearance_m=0.375, door=True)],
+        members=[MapMember(robot=HOSTILE, session=1, id=5), MapMember(robot="ada", id=2)],
     )
     box = {"position_m": (1.0, 0.5, 0.25), "min_m": (0.5, 0.0, 0.0), "max_m": (1.5, 1.0, 0.5)}
-    item = SceneObject(id=4, label=HOSTILE, probability=0.6, known=0.9, frames=3, **box)
+    item = SceneObject(id=4, label=HOSTILE, probability=0.6, known=0.9, frames=3, members=kitchen.members, **box)
     labels = {"labels": ["hall", FORMULA, "office"], "regions": [kitchen, *flat().regions[1:2]]}
     return changed(flat(), objects=[item], origin_m=(512_345.0, 5_403_210.0, 312.0), task=HOSTILE, **labels)
 
@@ -154,8 +156,8 @@ def test_json_is_read_back(make, tmp_path):
         if isinstance(ours, np.ndarray):
             assert ours.dtype == theirs.dtype and ours == pytest.approx(theirs, abs=1e-3), name
         elif name == "regions":  # places, neighbours and probabilities follow from the graph there
-            assert [(r.id, r.label, r.hull_m, r.transitions) for r in ours] == [
-                (r.id, r.label, r.hull_m, r.transitions) for r in theirs
+            assert [(r.id, r.label, r.hull_m, r.transitions, r.members) for r in ours] == [
+                (r.id, r.label, r.hull_m, r.transitions, r.members) for r in theirs
             ]
         else:
             assert ours == theirs, name

@@ -13,6 +13,7 @@ from prior_sg.deploy.benches.queries import synthetic_scene
 from prior_sg.deploy.showing.formats import save
 from prior_sg.deploy.showing.material import Material
 from prior_sg.deploy.showing.text import LEAST_TOKENS, scene_text, tokens_of
+from prior_sg.schemas.members import MapMember
 from prior_sg.schemas.regions import Transition
 from tests.deploy.api.test_scene import EMPTY, message, region
 from tests.help.foreseen import foresight
@@ -51,6 +52,15 @@ def test_it_says_what_is_where_and_how_to_get_there(tmp_path):
     ]
     save(Material(house()), tmp_path / "scene.txt")
     assert Scene(house()).to_text() == scene_text(house()) == (tmp_path / "scene.txt").read_text()
+
+
+def test_a_merged_region_says_what_it_is_made_of():
+    hall, kitchen = house().regions
+    parts = [MapMember(robot="ada", id=3), MapMember(robot='b\n"b', session=1, id=1)]
+    many = [MapMember(robot="ada", id=number) for number in range(10)]
+    scene = replace(house(), regions=[replace(hall, members=many), replace(kitchen, members=parts)])
+    assert "; made of ada #3, b 'b (session 1) #1\n" in scene_text(scene)
+    assert "ada #6, ada #7 and 2 more\n" in scene_text(scene)
 
 
 def test_what_is_expected_is_told_as_such():
