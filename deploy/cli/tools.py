@@ -3,7 +3,7 @@
 import argparse
 import json
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,8 +17,6 @@ from prior_sg.deploy.evaluation import tune_command as tuning
 from prior_sg.deploy.terminal import Part, line
 
 if TYPE_CHECKING:
-    from rich.status import Status
-
     from prior_sg.deploy.inspecting.health import Found
     from prior_sg.schemas.status import TopicCount
 
@@ -321,7 +319,7 @@ def cmd_bench(arguments: argparse.Namespace) -> int:
                 presets=arguments.presets,
                 worlds=arguments.worlds,
                 seeds=arguments.seeds,
-                report=partial(_tell, status, name),
+                report=partial(_tell, status.update, name),
             )
             found = bench.run(name, asked)
         if arguments.json:
@@ -334,8 +332,8 @@ def cmd_bench(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _tell(status: "Status", name: str, text: str) -> None:
-    status.update(f"measuring {name}: {text}")
+def _tell(update: Callable[[str], None], name: str, text: str) -> None:
+    update(f"measuring {name}: {text}")
 
 
 def _flat(metrics: dict, before: str = "") -> Iterator[tuple[str, float]]:
