@@ -21,7 +21,7 @@ LEAVES = 400  # of a picture
 LARGEST_LEAF = 1.0  # radius, of the picture's side
 SMALLEST_LEAF = 0.05
 KEPT_CONVOLUTIONS = 6  # the first ones, with two thirds of the error; all others have a tenth of the rest at most
-FLAGS = {"avx512_vnni", "avx_vnni", "asimddp"}  # of processors with products of 8-bit numbers
+FLAGS = {"avx512_vnni", "avx_vnni"}  # of such processors; those of ARM have not been measured
 PROCESSOR_FILE = Path("/proc/cpuinfo")
 
 
