@@ -218,6 +218,9 @@ LONG: dict[str, Callable[[Asked], tuple[dict, dict]]] = {  # no part of `all`; t
 }
 
 
+TAKERS = {"on": ("places", "foresight", "merge"), "worlds": ("learning",), "seeds": ("foresight",)}  # by option
+
+
 def learning_in_worlds(asked: Asked) -> tuple[dict, dict]:
     """Learning in generated worlds; see `prior_sg.deploy.benches.learning_worlds`. Raises EvaluationError."""
     from prior_sg.deploy.benches.learning_worlds import learning_worlds_bench  # compiles the worlds' loops

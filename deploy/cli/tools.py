@@ -124,8 +124,9 @@ def _add_measuring(commands: Commands) -> None:
     )
     bench.add_argument(
         "name",
-        help="bus, places, features, kernel, swap, segmenter, task, learning, encoder_swap, queries, e2e, store, all "
-        "of these, or exchange, fleet, foresight, levels, merge, pool, store_crashes, lidar, view, hydra",
+        help="bus, places, features, kernel, swap, segmenter, task, learning, encoder_swap, queries, e2e, store, "
+        "memory, start, all of these, or exchange, fleet, foresight, levels, merge, pool, store_crashes, lidar, view, "
+        "hydra",
     )
     bench.add_argument("--seconds", type=float, default=300.0, help="how long pool lasts (default: %(default)s)")
     bench.add_argument(
@@ -311,6 +312,9 @@ def cmd_bench(arguments: argparse.Namespace) -> int:
         raise UserError(
             f"there is no measurement {arguments.name!r}; known: {', '.join((*bench.BENCHES, *bench.LONG))}, all"
         )
+    for option, takers in bench.TAKERS.items():
+        if getattr(arguments, option) and arguments.name not in takers:
+            raise UserError(f"--{option} is of the measurements {', '.join(takers)}, not of {arguments.name}")
     for name in bench.BENCHES if arguments.name == "all" else [arguments.name]:
         with console.status(f"measuring {name}") as status:
             asked = bench.Asked(

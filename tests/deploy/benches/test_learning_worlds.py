@@ -33,6 +33,12 @@ def test_a_detector_misses_some_and_mistakes_some():
     assert (taken_for == truth).mean() == pytest.approx(0.82, abs=0.03)  # one in ten mistakes hits the truth
 
 
+@pytest.mark.parametrize("option", [("--worlds", "home"), ("--on", "world:home:1"), ("--seeds", "2")])
+def test_what_a_measurement_would_ignore_is_refused(option, capsys):
+    assert main.main(["bench", "bus", *option]) != 0
+    assert f"{option[0]} is of the measurements" in capsys.readouterr().err
+
+
 def test_an_unknown_kind_of_world_is_refused(capsys):
     assert main.main(["bench", "learning", "--worlds", "igloo"]) != 0
     assert "igloo" in capsys.readouterr().err

@@ -208,14 +208,20 @@ def test_the_next_day_goes_on_with_the_same_numbers():
     assert len(after.place_ids) == len(before.place_ids)
 
 
-def test_numbers_live_on_in_a_file(tmp_path):
-    path = str(tmp_path / "fleet" / "home.msgpack")
-    cfg = msgspec.structs.replace(CFG, memory=path)
+def merged_and_kept(cfg):
+    """Both maps made one, and what lasts of that in the file of the settings."""
     fleet = Fleet(cfg)
     fleet.tell(first())
     fleet.tell(second())
     fleet.tick()
-    keep(path, fleet.kept[-1])
+    keep(cfg.memory, fleet.kept[-1])
+    return fleet
+
+
+def test_numbers_live_on_in_a_file(tmp_path):
+    path = str(tmp_path / "fleet" / "home.msgpack")
+    cfg = msgspec.structs.replace(CFG, memory=path)
+    fleet = merged_and_kept(cfg)
     again = Fleet(cfg, epoch=6)
     again.tell(second())
     again.tell(first())
@@ -230,11 +236,7 @@ def test_numbers_live_on_in_a_file(tmp_path):
 def test_the_frame_lives_on_in_that_file_for_maps_that_go_on(tmp_path):
     path = str(tmp_path / "home.msgpack")
     cfg = msgspec.structs.replace(CFG, memory=path)
-    fleet = Fleet(cfg)
-    fleet.tell(first())
-    fleet.tell(second())
-    fleet.tick()
-    keep(path, fleet.kept[-1])
+    fleet = merged_and_kept(cfg)
     before_m = fleet.scene().positions_m
 
     def gaps_m(epoch):
