@@ -22,6 +22,7 @@ from prior_sg.services.roles import KEEPERS, LEASED, NAMES, WRITERS, declared
 from prior_sg.services.runtime import extras
 from prior_sg.services.runtime.bus import BusError
 from prior_sg.services.runtime.config import ConfigError
+from prior_sg.services.runtime.hearing import end_deaf
 from prior_sg.services.runtime.host.host import Host
 from prior_sg.services.runtime.host.lease import Fence, Lease, SupersededError
 from prior_sg.services.runtime.host.succession import Predecessor, Standby
@@ -88,7 +89,7 @@ async def stay(
     takes over: then True. `succeeds` is the instance from which this process takes over. Where it fails by a fault of
     its own, a report goes to the folder, if there is one.
     """
-    bus = await asyncio.to_thread(ZenohBus, connect)
+    bus = await asyncio.to_thread(ZenohBus, connect, on_deaf=end_deaf)
     stopping = asyncio.Event()
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):

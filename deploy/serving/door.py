@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterator
 
 from prior_sg.deploy.serving.gate import Entrance
 from prior_sg.deploy.serving.system import System
+from prior_sg.services.runtime.hearing import end_deaf
 from prior_sg.services.runtime.zenoh_bus import ZenohBus
 
 Say = Callable[[str], None]
@@ -13,7 +14,7 @@ Say = Callable[[str], None]
 @contextlib.contextmanager
 def joined(connect: str, robot: str) -> Iterator[System]:
     """The system behind a router. Raises BusError."""
-    system = System(lambda: ZenohBus(connect), robot)
+    system = System(lambda: ZenohBus(connect, on_deaf=end_deaf), robot)
     try:
         yield system
     finally:

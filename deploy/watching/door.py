@@ -11,6 +11,7 @@ from prior_sg.deploy.watching.follower import Follower, OnPassages
 from prior_sg.deploy.watching.latency import Latencies
 from prior_sg.deploy.watching.metrics import Collector
 from prior_sg.services.runtime.client import BusClient
+from prior_sg.services.runtime.hearing import end_deaf
 from prior_sg.services.runtime.zenoh_bus import ZenohBus
 
 Say = Callable[[str], None]
@@ -25,7 +26,7 @@ def serve_metrics(  # noqa: PLR0917
     taps: list[OnPassages] = [lambda passages: latencies.follow(passage for _, passage in passages)]
     with contextlib.ExitStack() as stack:
         listener = stack.enter_context(listening(entrance.host, port))
-        client = stack.enter_context(BusClient(ZenohBus(connect)))
+        client = stack.enter_context(BusClient(ZenohBus(connect, on_deaf=end_deaf)))
         if collector is not None:
             from prior_sg.deploy.watching.otlp import Export, endpoint_in_force
 

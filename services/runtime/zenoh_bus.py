@@ -46,6 +46,7 @@ from prior_sg.services.runtime.endpoints import (
     unanswered,
     without_places,
 )
+from prior_sg.services.runtime.hearing import watch_hearing
 from prior_sg.services.runtime.keys import Beyond, Bundle, bundle_in_force
 from prior_sg.services.runtime.shaping import size_filters, thinned
 
@@ -209,14 +210,17 @@ class ZenohRequest:
 
 
 class ZenohBus:
-    """One session. Raises BusError when no router answers within `wait_s`."""
+    """One session. Raises BusError when no router answers within `wait_s`. `on_deaf` is called once, from a thread of
+    its own, when nothing comes in any more though the session is connected (`hearing.watch_hearing`).
+    """
 
-    def __init__(self, endpoint: str, wait_s: float = 10.0) -> None:
+    def __init__(self, endpoint: str, wait_s: float = 10.0, *, on_deaf: Callable[[], None] | None = None) -> None:
         zenoh.init_log_from_env_or(LOGGED)
         self._session = self._open(endpoint, wait_s)
         self._publishers: dict[str, Any] = {}
         self._lock = threading.Lock()
         self._entities: list[Any] = []
+        self._end_watch = watch_hearing(self, on_deaf) if on_deaf is not None else lambda: None
 
     @staticmethod
     def _open(endpoint: str, wait_s: float) -> zenoh.Session:
@@ -352,6 +356,7 @@ class ZenohBus:
 
     def close(self) -> None:
         """Leave the bus, within a bound."""
+        self._end_watch()
         close_within(self._session, CLOSE_TIMEOUT_S)
 
 
