@@ -15,8 +15,8 @@ from prior_sg.services.runtime.bus import Bus, BusError
 log = logging.getLogger(__name__)
 NOBODY_KEY = roll_key("nobody", "nobody", "0")  # everybody may ask for it, nobody watches it: the router has to answer
 ASK_EVERY_S = 4.0
-ANSWER_S = 4.0
-DEAF_AFTER_S = 30.0
+ANSWER_S = 10.0  # behind much that travels, an answer takes a while
+DEAF_AFTER_S = 40.0
 LOOK_EVERY_S = 1.0
 EXIT_DEAF = 6  # started again, it hears
 
