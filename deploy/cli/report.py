@@ -93,8 +93,8 @@ def compare(
     if truth is not None:
         metrics |= evaluate(scene, result.voxels, GroundTruth.from_json(truth))
         console.print("against the ground truth: " + ", ".join(f"{name} {metrics[name]:.3f}" for name in MAIN_METRICS))
-        if not set(scene.labels) & {region["label"] for region in truth["regions"]}:
-            console.print("no region name of this task is in the ground truth: only f1_g and miou_g compare anything")
+        if note := _note_on_names(set(scene.labels), {region["label"] for region in truth["regions"]}):
+            console.print(note)
     if objects and result.counts.detectors - {NO_DETECTOR}:
         found = object_scores(scene.objects, objects, [item.name for item in result.prior.objects], result.voxels)
         shares = ", ".join(
@@ -104,6 +104,19 @@ def compare(
         console.print(f"objects against the ground truth: {counts}, {shares}")
         metrics |= found
     return {name: None if math.isnan(value) else value for name, value in metrics.items()}
+
+
+def _note_on_names(of_task: set[str], of_truth: set[str]) -> str:
+    """That scores of names say little, where the task names regions otherwise than the ground truth; else empty."""
+    missing = of_truth - of_task
+    if not missing:
+        return ""
+    if missing == of_truth:
+        return "no region name of this task is in the ground truth: only f1_g and miou_g compare anything"
+    return (
+        f"this task has no {' and no '.join(sorted(missing))}, which the ground truth has, so names cannot match "
+        "there: f1_g and miou_g compare shapes alone"
+    )
 
 
 def final_scene_difference(log: Log, path: Path) -> str:

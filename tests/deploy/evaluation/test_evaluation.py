@@ -182,6 +182,23 @@ def test_a_run_tells_how_well_it_found_objects(case, capsys):
     assert compare(result, None, full.objects, Console()) == {}
 
 
+def test_scores_of_names_that_the_task_does_not_use_are_said_to_say_little(case, capsys):
+    result = Result(
+        methods.ours(Config()).run(case), case.perception.voxels, Path("log.mcap"), Counts(), 1.0, case.prior, []
+    )
+    room = {"id": 0, "floor": 0, "polygon_m": [[0, 0], [4, 0], [4, 4]]}
+
+    def said(labels):
+        rooms = [room | {"id": number, "label": label} for number, label in enumerate(labels)]
+        floors = [{"id": 0, "z_min_m": 0.0, "z_max_m": 3.0}]
+        compare(result, {"floors": floors, "regions": rooms}, [], Console(width=200))
+        return capsys.readouterr().out
+
+    assert "this task has no atrium, which the ground truth has" in said((NAMES[0], "atrium"))
+    assert "no region name of this task is in the ground truth" in said(("nave", "atrium"))
+    assert "names" not in said((NAMES[0], NAMES[1]))
+
+
 def quiet(what, done, total):
     """Say nothing."""
 
