@@ -18,7 +18,7 @@ def rng():
 def endpoint():
     """A router of this test session, on loopback."""
     from prior_sg.services.runtime.endpoints import free_endpoint
-    from prior_sg.services.runtime.zenoh_bus import open_router
+    from prior_sg.services.runtime.zenoh_router import open_router
 
     address = free_endpoint("tcp/127.0.0.1:0")
     stop = open_router(address)

@@ -11,7 +11,7 @@ from prior_sg.schemas.topics import KEYFRAME
 from prior_sg.services.registry import SERVICES
 from prior_sg.services.runtime.endpoints import free_endpoint
 from prior_sg.services.runtime.record import LogWriter, read_log
-from prior_sg.services.runtime.zenoh_bus import open_router
+from prior_sg.services.runtime.zenoh_router import open_router
 from prior_sg.services.segmenter.core.experts import REGISTRY
 from tests.help.paths import ROOT, SAMPLE
 

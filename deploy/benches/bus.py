@@ -31,7 +31,9 @@ from prior_sg.schemas.frames import Keyframe
 from prior_sg.schemas.topics import KEYFRAME
 from prior_sg.services.runtime.bus import Sample, pack_header
 from prior_sg.services.runtime.endpoints import free_endpoint
-from prior_sg.services.runtime.zenoh_bus import ZenohBus, client_config, open_router
+from prior_sg.services.runtime.zenoh_bus import ZenohBus
+from prior_sg.services.runtime.zenoh_router import open_router
+from prior_sg.services.runtime.zenoh_session import client_config
 
 SIZES = {"150kB": (150_000, 1500), "1.5MB": (1_500_000, 200)}  # bytes, messages of one turn
 TURNS = 5

@@ -22,7 +22,8 @@ from prior_sg.services.registry import SERVICES
 from prior_sg.services.runtime.bus import Sample
 from prior_sg.services.runtime.client import BusClient
 from prior_sg.services.runtime.endpoints import free_endpoint
-from prior_sg.services.runtime.zenoh_bus import ZenohBus, open_router
+from prior_sg.services.runtime.zenoh_bus import ZenohBus
+from prior_sg.services.runtime.zenoh_router import open_router
 
 ROBOT = "bench"
 OLD, NEW = (f"conse/efficientnet-lite{size}/minilm-l6-v2" for size in (2, 1))

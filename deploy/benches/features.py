@@ -39,7 +39,8 @@ from prior_sg.services.runtime.bus import Sample
 from prior_sg.services.runtime.endpoints import free_endpoint
 from prior_sg.services.runtime.jobs.board import Ended
 from prior_sg.services.runtime.jobs.pool import JobPool
-from prior_sg.services.runtime.zenoh_bus import ZenohBus, open_router
+from prior_sg.services.runtime.zenoh_bus import ZenohBus
+from prior_sg.services.runtime.zenoh_router import open_router
 
 BATCHES = (1, 4, 16)
 ROUNDS = 3

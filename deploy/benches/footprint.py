@@ -35,7 +35,8 @@ from prior_sg.services.roles import NAMES
 from prior_sg.services.runtime.bus import BusError, Sample, message_in
 from prior_sg.services.runtime.client import BusClient
 from prior_sg.services.runtime.endpoints import free_endpoint
-from prior_sg.services.runtime.zenoh_bus import ZenohBus, open_free_router
+from prior_sg.services.runtime.zenoh_bus import ZenohBus
+from prior_sg.services.runtime.zenoh_router import open_free_router
 
 COMMAND = "command"  # the process of the command, with the router and the recorder
 TOTAL = "total"

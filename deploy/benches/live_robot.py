@@ -34,7 +34,8 @@ from prior_sg.services.runtime.client import BusClient
 from prior_sg.services.runtime.ros.session import RosSession
 from prior_sg.services.runtime.ros.types import Types, shared_types
 from prior_sg.services.runtime.ros.wire import Channel
-from prior_sg.services.runtime.zenoh_bus import ZenohBus, open_free_router
+from prior_sg.services.runtime.zenoh_bus import ZenohBus
+from prior_sg.services.runtime.zenoh_router import open_free_router
 
 RATE_HZ, HELD = 30.0, 15
 END_AFTER_S = 3.0

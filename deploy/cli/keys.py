@@ -141,7 +141,7 @@ def _list(arguments: argparse.Namespace) -> int:
 
 
 def _router(arguments: argparse.Namespace) -> int:
-    from prior_sg.services.runtime.zenoh_bus import check_router, open_router, router_settings
+    from prior_sg.services.runtime.zenoh_router import check_router, open_router, router_settings
 
     beyond = reach_of(arguments)
     if arguments.write is not None:

@@ -6,12 +6,12 @@ from collections.abc import Mapping, Sequence
 from rich.box import SIMPLE
 from rich.table import Table
 
-from prior_sg.deploy.evaluation.command import TABLE_COLUMNS, perceiver_of, progress
 from prior_sg.deploy.evaluation.datasets import Dataset
 from prior_sg.deploy.evaluation.errors import EvaluationError
 from prior_sg.deploy.evaluation.methods import Case, ours
 from prior_sg.deploy.evaluation.search import Found, Judge, figures, judged
 from prior_sg.deploy.evaluation.search_questions import QUESTIONS
+from prior_sg.deploy.evaluation.shared import TABLE_COLUMNS, perceiver_of, progress
 from prior_sg.deploy.json_text import json_text
 from prior_sg.deploy.settings import Layers
 from prior_sg.deploy.terminal import Terminal

@@ -12,7 +12,7 @@ from rich.box import SIMPLE
 from rich.table import Table
 
 from prior_sg.deploy.cli.shared import add_settings
-from prior_sg.deploy.evaluation import command
+from prior_sg.deploy.evaluation import shared
 from prior_sg.deploy.evaluation.kinds import BASELINES, OURS
 from prior_sg.deploy.json_text import json_text
 from prior_sg.deploy.settings import Layers
@@ -35,7 +35,7 @@ Judged = dict[str, dict[str, float]]  # scores by name of the method with its co
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """What `prior-sg tune` can be told."""
-    command.add_datasets(parser)
+    shared.add_datasets(parser)
     parser.add_argument(
         "--values",
         action="append",
@@ -59,10 +59,10 @@ def run(arguments: argparse.Namespace, console: Terminal) -> int:
     """Judge all combinations, choose, print, and write tune.json to the output folder. Raises EvaluationError."""
     from prior_sg.deploy.evaluation.datasets import chosen_datasets
 
-    check_scores(command.names_in(arguments.score))
-    candidates_of(arguments, command.chosen_layers(arguments))  # refuses what cannot be before anything takes time
+    check_scores(shared.names_in(arguments.score))
+    candidates_of(arguments, shared.chosen_layers(arguments))  # refuses what cannot be before anything takes time
     datasets = chosen_datasets(arguments.datasets, arguments.environment, arguments.task)
-    command.check_encoder(arguments.encoder, datasets)
+    shared.check_encoder(arguments.encoder, datasets)
     groups = groups_of(datasets, arguments.leave)
     arguments.out.mkdir(parents=True, exist_ok=True)
     found = choose(arguments, judged(arguments, datasets), groups)
@@ -106,7 +106,7 @@ def values_of(texts: Sequence[str], methods: Sequence[str]) -> dict[str, list[st
     for text in texts:
         setting, _, listed = text.partition("=")
         section, _, field = setting.strip().partition(".")
-        values = command.names_in(listed)
+        values = shared.names_in(listed)
         if not values or not field:
             raise EvaluationError(f"--values {text} names no values: write {SECTION}.region_cost=0,10")
         if (OURS if section == SECTION else section) not in methods:
@@ -127,7 +127,7 @@ def combinations(values: Values, one_at_a_time: bool) -> list[Combination]:
 
 def candidates_of(arguments: argparse.Namespace, layers: Layers) -> "dict[str, dict[str, Method]]":
     """By method what may be chosen, by what it is called. Raises EvaluationError or ConfigError."""
-    names = command.names_in(arguments.methods)
+    names = shared.names_in(arguments.methods)
     values = values_of(arguments.values, names)
     found: dict[str, dict[str, Method]] = {}
     for name in names:
@@ -170,9 +170,9 @@ def judged(arguments: argparse.Namespace, datasets: "Sequence[Dataset]") -> dict
     if arguments.jobs < 0:
         raise EvaluationError("--jobs must be at least 1, or 0 for the number of cores")
     jobs = min(arguments.jobs or os.cpu_count() or 1, len(datasets))
-    with command.progress(Terminal(stderr=True)) as report:
+    with shared.progress(Terminal(stderr=True)) as report:
         if jobs > 1:
-            parts = command.in_parallel(arguments, datasets, jobs, report, judge_one)
+            parts = shared.in_parallel(arguments, datasets, jobs, report, judge_one)
         else:
             parts = [judge_one(arguments, dataset) for dataset in datasets]
     return {dataset.name: part for dataset, part in zip(datasets, parts, strict=True)}
@@ -182,9 +182,9 @@ def judge_one(arguments: argparse.Namespace, dataset: "Dataset") -> Judged:
     """All combinations of all methods, and the configured settings, on one dataset."""
     from prior_sg.deploy.evaluation import runner
 
-    layers = command.chosen_layers(arguments)
-    perceive = command.perceiver_of(arguments, layers, lambda *_: None).perceive
-    rows = {name: method_of(name, (), layers) for name in command.names_in(arguments.methods)}
+    layers = shared.chosen_layers(arguments)
+    perceive = shared.perceiver_of(arguments, layers, lambda *_: None).perceive
+    rows = {name: method_of(name, (), layers) for name in shared.names_in(arguments.methods)}
     methods = {method.name: method for method in rows.values()}
     for candidates in candidates_of(arguments, layers).values():
         methods |= {method.name: method for method in candidates.values()}
@@ -198,13 +198,13 @@ def choose(
     """By method what choosing is worth. Raises EvaluationError where a dataset has no such score."""
     from prior_sg.deploy.evaluation.tuning import grouped, tuned
 
-    keys = command.names_in(arguments.score)
+    keys = shared.names_in(arguments.score)
 
     def means(row: str) -> dict[str, float]:
         return grouped({name: score_of(scores[name][row], keys, name) for name in scores}, groups)
 
     found = {}
-    for name, candidates in candidates_of(arguments, command.chosen_layers(arguments)).items():
+    for name, candidates in candidates_of(arguments, shared.chosen_layers(arguments)).items():
         default = means(row_name(name, called(())))
         found[name] = tuned({candidate: means(row_name(name, candidate)) for candidate in candidates}, default)
     return found
@@ -235,7 +235,7 @@ def as_table(found: "Tuned") -> dict[str, Any]:
 
 def print_tables(found: "Mapping[str, Tuned]", console: Terminal, leave: str) -> None:
     """One row per method, then what was chosen and whether it helps."""
-    console.width = max(console.width, command.TABLE_COLUMNS)
+    console.width = max(console.width, shared.TABLE_COLUMNS)
     title = f"percent, mean±standard error over {leave}s left out"
     table = Table("method", title=title, box=SIMPLE, padding=(0, 1, 0, 0))
     for heading in ("left out", "hindsight", "as configured", "gain"):

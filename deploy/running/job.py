@@ -40,7 +40,8 @@ from prior_sg.services.registry import SERVICES
 from prior_sg.services.runtime.bus import Bus, BusError, LocalBus, Sample, message_in
 from prior_sg.services.runtime.client import BusClient, NoPriorError
 from prior_sg.services.runtime.endpoints import parse_endpoint
-from prior_sg.services.runtime.zenoh_bus import ZenohBus, open_free_router
+from prior_sg.services.runtime.zenoh_bus import ZenohBus
+from prior_sg.services.runtime.zenoh_router import open_free_router
 
 log = logging.getLogger(__name__)
 QUIET_S = 1.5

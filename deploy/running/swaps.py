@@ -15,7 +15,7 @@ from prior_sg.schemas.topics import swap_key
 from prior_sg.services.errors import PriorSgError
 from prior_sg.services.runtime.bus import Bus, Request
 from prior_sg.services.runtime.keys import Beyond
-from prior_sg.services.runtime.zenoh_bus import EndpointTakenError, open_router
+from prior_sg.services.runtime.zenoh_router import EndpointTakenError, open_router
 
 ROUTER = "router"
 RESTARTED = "the router was started again in its place"

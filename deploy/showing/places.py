@@ -8,8 +8,8 @@ openings to unobserved space. 2D places are their ellipses.
 import cv2
 import numpy as np
 
+from prior_sg.deploy.showing.canvas import INK, MUTED
 from prior_sg.deploy.showing.colors import UNLABELLED, Color, label_colors
-from prior_sg.deploy.showing.map import INK, MUTED
 from prior_sg.schemas.places import VoxelMap
 from prior_sg.schemas.scene import Scene
 

@@ -1,14 +1,11 @@
-"""The bus over Zenoh: beside the session with ROS 2, the only file that imports zenoh.
+"""The bus over Zenoh. Beside what all sessions share, the router and the session with ROS 2, the only file that imports
+zenoh.
 
 Every process is a client of a router on its own host (peers do not relay). `every` uses advanced publishers with a
 cache, history for late readers and recovery of missed samples; what these cannot recover is caught by the revisions of
 deltas. The encoding of everything sent names its schema; what comes in another version is brought to ours, or refused.
 """
 
-import contextlib
-import errno
-import json
-import logging
 import threading
 import time
 from collections.abc import Callable
@@ -33,153 +30,18 @@ from prior_sg.services.runtime.bus import (
     Sample,
     unpack_header,
 )
-from prior_sg.services.runtime.endpoints import (
-    KEYS_NEEDED,
-    cannot_listen,
-    check_endpoint,
-    check_host,
-    check_reach,
-    free_endpoint,
-    number_in,
-    on_loopback,
-    secured,
-    unanswered,
-    without_places,
-)
+from prior_sg.services.runtime.endpoints import check_endpoint, check_host, check_reach, secured, unanswered
 from prior_sg.services.runtime.hearing import watch_hearing
-from prior_sg.services.runtime.keys import Beyond, Bundle, bundle_in_force
-from prior_sg.services.runtime.shaping import size_filters, thinned
+from prior_sg.services.runtime.keys import bundle_in_force
+from prior_sg.services.runtime.zenoh_session import CLOSE_TIMEOUT_S, LOGGED, client_config, close_within, quietly
 
-log = logging.getLogger(__name__)
 HEARTBEAT_S = 0.3
-CLOSE_TIMEOUT_S = 3.0
-LEASE_MS = 2000
-ATTEMPTS = 5
-CONNECT_MS = 3000
-RETRY = {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 1.5}
-HEAD_BYTES = 65536  # of key, header and encoding beside a message
 PRIORITIES = {
     "now": Priority.INTERACTIVE_HIGH,
     "soon": Priority.INTERACTIVE_LOW,
     "data": Priority.DATA,
     "bulk": Priority.DATA_LOW,
 }
-LOGGED = "error"
-LOGGED_BEYOND = (
-    f"{LOGGED},zenoh_link_tls::unicast=warn,zenoh::net::routing::interceptor::access_control=info"  # who is not let in
-)
-STAMPS = {"enabled": False}  # writers number their samples; a stamp of a clock ahead would be an error at each hop
-TRANSPORT: dict[str, Any] = {
-    "link": {
-        "tx": {"lease": LEASE_MS, "keep_alive": 4},
-        "rx": {"buffer_size": 4194304, "max_message_size": LARGEST + HEAD_BYTES},
-    },
-    "shared_memory": {"enabled": False},  # a reader that was stopped would take other bytes: docs/decisions.md
-}
-
-
-def _transport(bundle: Bundle | None) -> dict[str, Any]:
-    if bundle is None:
-        return TRANSPORT
-    return TRANSPORT | {"link": TRANSPORT["link"] | {"tls": bundle.transport()}}
-
-
-class EndpointTakenError(BusError):
-    """Somebody else listens there."""
-
-
-def client_config(endpoint: str, bundle: Bundle | None = None) -> zenoh.Config:
-    """Client of one router; dead neighbours are noticed within two seconds."""
-    return zenoh.Config.from_json5(
-        json.dumps(
-            {
-                "mode": "client",
-                "connect": {
-                    "endpoints": [endpoint],
-                    "timeout_ms": CONNECT_MS,
-                    "retry": RETRY,
-                },
-                "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
-                "timestamping": STAMPS,
-                "transport": _transport(bundle if secured(endpoint) else None),
-            }
-        )
-    )
-
-
-def router_settings(endpoint: str, beyond: Beyond | None = None) -> dict[str, Any]:
-    """Zenoh's settings of a router: for the processes of its host on loopback, and `beyond` for those with keys. On
-    loopback alone it gossips: nodes of ROS, which are peers, find each other by that.
-    """
-    settings: dict[str, Any] = {
-        "mode": "router",
-        "listen": {"endpoints": [endpoint, *(beyond.listen if beyond else ())]},
-        "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": beyond is None}},
-        "timestamping": STAMPS,
-        "transport": _transport(beyond.bundle if beyond else None),
-        "low_pass_filter": size_filters(),
-    }
-    if beyond is not None:
-        joined = {"endpoints": list(beyond.join), "timeout_ms": 0, "exit_on_failure": False, "retry": RETRY}
-        settings |= {"access_control": beyond.access, "connect": joined}
-        if beyond.thin_bps:
-            settings = thinned(settings, beyond.thin_bps, beyond.bundle.robots)
-    return settings
-
-
-def check_router(endpoint: str, beyond: Beyond | None) -> None:
-    """That nobody without keys reaches the router from another host. Raises BusError."""
-    check_endpoint(endpoint)
-    if secured(endpoint) or not on_loopback(endpoint):
-        raise BusError(
-            f"{endpoint} is beyond this host: keep --connect on loopback, and let others join by "
-            f"`prior-sg router --listen tls/HOST:PORT`; {KEYS_NEEDED}"
-        )
-    for other in (*beyond.listen, *beyond.join) if beyond else ():
-        check_endpoint(other)
-        if not secured(other):
-            raise BusError(f"{other} is not encrypted; write it as tls/HOST:PORT")
-    if beyond is not None and beyond.listen and beyond.bundle.own.role != "edge":
-        raise BusError(f"{beyond.bundle.own.name} has no key of an edge, so nobody would join it; leave out --listen")
-
-
-def open_router(endpoint: str, beyond: Beyond | None = None) -> Callable[[], None]:
-    """Start a router in this process; returns the function that stops it. Raises BusError."""
-    check_router(endpoint, beyond)
-    zenoh.init_log_from_env_or(LOGGED_BEYOND if beyond else LOGGED)
-    try:
-        session = zenoh.open(zenoh.Config.from_json5(json.dumps(router_settings(endpoint, beyond))))
-    except zenoh.ZError as error:
-        said = str(error)
-        number = number_in(said)
-        kind = EndpointTakenError if number == errno.EADDRINUSE else BusError
-        where = " and ".join((endpoint, *(beyond.listen if beyond else ())))
-        raise kind(cannot_listen(where, number, without_places(said))) from error
-    return lambda: close_within(session, CLOSE_TIMEOUT_S)
-
-
-def open_free_router(wanted: str) -> tuple[str, Callable[[], None]]:
-    """A router on the endpoint wanted or on a free port of the same host: where it listens, and the function that stops
-    it. Others may take a port between its being found free and being used. Raises BusError."""
-    for _ in range(ATTEMPTS - 1):
-        endpoint = free_endpoint(wanted)
-        with contextlib.suppress(EndpointTakenError):
-            return endpoint, open_router(endpoint)
-    endpoint = free_endpoint(wanted)
-    return endpoint, open_router(endpoint)
-
-
-def close_within(session: zenoh.Session, timeout_s: float) -> None:
-    """Close, but not for longer than the timeout: closing over a broken link can take very long."""
-    closer = threading.Thread(target=lambda: quietly(session.close), daemon=True)
-    closer.start()
-    closer.join(timeout_s)
-
-
-def quietly(action: Callable[[], Any]) -> None:
-    """Run what may fail because the other side, or the session, has gone."""
-    with contextlib.suppress(zenoh.ZError):
-        action()
 
 
 class ZenohRequest:

@@ -16,7 +16,8 @@ from prior_sg.schemas.priors import Task
 from prior_sg.schemas.topics import INGEST_STATE
 from prior_sg.services.runtime.bus import Sample, message_in
 from prior_sg.services.runtime.client import BusClient
-from prior_sg.services.runtime.zenoh_bus import ZenohBus, open_free_router
+from prior_sg.services.runtime.zenoh_bus import ZenohBus
+from prior_sg.services.runtime.zenoh_router import open_free_router
 from tests.chaos import painted
 from tests.chaos.streams import STEP_NS, Stream
 from tests.help.paths import ROOT

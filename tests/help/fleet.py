@@ -9,7 +9,9 @@ from prior_sg.deploy.keys.access import access_control
 from prior_sg.deploy.keys.authority import Authority
 from prior_sg.services.runtime.endpoints import free_endpoint
 from prior_sg.services.runtime.keys import VARIABLE, Beyond, read_bundle
-from prior_sg.services.runtime.zenoh_bus import ZenohBus, client_config, open_router
+from prior_sg.services.runtime.zenoh_bus import ZenohBus
+from prior_sg.services.runtime.zenoh_router import open_router
+from prior_sg.services.runtime.zenoh_session import client_config
 
 ROBOTS = ("robotA", "robotB")
 PARTICIPANTS = (("edge", "edge1"), *(("robot", name) for name in ROBOTS), ("viewer", "anna"), ("operator", "otto"))

@@ -32,10 +32,10 @@ from prior_sg.schemas.topics import (
     TASK,
     job_key,
 )
-from prior_sg.services.runtime import zenoh_bus
+from prior_sg.services.runtime import zenoh_session
 from prior_sg.services.runtime.bus import pack_header
 from prior_sg.services.runtime.keys import read_bundle
-from prior_sg.services.runtime.zenoh_bus import client_config
+from prior_sg.services.runtime.zenoh_session import client_config
 from tests.help.examples import PRIOR as A_PRIOR
 from tests.help.intruders import BLOCK, BY_ROUTER, Row, Stage, at_the_router, at_the_service, connects, until
 from tests.help.world import no_places
@@ -300,7 +300,7 @@ def _(stage):
 def table(folder):
     """All rows, on one stage, as they come."""
     logging.getLogger("prior_sg").setLevel(logging.INFO)
-    with mock.patch.object(zenoh_bus, "CONNECT_MS", 1500), contextlib.closing(Stage(folder)) as stage:
+    with mock.patch.object(zenoh_session, "CONNECT_MS", 1500), contextlib.closing(Stage(folder)) as stage:
         for who, tried, does in ROWS:
             yield Row(who, tried, *does(stage))
 

@@ -21,7 +21,8 @@ from prior_sg.services.registry import BY_NAME
 from prior_sg.services.runtime.endpoints import free_endpoint, listened_to
 from prior_sg.services.runtime.keys import VARIABLE, read_bundle
 from prior_sg.services.runtime.service import Identity
-from prior_sg.services.runtime.zenoh_bus import ZenohBus, client_config
+from prior_sg.services.runtime.zenoh_bus import ZenohBus
+from prior_sg.services.runtime.zenoh_session import client_config
 from tests.help.paths import ROOT
 
 TRACED = "warn,zenoh::net::routing::interceptor=trace"
@@ -33,7 +34,7 @@ START_S, PATIENCE_S = 300.0, 60.0  # on a busy machine
 ROUTER = """
 import sys, time
 from prior_sg.deploy.keys.routing import beyond_this_host
-from prior_sg.services.runtime.zenoh_bus import open_router
+from prior_sg.services.runtime.zenoh_router import open_router
 stop = open_router(sys.argv[1], beyond_this_host(sys.argv[2:], []))
 time.sleep(3600)
 """

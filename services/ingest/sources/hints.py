@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from pathlib import Path
 
-from prior_sg.services.ingest.sources import dataset, generic, pose_lists
+from prior_sg.services.ingest.sources import dataset, own_files, pose_lists
 
 FOLDERS_LOOKED_AT, NAMED = 200, 5
 RECORDINGS = (".mcap", ".db3", ".bag")
@@ -37,16 +37,16 @@ def _lacking(path: Path) -> str:
         if (path / held).is_file() and not (path / missing).exists():
             return f"it has {held} but no {missing}"
     parts = {
-        "colour (rgb/ or color/)": generic.COLORS,
-        "depth (depth/)": generic.DEPTHS,
-        "poses (pose/)": generic.POSES,
+        "colour (rgb/ or color/)": own_files.COLORS,
+        "depth (depth/)": own_files.DEPTHS,
+        "poses (pose/)": own_files.POSES,
     }
-    lacks = [name for name, names in parts.items() if generic.folder_of(path, names) is None]
+    lacks = [name for name, names in parts.items() if own_files.folder_of(path, names) is None]
     if len(lacks) != 1:
         return ""
     if "pose" not in lacks[0]:
         return f"it has no folder of {lacks[0]}"
     others = sorted(child.name for child in path.iterdir() if not child.name.startswith("."))
-    held = ", ".join(name for name in others if name.lower() not in (*generic.COLORS, *generic.DEPTHS))
+    held = ", ".join(name for name in others if name.lower() not in (*own_files.COLORS, *own_files.DEPTHS))
     found = f"; what lies there ({held[:120]}) is none" if held else ""
     return f"it has no folder of {lacks[0]}: understood are {pose_lists.UNDERSTOOD}{found}"

@@ -10,44 +10,34 @@ import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
-from typing import Any, cast
+from typing import Any
 
 import msgspec
 
 from prior_sg.schemas.codec import DecodeError, Message, decode, encode, versions
 from prior_sg.schemas.status import JobDone, ServiceStatus, Started, StatusRequest, Tick, TopicCount
 from prior_sg.schemas.succession import Bequest, Succession, TakesOver
-from prior_sg.schemas.topics import (
-    DELTAS,
-    Query,
-    Topic,
-    alive_key,
-    status_key,
-    worker_keys,
-    yield_key,
-)
+from prior_sg.schemas.topics import DELTAS, Query, Topic, alive_key, status_key, worker_keys, yield_key
 from prior_sg.services.refusals import InputRefused
 from prior_sg.services.runtime.bus import Bus, Request, Sample
 from prior_sg.services.runtime.extras import release
+from prior_sg.services.runtime.host.admission import Admission
 from prior_sg.services.runtime.host.answering import Answering
 from prior_sg.services.runtime.host.asks import Asks, Reply
 from prior_sg.services.runtime.host.door import Door
-from prior_sg.services.runtime.host.faults import fault_of_clock, fault_of_reply, fault_of_writer
 from prior_sg.services.runtime.host.flow import Progress
+from prior_sg.services.runtime.host.giving import Giving
 from prior_sg.services.runtime.host.inbox import Inbox
 from prior_sg.services.runtime.host.items import LastWord, Question, Work
 from prior_sg.services.runtime.host.lease import Fence, Lease
 from prior_sg.services.runtime.host.outbox import Outbox
 from prior_sg.services.runtime.host.port import Fed, Port
 from prior_sg.services.runtime.host.readers import Readers
-from prior_sg.services.runtime.host.replays import Replays
 from prior_sg.services.runtime.host.succession import Predecessor, Standby
 from prior_sg.services.runtime.host.timing import Timing
 from prior_sg.services.runtime.host.trail import Trail
 from prior_sg.services.runtime.host.workplace import Workplace
 from prior_sg.services.runtime.host.yielding import Yielding
-from prior_sg.services.runtime.jobs.board import Ended
-from prior_sg.services.runtime.jobs.pool import JobPool
 from prior_sg.services.runtime.service import Ask, Identity, Service
 from prior_sg.services.runtime.signatures import signatures_in_force
 
@@ -78,24 +68,24 @@ class Host:
         self.service, self.bus, self.cfg, self.identity = service, bus, cfg, identity
         self.inbox = Inbox(wake=self._wake)
         self._door = Door(self.inbox)
-        self._lease, self._fence = lease, fence
+        self._lease = lease
         self._standby, self._replaces, self._follows = standby, replaces, follows
         self._no_more = asyncio.Event()  # of a source
         self._yielding = Yielding(self.inbox, self._no_more, self._may_yield)
         self._driving = self._answers = False
         self._signatures = signatures_in_force()
+        self._admission = Admission(self._door, fence, self._signatures)
         self.stopping = asyncio.Event()
         self._loop = asyncio.get_running_loop()
         self._waiting = asyncio.Event()
         self._thread = ThreadPoolExecutor(1, thread_name_prefix=service.name)
         self._asks = Asks(bus, self.inbox, self.stopping)
-        self._pools: dict[Topic, JobPool] = {}
         self._progress = Progress()
+        self._giving = Giving(self.inbox, self._progress, self._loop)
         self._outbox = Outbox(service.name, identity, bus, self._progress)
         self._answering = Answering(self.inbox, self._door)
         self._workplace = self._workplace_of(service)
         self._timing = Timing()
-        self._replays = Replays()
         self.trail = Trail(identity.robot)
         self._state: Any = None
 
@@ -174,7 +164,7 @@ class Host:
 
     def _is_busy(self) -> bool:
         """Whether a source is still being read, or an errand or a job given to a worker is under way."""
-        return self._driving or bool(self._asks.under_way) or any(pool.outstanding for pool in self._pools.values())
+        return self._driving or bool(self._asks.under_way) or self._giving.under_way
 
     def _may_yield(self) -> str:
         if self._standby is not None and not self._answers:
@@ -188,8 +178,7 @@ class Host:
         self._waiting.set()
 
     async def _leave(self) -> None:
-        for pool in self._pools.values():
-            pool.close()
+        self._giving.close()
         await self._on_thread(self.service.close, self._state)
         await self._yielding.hand_over(self._lease)
         await self._on_thread(self.bus.close)
@@ -216,9 +205,7 @@ class Host:
         self.bus.serve(yield_key(self.identity.whose, service.name, self.identity.instance), self._yielding.receive)
         for topic in service.writes:
             if topic.delivery == "job":
-                limit = service.job_limit(self.cfg)
-                ended = self._job_ended(topic)
-                self._pools[topic] = JobPool(self.bus, topic, robot, time.monotonic, ended, limit=limit)
+                self._giving.open(self.bus, topic, robot, service.job_limit(self.cfg))
         for topic in service.reads:
             for pattern in service.read_keys(topic, robot, self.cfg):
                 self.bus.subscribe(topic, pattern, self.inbox.offer, self._missed)
@@ -289,21 +276,7 @@ class Host:
         self._loop.call_soon_threadsafe(self.stop)
 
     def _handle_sample(self, sample: Sample) -> None:
-        topic, key = sample.topic, sample.key
-        message = self._door.admitted(
-            topic.type,
-            sample.payload,
-            name=topic.name,
-            key=key,
-            fault_of=lambda message: (
-                topic.fault_of(key, message)
-                or fault_of_writer(self._fence, message)
-                or fault_of_clock(message)
-                or self._replays.fault_of(sample, message)
-                or self._signatures.fault_of(message)
-            ),
-            writer=sample.writer,
-        )
+        message = self._admission.of_sample(sample)
         if message is None:
             return
         counts = self.inbox.of(sample.topic.name)
@@ -329,18 +302,7 @@ class Host:
 
     def _handle_reply(self, reply: Reply) -> None:
         query = reply.ask.query
-        message = self._door.admitted(
-            query.reply,
-            reply.payload,
-            name=query.name,
-            key=query.key,
-            fault_of=lambda told: (
-                fault_of_reply(reply.ask.request, told)
-                or fault_of_writer(self._fence, told)
-                or fault_of_clock(told)
-                or self._signatures.fault_of(told)
-            ),
-        )
+        message = self._admission.of_reply(reply)
         if message is None:
             self._asks.ask_later(reply.ask)
             return
@@ -370,9 +332,7 @@ class Host:
         self.inbox.of(topic.name).published += 1
         self.trail.published(topic, message)
         if topic.delivery == "job":
-            job_id = (message.robot, message.frame_id)  # type: ignore[attr-defined]
-            group = getattr(message, "space", "")  # of a back-fill, which gives way to the stream
-            self._pools[topic].submit(job_id, encode(message), group, later=bool(group))
+            self._giving.give(topic, message)
         else:
             if self._lease is not None and topic in DELTAS:
                 self._lease.tells(topic.name, message.revision)  # type: ignore[attr-defined]
@@ -382,19 +342,6 @@ class Host:
         self.service.check_ask(ask)
         self._asks.ask(ask)
 
-    def _job_ended(self, topic: Topic) -> Callable[[Ended], None]:
-        def ended(job: Ended) -> None:
-            if job.error:
-                log.warning("job given up", extra={"topic": topic.name, "job": str(job.id), "reason": job.error})
-            _, frame_id = cast(tuple[str, int], job.id)
-            done = JobDone(
-                topic=topic.name, frame_id=frame_id, worker=job.worker, attempts=job.attempts, error=job.error
-            )
-            self.inbox.put(done)
-            self._progress.changed(self._loop)
-
-        return ended
-
     async def _tick(self, period_s: float) -> None:
         while True:
             await asyncio.sleep(period_s)
@@ -402,7 +349,9 @@ class Host:
 
     async def _drive(self) -> None:
         assert self.service.drive is not None
-        port = Port(self.identity.robot, self._no_more, self.inbox, self._progress, self.service.writes, self._pools)
+        port = Port(
+            self.identity.robot, self._no_more, self.inbox, self._progress, self.service.writes, self._giving.pools
+        )
         self._driving = True
         try:
             await self.service.drive(port, self.cfg)
@@ -436,7 +385,7 @@ class Host:
             losses=self.service.losses(self._state),
             clock_ns=time.time_ns(),
             release=release(),
-            pools=[pool.count() for pool in self._pools.values()],
+            pools=self._giving.counts(),
             figures=self.service.figures(self._state),
             passages=self.trail.asked(asked),
             **self._timing.figures()._asdict(),

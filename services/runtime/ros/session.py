@@ -17,7 +17,7 @@ from prior_sg.services.runtime.endpoints import check_endpoint, check_host, secu
 from prior_sg.services.runtime.keys import bundle_in_force
 from prior_sg.services.runtime.ros import wire
 from prior_sg.services.runtime.ros.wire import Attachment, Channel, Entity, WireError
-from prior_sg.services.runtime.zenoh_bus import CLOSE_TIMEOUT_S, client_config, close_within, quietly
+from prior_sg.services.runtime.zenoh_session import CLOSE_TIMEOUT_S, client_config, close_within, quietly
 
 log = logging.getLogger(__name__)
 ENDPOINT = "tcp/127.0.0.1:7447"  # where rmw_zenohd listens

@@ -17,7 +17,7 @@ from prior_sg.services.segmenter.core.foresight.config import ForesightConfig
 from prior_sg.services.segmenter.core.layers.stacking import LayersConfig
 from prior_sg.services.segmenter.core.map.inclination import GeometryConfig
 from prior_sg.services.segmenter.core.objects.sizes import SizeConfig
-from prior_sg.services.segmenter.core.objects.tracks import TrackingConfig
+from prior_sg.services.segmenter.core.objects.track import TrackingConfig
 
 
 class AdjacencyConfig(msgspec.Struct, frozen=True, kw_only=True):

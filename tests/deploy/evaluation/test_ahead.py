@@ -9,7 +9,7 @@ from msgspec.structs import replace as replace_struct
 from rich.console import Console
 
 from prior_sg.deploy.cli import main
-from prior_sg.deploy.evaluation import ahead_walks, command
+from prior_sg.deploy.evaluation import ahead_command, ahead_walks, command
 from prior_sg.deploy.evaluation.ahead import NEARNESS, NO_LABEL, Stop, band_names, joined, score
 from prior_sg.deploy.evaluation.ahead_page import HEADINGS, cells, page
 from prior_sg.deploy.evaluation.methods import Case
@@ -132,7 +132,7 @@ def test_a_walk_judges_every_variant_on_the_same_places():
 def test_the_command_prints_and_writes_what_a_walk_gives(tmp_path, monkeypatch):
     case, deltas = walked()
     perceiver = SimpleNamespace(perceive=lambda *_: case.perception, deltas=lambda _: deltas)
-    monkeypatch.setattr(command, "perceiver_of", lambda *_: perceiver)
+    monkeypatch.setattr(ahead_command, "perceiver_of", lambda *_: perceiver)
     dataset = SimpleNamespace(name="two rooms", prior=case.prior, truth=case.truth, objects=())
     monkeypatch.setattr("prior_sg.deploy.evaluation.datasets.chosen_datasets", lambda *_: [dataset])
     monkeypatch.setattr(command, "check_encoder", lambda *_: None)
@@ -152,5 +152,5 @@ def test_what_ahead_would_ignore_is_refused(extra, capsys):
 def test_the_table_names_the_dataset():
     found = score([stop(0, [8], [False])], given(1))
     console = Console(record=True, width=120)
-    command.print_ahead({"somewhere": {key: {"ours": found} for key in NEARNESS}}, console)
+    ahead_command.print_ahead({"somewhere": {key: {"ours": found} for key in NEARNESS}}, console)
     assert "somewhere" in console.export_text()

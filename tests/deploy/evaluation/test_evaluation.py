@@ -12,7 +12,7 @@ from rich.console import Console
 
 from prior_sg.deploy.cli import main
 from prior_sg.deploy.cli.report import compare
-from prior_sg.deploy.evaluation import command, datasets, methods, oracles, priors, runner
+from prior_sg.deploy.evaluation import datasets, methods, oracles, priors, runner, tables
 from prior_sg.deploy.evaluation.errors import EvaluationError
 from prior_sg.deploy.evaluation.kinds import BASELINES, ORACLES, SWEEPS
 from prior_sg.deploy.evaluation.metrics import Reliability
@@ -163,7 +163,7 @@ def test_scores_of_objects_stand_beside_the_others(case, capsys):
     assert table["mean"]["ours"]["objects_recall"] == 1.0
     seen = found.pictures[0].scene
     assert seen.objects and not true_scene(seen, full.truth).objects
-    command.print_tables(found, Console())
+    tables.print_tables(found, Console())
     assert "recall 100.0" in " ".join(capsys.readouterr().out.split())
     assert "a: ours</td><td>0.500</td><td>1.000</td>" in page(found, {})
 
@@ -344,7 +344,7 @@ def test_the_page_needs_nothing_else(results):
 
 def test_tables_name_every_method(results):
     console = Console(record=True, width=60)
-    command.print_tables(results, console)
+    tables.print_tables(results, console)
     shown = console.export_text()
     assert all(method.name in shown for method in results.methods)
     assert "…" not in shown

@@ -24,7 +24,7 @@ from prior_sg.schemas.codec import encode
 from prior_sg.schemas.status import ServiceStatus, TopicCount
 from prior_sg.schemas.topics import alive_key, status_key
 from prior_sg.services.refusals import CLOCK_SET_NS
-from prior_sg.services.runtime import zenoh_bus
+from prior_sg.services.runtime import zenoh_session
 from prior_sg.services.runtime.extras import release
 from prior_sg.services.runtime.keys import ABOUT_FILE, KEY_FILE, VARIABLE
 from prior_sg.services.runtime.zenoh_bus import ZenohBus
@@ -84,7 +84,7 @@ def test_it_tells_a_line_each_and_their_number(said, capsys, tmp_path):
 
 
 def test_a_port_that_a_foreign_program_has(said, monkeypatch):
-    monkeypatch.setattr(zenoh_bus, "CONNECT_MS", 300)
+    monkeypatch.setattr(zenoh_session, "CONNECT_MS", 300)
     with socket.create_server(("127.0.0.1", 0)) as foreign:
         endpoint = f"tcp/127.0.0.1:{foreign.getsockname()[1]}"
         one = only(said("--connect", endpoint), "router")

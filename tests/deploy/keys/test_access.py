@@ -27,11 +27,13 @@ from prior_sg.schemas.topics import (
     status_key,
     worker_keys,
 )
-from prior_sg.services.runtime import zenoh_bus
+from prior_sg.services.runtime import zenoh_session
 from prior_sg.services.runtime.bus import BusError, pack_header
 from prior_sg.services.runtime.endpoints import free_endpoint
 from prior_sg.services.runtime.keys import VARIABLE, read_bundle
-from prior_sg.services.runtime.zenoh_bus import ZenohBus, client_config, open_router
+from prior_sg.services.runtime.zenoh_bus import ZenohBus
+from prior_sg.services.runtime.zenoh_router import open_router
+from prior_sg.services.runtime.zenoh_session import client_config
 from tests.help.fleet import Fleet, beyond, until, without_certificate
 
 
@@ -66,7 +68,7 @@ def answered(bus, key, timeout_s=1.0):
 
 @pytest.fixture
 def impatient(monkeypatch):
-    monkeypatch.setattr(zenoh_bus, "CONNECT_MS", 400)
+    monkeypatch.setattr(zenoh_session, "CONNECT_MS", 400)
 
 
 def test_strangers_are_not_let_in(fleet, monkeypatch, impatient):

@@ -8,7 +8,7 @@ import pytest
 from prior_sg.schemas.topics import CAMERA_STATE, KEYFRAME, PLACE_DELTA, TASK, TOPICS
 from prior_sg.services.runtime.bus import pack_header
 from prior_sg.services.runtime.shaping import LEAST_BUFFER
-from prior_sg.services.runtime.zenoh_bus import router_settings
+from prior_sg.services.runtime.zenoh_router import router_settings
 from tests.help.fleet import ROBOTS, Fleet, beyond, until
 
 SENT = 60

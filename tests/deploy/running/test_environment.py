@@ -23,7 +23,8 @@ from prior_sg.deploy.running.supervisor import Child, ChildFailed, Supervisor
 from prior_sg.deploy.sample import SAMPLE
 from prior_sg.services.runtime.client import BusClient
 from prior_sg.services.runtime.endpoints import free_endpoint
-from prior_sg.services.runtime.zenoh_bus import ZenohBus, open_free_router
+from prior_sg.services.runtime.zenoh_bus import ZenohBus
+from prior_sg.services.runtime.zenoh_router import open_free_router
 
 COMMAND = [sys.executable, "-m", "prior_sg.deploy.cli.main"]
 ENVIRONMENT = os.environ | {"PYTHONPATH": str(Path(prior_sg.__file__).parents[1])}

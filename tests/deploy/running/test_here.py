@@ -24,7 +24,8 @@ from prior_sg.services.runtime.endpoints import free_endpoint
 from prior_sg.services.runtime.host.host import Host
 from prior_sg.services.runtime.keys import VARIABLE, Beyond, read_bundle
 from prior_sg.services.runtime.service import Identity
-from prior_sg.services.runtime.zenoh_bus import ZenohBus, open_router
+from prior_sg.services.runtime.zenoh_bus import ZenohBus
+from prior_sg.services.runtime.zenoh_router import open_router
 
 PROGRAM = [sys.executable, "-m", "prior_sg.deploy.cli.main"]
 

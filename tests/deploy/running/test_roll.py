@@ -73,7 +73,7 @@ def test_a_stopped_process_is_told_by_who_started_it_and_by_health_and_so_is_its
 
 ROUTER = """
 import sys, time
-from prior_sg.services.runtime.zenoh_bus import open_router
+from prior_sg.services.runtime.zenoh_router import open_router
 stop = open_router(sys.argv[1])
 time.sleep(60)
 """

@@ -9,6 +9,7 @@ import pytest
 import spark_dsg
 from scipy.spatial.transform import Rotation
 
+from prior_sg.deploy.showing.canvas import FREE, WALL
 from prior_sg.deploy.showing.colors import PALETTE, UNLABELLED, label_colors
 from prior_sg.deploy.showing.dsg import save_spark_dsg, spark_dsg_graph
 from prior_sg.deploy.showing.export import (
@@ -18,7 +19,6 @@ from prior_sg.deploy.showing.export import (
     scene_json,
     zones,
 )
-from prior_sg.deploy.showing.map import FREE, WALL
 from prior_sg.deploy.showing.places import OPENING
 from prior_sg.deploy.truth import GroundTruth
 from prior_sg.schemas.objects import SceneObject

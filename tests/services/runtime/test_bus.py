@@ -13,11 +13,12 @@ from prior_sg.schemas.migrations import MIGRATIONS
 from prior_sg.schemas.places import SnapshotRequest
 from prior_sg.schemas.priors import Task
 from prior_sg.schemas.topics import INGEST_STATE, KEYFRAME, PLACE_SNAPSHOT, TASK
-from prior_sg.services.runtime import zenoh_bus
+from prior_sg.services.runtime import zenoh_router
 from prior_sg.services.runtime.bus import Answer, BusError, Hub, LocalBus, key_matches, pack_header, unpack_header
 from prior_sg.services.runtime.host.inbox import Inbox
 from prior_sg.services.runtime.host.replays import Replays
-from prior_sg.services.runtime.zenoh_bus import ZenohBus, client_config
+from prior_sg.services.runtime.zenoh_bus import ZenohBus
+from prior_sg.services.runtime.zenoh_session import client_config
 from tests.help import reading
 from tests.help.examples import KEYFRAME as FRAME
 
@@ -285,7 +286,7 @@ def test_questions_and_answers_name_their_schema_and_are_refused_like_samples(en
 
 
 def test_what_a_link_loses_comes_later_and_still_in_its_order(monkeypatch):
-    settings = zenoh_bus.router_settings
+    settings = zenoh_router.router_settings
 
     def loses(endpoint, beyond=None):
         rules = [{"key_expr": KEYFRAME.pattern("*"), "freq": 10}]
@@ -293,8 +294,8 @@ def test_what_a_link_loses_comes_later_and_still_in_its_order(monkeypatch):
             "downsampling": [{"flows": ["ingress"], "messages": ["put"], "rules": rules}]
         }
 
-    monkeypatch.setattr(zenoh_bus, "router_settings", loses)
-    endpoint, stop = zenoh_bus.open_free_router("tcp/127.0.0.1:0")
+    monkeypatch.setattr(zenoh_router, "router_settings", loses)
+    endpoint, stop = zenoh_router.open_free_router("tcp/127.0.0.1:0")
     reader, writer, got, live = ZenohBus(endpoint), ZenohBus(endpoint), [], []
     inbox, replays = Inbox(wake=lambda: None), Replays()
     try:

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from prior_sg.services.runtime import zenoh_bus
+from prior_sg.services.runtime import zenoh_router
 from prior_sg.services.runtime.bus import BusError
 from prior_sg.services.runtime.endpoints import (
     cannot_listen,
@@ -18,7 +18,9 @@ from prior_sg.services.runtime.endpoints import (
     on_loopback,
     parse_endpoint,
 )
-from prior_sg.services.runtime.zenoh_bus import ZenohBus, client_config, open_router, router_settings
+from prior_sg.services.runtime.zenoh_bus import ZenohBus
+from prior_sg.services.runtime.zenoh_router import open_router, router_settings
+from prior_sg.services.runtime.zenoh_session import client_config
 
 ROUTER_FILE = Path(__file__).parents[3] / "deploy" / "router.json5"
 NONSENSE = (
@@ -132,8 +134,8 @@ def test_a_port_taken_after_it_was_found_free_is_no_end(monkeypatch):
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         found = [f"tcp/127.0.0.1:{taken.getsockname()[1]}", free_endpoint("tcp/127.0.0.1:0")]
-        monkeypatch.setattr(zenoh_bus, "free_endpoint", lambda wanted: found.pop(0))
-        endpoint, stop = zenoh_bus.open_free_router("tcp/127.0.0.1:0")
+        monkeypatch.setattr(zenoh_router, "free_endpoint", lambda wanted: found.pop(0))
+        endpoint, stop = zenoh_router.open_free_router("tcp/127.0.0.1:0")
         stop()
     assert found == [] and endpoint.startswith("tcp/127.0.0.1:")
 

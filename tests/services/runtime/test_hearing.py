@@ -18,7 +18,7 @@ from prior_sg.services.runtime.zenoh_bus import ZenohBus
 
 ROUTER = """
 import sys, time
-from prior_sg.services.runtime.zenoh_bus import open_router
+from prior_sg.services.runtime.zenoh_router import open_router
 stop = open_router(sys.argv[1])
 print("stands", flush=True)
 time.sleep(300)

@@ -33,7 +33,8 @@ from prior_sg.services.runtime.client import BusClient
 from prior_sg.services.runtime.host.host import Host
 from prior_sg.services.runtime.jobs.pool import JobPool
 from prior_sg.services.runtime.service import Ask, Identity, Service, UndeclaredError
-from prior_sg.services.runtime.zenoh_bus import ZenohBus, client_config
+from prior_sg.services.runtime.zenoh_bus import ZenohBus
+from prior_sg.services.runtime.zenoh_session import client_config
 
 CAMERA = Intrinsics(4, 3, 5.0, 5.0, 2.0, 1.5)
 

@@ -30,7 +30,9 @@ from prior_sg.services.runtime.host.host import Host
 from prior_sg.services.runtime.host.limits import Limits
 from prior_sg.services.runtime.host.replays import Replays
 from prior_sg.services.runtime.service import Identity, Service
-from prior_sg.services.runtime.zenoh_bus import ZenohBus, client_config, router_settings
+from prior_sg.services.runtime.zenoh_bus import ZenohBus
+from prior_sg.services.runtime.zenoh_router import router_settings
+from prior_sg.services.runtime.zenoh_session import client_config
 
 
 class Config(msgspec.Struct, frozen=True):

@@ -15,7 +15,7 @@ from prior_sg.services.runtime.ros import wire
 from prior_sg.services.runtime.ros.session import RosError, RosSession
 from prior_sg.services.runtime.ros.types import Types
 from prior_sg.services.runtime.ros.wire import Attachment, Channel, Entity, Quality, WireError
-from prior_sg.services.runtime.zenoh_bus import client_config
+from prior_sg.services.runtime.zenoh_session import client_config
 
 STRING = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
 ADD_TWO_INTS = "RIHS01_e118de6bf5eeb66a2491b5bda11202e7b68f198d6f67922cf30364858239c81a"

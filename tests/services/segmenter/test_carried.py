@@ -14,7 +14,7 @@ from prior_sg.services.runtime.runner import Runner
 from prior_sg.services.runtime.service import Identity
 from prior_sg.services.segmenter.core import inference
 from prior_sg.services.segmenter.core.config import Config
-from prior_sg.services.segmenter.core.energy import swap_moves
+from prior_sg.services.segmenter.core.energy import swap_work
 from prior_sg.services.segmenter.core.energy.region_cost import consolidated
 from prior_sg.services.segmenter.core.energy.solver import Solver
 from prior_sg.services.segmenter.core.evidence.kernel import Frame, KernelConfig, project, visible
@@ -147,16 +147,16 @@ def test_sorted_queues_are_those_filled_from_the_flags(seed):
     solver = Solver()
     solver.take(field, rng.integers(0, 5, 80))
     work = solver._work
-    swap_moves.flag_all(rng.choice(80, 30, replace=False), swap_moves.NEAR, work)
-    work.pending[rng.random(work.pending.shape) < 0.5] = swap_moves.NOT_PENDING
-    fresh = swap_moves.empty_work(80, 5, len(solver._graph.neighbours))
+    swap_work.flag_all(rng.choice(80, 30, replace=False), swap_work.NEAR, work)
+    work.pending[rng.random(work.pending.shape) < 0.5] = swap_work.NOT_PENDING
+    fresh = swap_work.empty_work(80, 5, len(solver._graph.neighbours))
     fresh.pending[:] = work.pending
-    swap_moves.requeue(fresh)
+    swap_work.requeue(fresh)
     sorted_ = copy.deepcopy(work)
-    swap_moves.sort_queues(sorted_)
+    swap_work.sort_queues(sorted_)
     for ring in range(2):
-        counts = sorted_.rings[ring, swap_moves.COUNT]
-        assert counts == fresh.rings[ring, swap_moves.COUNT] and sorted_.rings[ring, swap_moves.HEAD] == 0
+        counts = sorted_.rings[ring, swap_work.COUNT]
+        assert counts == fresh.rings[ring, swap_work.COUNT] and sorted_.rings[ring, swap_work.HEAD] == 0
         np.testing.assert_array_equal(sorted_.queues[ring, :counts], fresh.queues[ring, :counts])
     np.testing.assert_array_equal(sorted_.queued, fresh.queued)
 

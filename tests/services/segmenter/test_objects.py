@@ -19,12 +19,17 @@ from prior_sg.services.runtime.service import Identity
 from prior_sg.services.segmenter.core.config import Config
 from prior_sg.services.segmenter.core.experts.context import ObjectView
 from prior_sg.services.segmenter.core.objects import names as naming
-from prior_sg.services.segmenter.core.objects import tracks as objects
+from prior_sg.services.segmenter.core.objects import splitting
+from prior_sg.services.segmenter.core.objects.association import observe
+from prior_sg.services.segmenter.core.objects.cells import connected, packed, shared, unpacked
 from prior_sg.services.segmenter.core.objects.object_map import ObjectMap
+from prior_sg.services.segmenter.core.objects.renewal import renew
+from prior_sg.services.segmenter.core.objects.track import TrackingConfig, descriptor
+from prior_sg.services.segmenter.core.objects.tracks import Tracks, move, outdated
 from prior_sg.services.segmenter.service import SERVICE
 from tests.help.world import CAMERA, DIM, ROBOT, SPACE, look, place_delta, place_grid, prior, task, text
 
-CFG = objects.TrackingConfig()
+CFG = TrackingConfig()
 EYE = np.eye(DIM)
 BED = (np.array((2.0, 1.0, 0.0)), np.array((3.2, 2.6, 0.6)), 1)  # low and high corner, axis of its embedding
 OVEN = (np.array((2.0, -2.0, 0.0)), np.array((2.6, -1.4, 0.9)), 0)
@@ -80,9 +85,9 @@ def walk(count=8):
 
 
 def seen(frames, cfg=CFG):
-    tracks = objects.Tracks(SPACE)
+    tracks = Tracks(SPACE)
     for frame in frames:
-        assert objects.observe(tracks, frame, cfg)
+        assert observe(tracks, frame, cfg)
     return tracks
 
 
@@ -90,7 +95,7 @@ def test_boxes_seen_from_a_walk_become_one_object_each_with_their_size():
     tracks = seen([sight(i, pose, [BED, OVEN] if i % 2 else [OVEN, BED]) for i, pose in enumerate(walk())])
     assert len(tracks.items) == 2
     for track in tracks.items.values():
-        vector = objects.descriptor(track.embeddings)
+        vector = descriptor(track.embeddings)
         low, high, axis = BED if vector[1] > vector[0] else OVEN
         assert vector[axis] > 0.97 and track.frames == 8
         found = track.box_m(CFG)
@@ -101,7 +106,7 @@ def test_boxes_seen_from_a_walk_become_one_object_each_with_their_size():
 def test_a_repeated_frame_changes_nothing():
     frame = sight(0, walk()[0], [BED])
     tracks = seen([frame])
-    assert not objects.observe(tracks, frame, CFG)
+    assert not observe(tracks, frame, CFG)
     assert [track.frames for track in tracks.items.values()] == [1]
 
 
@@ -113,9 +118,9 @@ def test_halves_become_one_object_when_two_views_join_them_and_the_older_id_stay
     frames = [sight(0, pose, [left, right]), sight(1, pose, [left, right])]
     tracks = seen(frames)
     assert sorted(tracks.items) == [0, 1]
-    objects.observe(tracks, sight(2, pose, [BED]), CFG)
+    observe(tracks, sight(2, pose, [BED]), CFG)
     assert sorted(tracks.items) == [0, 1]  # one look may err
-    objects.observe(tracks, sight(3, pose, [BED]), CFG)
+    observe(tracks, sight(3, pose, [BED]), CFG)
     assert sorted(tracks.items) == [0]
     assert tracks.merged == [(1, 0)]
 
@@ -124,7 +129,7 @@ def test_two_objects_with_the_same_cells_merge_into_the_older():
     tracks = seen([sight(0, walk()[3], [BED]), sight(1, walk()[3], [OVEN])])
     younger, older = tracks.items[1], tracks.items[0]
     younger.cells, younger.hits, younger.bounds = older.cells.copy(), older.hits.copy(), older.bounds.copy()
-    objects.observe(tracks, sight(2, walk()[3], [BED]), CFG)
+    observe(tracks, sight(2, walk()[3], [BED]), CFG)
     assert list(tracks.items) == [0] and tracks.merged == [(1, 0)]
     assert tracks.items[0].frames == 3
 
@@ -143,19 +148,19 @@ def test_two_objects_that_the_first_looks_took_for_one_are_split_and_the_one_see
     frames = [sight(i, pose, [BED]) for i in range(2)]
     frames += [sight(2 + i, pose, [left, right]) for i in range(12)]
     frames += [sight(14 + i, pose, [left]) for i in range(4)]
-    tracks = objects.Tracks(SPACE)
+    tracks = Tracks(SPACE)
     ids = []
     for frame in frames:
-        objects.observe(tracks, frame, CFG)
+        observe(tracks, frame, CFG)
         ids.append(sorted(tracks.items))
     assert ids[1] == [0] and ids[-1][0] == 0 and len(ids[-1]) == 2 and ids[-1] == ids[13]
     first, second = tracks.items.values()
     for track, truth in ((first, left), (second, right)):
         assert track.box_m(CFG) == pytest.approx(np.array(truth[:2]), abs=2 * CFG.cell_m)
-        assert objects.descriptor(track.embeddings)[truth[2]] > 0.9
+        assert descriptor(track.embeddings)[truth[2]] > 0.9
     assert first.frames > second.frames >= 10 and not first.sources & second.sources
-    again = objects.Tracks(SPACE, archive=dict(tracks.archive))
-    objects.renew(again, SPACE, 99, CFG)
+    again = Tracks(SPACE, archive=dict(tracks.archive))
+    renew(again, SPACE, 99, CFG)
     assert [set(track.sources) for track in again.items.values()] == [first.sources, second.sources]
 
 
@@ -165,13 +170,13 @@ def test_an_object_that_a_post_cuts_in_two_but_every_look_shows_whole_stays_one(
     clouds = [transform(inverse(pose), side(part, pose[:3, 3])) for part in parts]
     whole = sight(0, pose, [BED])
     points = np.concatenate(clouds).astype(np.float16)
-    tracks = objects.Tracks(SPACE)
+    tracks = Tracks(SPACE)
     for number in range(20):
         counts = np.array([len(points)], np.int32)
         frame = msgspec.structs.replace(whole, frame_id=number, points_camera_m=points, point_counts=counts)
-        objects.observe(tracks, frame, CFG)
+        observe(tracks, frame, CFG)
     (track,) = tracks.items.values()
-    assert len(objects._parts(track.firm(CFG.firm_share))) == 2 and track.frames == 20
+    assert len(connected(track.firm(CFG.firm_share))) == 2 and track.frames == 20
 
 
 def test_parts_against_a_flood_fill():
@@ -187,9 +192,9 @@ def test_parts_against_a_flood_fill():
             waiting -= close
             edge += close
         groups.append(group)
-    parts = objects._parts(np.sort(objects.packed(numbers)))
+    parts = connected(np.sort(packed(numbers)))
     assert len(groups) > 3
-    assert sorted(sorted(map(tuple, objects.unpacked(part).tolist())) for part in parts) == sorted(map(sorted, groups))
+    assert sorted(sorted(map(tuple, unpacked(part).tolist())) for part in parts) == sorted(map(sorted, groups))
     assert [len(part) for part in parts] == sorted(map(len, groups), reverse=True)
 
 
@@ -199,16 +204,16 @@ def test_what_later_frames_look_at_in_vain_was_no_object(surface_m, left):
     tracks = seen([sight(0, pose, [BED])])
     for number in range(1, CFG.patience_frames + 1):
         assert len(tracks.items) == 1
-        objects.observe(tracks, sight(number, pose, [], surface_m=surface_m), CFG)
+        observe(tracks, sight(number, pose, [], surface_m=surface_m), CFG)
     assert len(tracks.items) == left
 
 
 def test_centrality_by_hand():
     """Two alike at cosine 1 and an outlier at cosine 0: weights 1/2, 1/2, 0, so the outlier leaves no trace."""
     one, other = EYE[0], EYE[1]
-    assert np.allclose(objects.descriptor([one, one, other]), one)
-    assert np.allclose(objects.descriptor([one, other]), (one + other) / np.sqrt(2))  # none is central: alike
-    assert np.allclose(objects.descriptor([other]), other)
+    assert np.allclose(descriptor([one, one, other]), one)
+    assert np.allclose(descriptor([one, other]), (one + other) / np.sqrt(2))  # none is central: alike
+    assert np.allclose(descriptor([other]), other)
 
 
 def test_centrality_against_a_literal_loop():
@@ -219,16 +224,16 @@ def test_centrality_against_a_literal_loop():
     for k, row in enumerate(rows):
         cosines = [float(row @ rows[j]) for j in range(len(rows)) if j != k]
         total += max(sum(cosines) / len(cosines), 0.0) * row
-    assert np.abs(objects.descriptor(list(rows)) - total / np.linalg.norm(total)).max() < 1e-12
+    assert np.abs(descriptor(list(rows)) - total / np.linalg.norm(total)).max() < 1e-12
 
 
 def test_packed_cells_come_back_and_neighbours_are_near():
     rng = np.random.default_rng(0)
     numbers = rng.integers(-500, 500, (200, 3))
-    assert (objects.unpacked(objects.packed(numbers)) == numbers).all()
-    cells = np.sort(objects.packed(np.array([(0, 0, 0), (5, 5, 5)])))
-    assert objects.shared(cells, np.sort(objects.packed(np.array([(1, -1, 1)])))) == 0.5
-    assert objects.shared(cells, np.sort(objects.packed(np.array([(2, 0, 0)])))) == 0.0
+    assert (unpacked(packed(numbers)) == numbers).all()
+    cells = np.sort(packed(np.array([(0, 0, 0), (5, 5, 5)])))
+    assert shared(cells, np.sort(packed(np.array([(1, -1, 1)])))) == 0.5
+    assert shared(cells, np.sort(packed(np.array([(2, 0, 0)])))) == 0.0
 
 
 def test_a_pose_correction_moves_the_object_and_keeps_its_id():
@@ -240,8 +245,8 @@ def test_a_pose_correction_moves_the_object_and_keeps_its_id():
     tracks.next_id = 50
     wrong = {number: track.box_m(CFG) for number, track in tracks.items.items()}
     for index, pose in enumerate(poses):
-        objects.move(tracks, {index: pose})
-    objects.renew(tracks, SPACE, 99, CFG)
+        move(tracks, {index: pose})
+    renew(tracks, SPACE, 99, CFG)
     assert tracks.items.keys() == wrong.keys() and tracks.next_id == 50
     for number, track in tracks.items.items():
         assert (track.box_m(CFG) == truth.items[number].box_m(CFG)).all()
@@ -256,24 +261,24 @@ def test_a_renewal_in_slices_with_new_frames_between_equals_one_in_one_go():
     late = [sight(i, poses[i], [BED, OVEN]) for i in (6, 7)]
     whole, sliced = seen(frames), seen(frames)
     for tracks in (whole, sliced):
-        objects.move(tracks, dict(enumerate(poses[:6])))
-    objects.renew(whole, SPACE, 99, CFG)
+        move(tracks, dict(enumerate(poses[:6])))
+    renew(whole, SPACE, 99, CFG)
     for frame in late:
-        objects.observe(whole, frame, CFG)
+        observe(whole, frame, CFG)
     before = dict(sliced.items)
     for step in range(3):
-        assert objects.outdated(sliced, SPACE) and sliced.items == before
-        objects.renew(sliced, SPACE, 3, CFG)
+        assert outdated(sliced, SPACE) and sliced.items == before
+        renew(sliced, SPACE, 3, CFG)
         if step < 2:
-            objects.observe(sliced, late[step], CFG)
-    assert not objects.outdated(sliced, SPACE) and sliced.items.keys() == whole.items.keys() == before.keys()
+            observe(sliced, late[step], CFG)
+    assert not outdated(sliced, SPACE) and sliced.items.keys() == whole.items.keys() == before.keys()
     for number, track in whole.items.items():
         assert (sliced.items[number].cells == track.cells).all() and sliced.items[number].sources == track.sources
 
 
 def late(frames, cfg=CFG):
     """A map of objects that heard the third of some frames last, and then nothing any more."""
-    objects_of_map = ObjectMap(objects.Tracks(space=SPACE))
+    objects_of_map = ObjectMap(Tracks(space=SPACE))
     for frame in [*frames[:2], *frames[3:], frames[2]]:
         objects_of_map.observe(frame, cfg)
     return objects_of_map
@@ -297,7 +302,7 @@ def test_frames_that_came_late_are_put_in_their_place_when_no_more_come():
 
 
 def test_what_an_archive_has_lost_is_not_taken_from_the_objects_for_the_sake_of_order():
-    cfg = objects.TrackingConfig(archive_frames=4)
+    cfg = TrackingConfig(archive_frames=4)
     crooked = late([sight(i, pose, [BED]) for i, pose in enumerate(walk(8))], cfg)
     assert crooked.renew(SPACE, True, cfg) and crooked.tracks.items[0].frames == 8
 
@@ -308,25 +313,25 @@ def test_corrections_at_every_tick_do_not_keep_the_objects_as_they_were():
     shift = np.eye(4)
     for tick in range(12):
         shift[1, 3] += 0.01
-        objects.move(tracks, {i: shift @ pose for i, pose in enumerate(poses)})
-        objects.observe(tracks, sight(100 + tick, shift @ poses[0], [BED, OVEN]), CFG)
-        objects.renew(tracks, SPACE, 8, CFG)
+        move(tracks, {i: shift @ pose for i, pose in enumerate(poses)})
+        observe(tracks, sight(100 + tick, shift @ poses[0], [BED, OVEN]), CFG)
+        renew(tracks, SPACE, 8, CFG)
     assert tracks.items[0].frames > 8 and tracks.items[1].frames > 8
-    while objects.outdated(tracks, SPACE):
-        objects.renew(tracks, SPACE, 8, CFG)
+    while outdated(tracks, SPACE):
+        renew(tracks, SPACE, 8, CFG)
     assert tracks.items[0].frames == tracks.items[1].frames == 8 + 12
 
 
 def test_what_is_too_old_for_the_archive_is_neither_split_nor_lost_when_poses_change():
-    cfg = objects.TrackingConfig(archive_frames=6)
+    cfg = TrackingConfig(archive_frames=6)
     poses = walk(8)
     tracks = seen([sight(i, pose, [BED]) for i, pose in enumerate(poses[:4])], cfg)
     for i in range(6):
-        objects.observe(tracks, sight(10 + i, poses[i], [OVEN]), cfg)
+        observe(tracks, sight(10 + i, poses[i], [OVEN]), cfg)
     before = tracks.items[0].cells
-    assert objects._halves(tracks, tracks.items[0], before[:1], before[-1:], cfg) is None
-    objects.move(tracks, {10: poses[0]})
-    objects.renew(tracks, SPACE, 99, cfg)
+    assert splitting._halves(tracks, tracks.items[0], before[:1], before[-1:], cfg) is None
+    move(tracks, {10: poses[0]})
+    renew(tracks, SPACE, 99, cfg)
     assert sorted(tracks.items) == [0, 1] and (tracks.items[0].cells == before).all()
 
 
@@ -334,7 +339,7 @@ def test_embeddings_of_another_width_are_refused():
     tracks = seen([sight(0, walk()[0], [BED])])
     other = sight(1, walk()[1], [BED])
     wide = msgspec.structs.replace(other, embeddings=np.tile(other.embeddings, 2))
-    assert not objects.observe(tracks, wide, CFG) and len(tracks.archive) == 1
+    assert not observe(tracks, wide, CFG) and len(tracks.archive) == 1
 
 
 def test_beliefs_by_hand():
@@ -457,7 +462,7 @@ def test_only_objects_that_were_sought_by_the_priors_names_answer_what_it_holds(
     assert np.allclose(view.concepts.sum(axis=1), 1.0)
     assert (view.words > 0.9).all()
     assert view.answers == pytest.approx([word, word], abs=0.1) and (view.answers > 0).all() == (word > 0)
-    silent = Config(tracking=objects.TrackingConfig(unprompted_weight=0.0))
+    silent = Config(tracking=TrackingConfig(unprompted_weight=0.0))
     view = started(silent, **fields).feed(task(), prior(["kitchen", "bedroom"]), TICK).state.objects.view
     assert view.words == pytest.approx([word, word], abs=0.1)
 
@@ -472,7 +477,7 @@ def test_the_detectors_name_outweighs_the_encoders():
 
 
 def test_where_nothing_is_likely_enough_no_object_has_a_label_and_nothing_a_word():
-    cfg = Config(tracking=objects.TrackingConfig(label_least=1.0, unprompted_weight=0.0))
+    cfg = Config(tracking=TrackingConfig(label_least=1.0, unprompted_weight=0.0))
     positions, edges = place_grid(1)
     frames = [sight(i, pose, [BED, OVEN]) for i, pose in enumerate(walk())]
     run = Run(cfg).feed(place_delta(positions, edges), *frames, TICK, task(), prior(["kitchen", "bedroom"]), TICK, TICK)
@@ -501,10 +506,10 @@ def test_detections_of_another_space_wait_until_it_is_in_force():
     there = dict(run.objects)
     run.feed(*[sight(i, pose, [OVEN], space="other/space") for i, pose in enumerate(walk())], TICK)
     assert run.objects == there
-    objects.renew(run.state.objects.tracks, "other/space", 99, run.cfg.tracking)
+    renew(run.state.objects.tracks, "other/space", 99, run.cfg.tracking)
     assert [track.frames for track in run.state.objects.tracks.items.values()] == [8]
 
 
 def test_settings_out_of_range_are_refused():
     with pytest.raises(ValueError, match="shares"):
-        msgspec.convert({"match_overlap": 2.0}, objects.TrackingConfig)
+        msgspec.convert({"match_overlap": 2.0}, TrackingConfig)

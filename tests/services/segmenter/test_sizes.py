@@ -11,8 +11,9 @@ from prior_sg.services.prior_gateway.core.config import Config
 from prior_sg.services.prior_gateway.outside import library
 from prior_sg.services.segmenter.core.map.received import ReceivedGraph, apply
 from prior_sg.services.segmenter.core.objects import names, sizes
+from prior_sg.services.segmenter.core.objects.cells import packed
 from prior_sg.services.segmenter.core.objects.sizes import Boxes, SizeConfig
-from prior_sg.services.segmenter.core.objects.tracks import Track, TrackingConfig, packed
+from prior_sg.services.segmenter.core.objects.track import Track, TrackingConfig
 from tests.help.world import place_delta
 
 CELL_M = 0.15

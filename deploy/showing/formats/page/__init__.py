@@ -20,8 +20,8 @@ import numpy as np
 from prior_sg.deploy.json_text import json_text
 from prior_sg.deploy.showing.colors import label_colors
 from prior_sg.deploy.showing.formats.page.steps import steps_of
-from prior_sg.deploy.showing.map import FURNITURE_SHARE, WALL_SHARE, layers_of
 from prior_sg.deploy.showing.material import Material, Moment
+from prior_sg.deploy.showing.top_view import FURNITURE_SHARE, WALL_SHARE, layers_of
 from prior_sg.schemas.places import VoxelMap
 from prior_sg.schemas.scene import Scene
 from prior_sg.schemas.status import Loss

@@ -38,7 +38,7 @@ from prior_sg.services.ingest.sources.base import (
     truth_beside,
 )
 from prior_sg.services.ingest.sources.clouds.swept import Drawing, Lidar, view_entries
-from prior_sg.services.ingest.sources.generic import COLORS, PICTURES, folder_of
+from prior_sg.services.ingest.sources.own_files import COLORS, PICTURES, folder_of
 from prior_sg.services.ingest.sources.tables import read_json, stamps_ns
 
 NAME = "lidar"

@@ -20,7 +20,7 @@ The change is solved as a local problem with fixed surroundings, which grows whi
 2. The alpha-beta-swaps that the change can have made profitable are tried, then those that their own changes can have.
 
 Both stop when `expired()` says so; the labels are valid at any time and the energy of the field in hand never rises.
-Once `pending` is 0, no alpha-beta-swap on the whole field lowers the energy (see `moves`), as after a fresh solve.
+Once `pending` is 0, no alpha-beta-swap on the whole field lowers the energy (see `swap_moves`), as after a fresh solve.
 Idle time also goes into longer message passing over the whole field, at the start and whenever much has changed.
 """
 
@@ -30,7 +30,7 @@ import msgspec
 import numpy as np
 
 from prior_sg.services.compiled import compiled
-from prior_sg.services.segmenter.core.energy import swap_moves
+from prior_sg.services.segmenter.core.energy import swap_moves, swap_work
 from prior_sg.services.segmenter.core.energy.maxflow import CUTS, MinCut, min_cut_in_use
 from prior_sg.services.segmenter.core.energy.mrf import Field, least_gain
 from prior_sg.services.segmenter.core.energy.trws import empty_messages, lay_down, run_pass, take_up
@@ -77,7 +77,7 @@ class Solver:
         self._graph: Arcs = no_arcs()
         self._unary = np.zeros((0, 0))
         self._pairwise = np.zeros((0, 0))
-        self._work = swap_moves.empty_work(0, 0, 0)
+        self._work = swap_work.empty_work(0, 0, 0)
         self._least_gain = 0.0
         self._changes = 0  # places reported dirty since message passing last went over the whole field
         self._unproposed = np.zeros(0, np.int64)  # rows around which message passing has yet to propose
@@ -85,7 +85,7 @@ class Solver:
     @property
     def pending(self) -> int:
         """Places at which a swap is still to be tried or around which labels are to be proposed; 0 when settled."""
-        return swap_moves.waiting(self._work, swap_moves.DEEP) + len(self._unproposed) + self._worn
+        return swap_work.waiting(self._work, swap_work.DEEP) + len(self._unproposed) + self._worn
 
     def update(
         self,
@@ -100,17 +100,17 @@ class Solver:
         """Labels (place,) for `field`, starting from `labels`, by work near the change only; see the module."""
         self.take(field, labels, dirty=dirty, previous=previous, ties=ties)
         self._propose_near(expired)
-        self._swap(swap_moves.NEAR, expired)
+        self._swap(swap_work.NEAR, expired)
         return self.labels.copy()
 
     def drain(self, expired: Expired = never) -> np.ndarray:
         """Go on with what is pending, on the whole field; the labels (place,) so far."""
         self._propose_near(expired)
-        self._swap(swap_moves.DEEP, expired)
+        self._swap(swap_work.DEEP, expired)
         if self._worn and not expired():
             if self._propose(np.arange(len(self.labels)), self.settings.idle_round_trips, expired):
                 self._changes = 0
-            self._swap(swap_moves.DEEP, expired)
+            self._swap(swap_work.DEEP, expired)
         return self.labels.copy()
 
     @property
@@ -121,7 +121,7 @@ class Solver:
     def _swap(self, depth: int, expired: Expired) -> None:
         settings, arrays = self.settings, (self._graph, self._unary, self._pairwise, self.labels, self._work)
         limits = swap_moves.Limits(depth, settings.near, settings.compiled_up_to, settings.chunk, self._least_gain)
-        while swap_moves.waiting(self._work, depth) and not expired():
+        while swap_work.waiting(self._work, depth) and not expired():
             swap_moves.run_swaps(*arrays, self._cut, limits)
 
     def take(
@@ -155,7 +155,7 @@ class Solver:
             dirty = np.flatnonzero(dirty)
         if not same_edges:
             if same_rows and graph.neighbours is self._graph.neighbours:
-                swap_moves.sort_queues(self._work)
+                swap_work.sort_queues(self._work)
             else:
                 self._carry(before, origin, field, graph)
         given, found = np.asarray(labels), self.labels
@@ -165,8 +165,8 @@ class Solver:
         if not everything:
             known = np.flatnonzero(origin >= 0)
             others = np.flatnonzero(given != found) if same_rows else known[given[known] != found[origin[known]]]
-            swap_moves.flag_around(others, swap_moves.NEAR, graph, self._work)
-        swap_moves.flag_all(dirty, swap_moves.DEEP if before is None else swap_moves.NEAR, self._work)
+            swap_work.flag_around(others, swap_work.NEAR, graph, self._work)
+        swap_work.flag_all(dirty, swap_work.DEEP if before is None else swap_work.NEAR, self._work)
         self._unproposed = np.union1d(self._unproposed, dirty).astype(np.int64)
         self._changes += len(dirty)
         self._least_gain = max(0.0 if before is None else self._least_gain, least_gain(unary[dirty]))
@@ -175,14 +175,14 @@ class Solver:
         """Scratch space for new rows and arcs, with what was pending before on the rows where it is now."""
         old_work, old_unproposed = self._work, self._unproposed
         arcs, (count, label_count) = len(graph.neighbours), field.unary.shape
-        self._work = swap_moves.empty_work(count, label_count, arcs)
+        self._work = swap_work.empty_work(count, label_count, arcs)
         self._messages = empty_messages(count, arcs, field.pairwise, np.float32)
         self._unproposed = np.zeros(0, np.int64)
         if before is None:
             return
         known = np.flatnonzero(origin >= 0)
         self._work.pending[known] = old_work.pending[origin[known]]
-        swap_moves.requeue(self._work)
+        swap_work.requeue(self._work)
         waits = np.zeros(len(old_work.mark), np.bool_)
         waits[old_unproposed] = True
         self._unproposed = known[waits[origin[known]]]
@@ -201,7 +201,7 @@ class Solver:
             round_trip(rows, labels, *scene, messages, self._work.mark, self._least_gain)
             trips += 1
         lay_down(rows, messages)
-        swap_moves.flag_around(rows[labels[rows] != before], swap_moves.NEAR, graph, self._work)
+        swap_work.flag_around(rows[labels[rows] != before], swap_work.NEAR, graph, self._work)
         return trips > 0 or not round_trips
 
     def _propose_near(self, expired: Expired) -> None:

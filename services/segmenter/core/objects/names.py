@@ -11,7 +11,8 @@ from prior_sg.services.segmenter.core.experts.context import standardised
 from prior_sg.services.segmenter.core.map.received import ReceivedGraph
 from prior_sg.services.segmenter.core.objects import sizes
 from prior_sg.services.segmenter.core.objects.sizes import SizeConfig
-from prior_sg.services.segmenter.core.objects.tracks import Track, TrackingConfig, Tracks, descriptor
+from prior_sg.services.segmenter.core.objects.track import Track, TrackingConfig, descriptor
+from prior_sg.services.segmenter.core.objects.tracks import Tracks
 
 
 class Named(NamedTuple):

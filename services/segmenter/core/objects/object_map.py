@@ -8,10 +8,11 @@ import numpy as np
 from prior_sg.schemas.objects import Detections, ObjectDelta, SceneObject
 from prior_sg.schemas.priors import Prior
 from prior_sg.services.segmenter.core.experts.context import ObjectView
-from prior_sg.services.segmenter.core.objects import tracks
+from prior_sg.services.segmenter.core.objects import association, renewal, tracks
 from prior_sg.services.segmenter.core.objects.ledger import ObjectLedger
 from prior_sg.services.segmenter.core.objects.names import Named
-from prior_sg.services.segmenter.core.objects.tracks import TrackingConfig, Tracks
+from prior_sg.services.segmenter.core.objects.track import TrackingConfig
+from prior_sg.services.segmenter.core.objects.tracks import Tracks
 from prior_sg.services.segmenter.core.succession import same_objects
 
 
@@ -25,7 +26,7 @@ class ObjectMap:
 
     def observe(self, detections: Detections, cfg: TrackingConfig) -> bool:
         """Associate one frame's detections; False for those that cannot be used."""
-        return tracks.observe(self.tracks, detections, cfg)
+        return association.observe(self.tracks, detections, cfg)
 
     def holds(self, detections: Detections) -> bool:
         """Whether these are here already."""
@@ -65,7 +66,7 @@ class ObjectMap:
         if rests:
             tracks.in_order(self.tracks)
         if tracks.outdated(self.tracks, space):
-            tracks.renew(self.tracks, space, cfg.renew_frames_at_rest if rests else cfg.renew_frames, cfg)
+            renewal.renew(self.tracks, space, cfg.renew_frames_at_rest if rests else cfg.renew_frames, cfg)
         return self.tracks.space == space
 
     def tell(self, robot: str, epoch: int, stamp_ns: int, *, now: dict[int, Named], digest: str) -> ObjectDelta | None:

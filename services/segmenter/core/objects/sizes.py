@@ -20,7 +20,8 @@ import scipy
 
 from prior_sg.schemas.priors import ObjectPrior
 from prior_sg.services.segmenter.core.map.received import ReceivedGraph
-from prior_sg.services.segmenter.core.objects.tracks import Track, TrackingConfig, unpacked
+from prior_sg.services.segmenter.core.objects.cells import unpacked
+from prior_sg.services.segmenter.core.objects.track import Track, TrackingConfig
 
 ANGLES = np.radians(np.arange(0, 90, 5))  # directions tried for the sides of a rotated thing
 
