@@ -5,11 +5,14 @@ its start.
 """
 
 import functools
+import hashlib
 import logging
+import marshal
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from importlib.util import find_spec
 from pathlib import Path
+from types import CodeType, ModuleType
 from typing import Any, TypeVar, cast
 
 from prior_sg.services.folders import temporary_cache
@@ -93,8 +96,52 @@ def _numba() -> Any:
 
 
 def _kept(function: Callable, options: dict[str, Any]) -> Callable:
+    """Compiled code as it is on the disk, unless it was made of something else. numba looks at the function's own file
+    alone: code made with another module's loops and constants would outlast a change of these, as in an upgrade.
+    """
     kept: Callable = _numba().njit(cache=True, nogil=True, **options)(function)
+    index = cast(Any, kept)._cache._cache_file
+    index._source_stamp = (index._source_stamp, made_of(function))
     return kept
+
+
+def made_of(function: Callable) -> str:
+    """Digest of what else goes into a function's machine code: the code of the loops that it calls, and of those that
+    these call, and the values that they name."""
+    digest = hashlib.blake2b(digest_size=16)
+    waiting, met = [function], {function}
+    while waiting:
+        for name, value in _named(waiting.pop()):
+            if isinstance(value, Loop):
+                called = value.py_func
+                digest.update(marshal.dumps((name, called.__code__)))
+                if called not in met:
+                    met.add(called)
+                    waiting.append(called)
+            else:
+                digest.update(repr((name, value.tolist() if hasattr(value, "tolist") else value)).encode())
+    return digest.hexdigest()
+
+
+def _named(function: Callable) -> Iterator[tuple[str, Any]]:
+    """Loops and values that a function's code names, also as members of modules of ours, in order."""
+    names = sorted({name for code in _codes(function.__code__) for name in code.co_names})
+    known: dict[str, Any] = function.__globals__
+    modules = [value for name in names if isinstance(value := known.get(name), ModuleType)]
+    ours = [vars(module) for module in modules if module.__name__.partition(".")[0] == __name__.partition(".")[0]]
+    for members in (known, *ours):
+        for name in names:
+            value = members.get(name)
+            if isinstance(value, Loop | int | float | str | tuple) or hasattr(value, "tolist"):
+                yield name, value
+
+
+def _codes(code: CodeType) -> Iterator[CodeType]:
+    """A function's code, and that of the functions in it."""
+    yield code
+    for inner in code.co_consts:
+        if isinstance(inner, CodeType):
+            yield from _codes(inner)
 
 
 def _keep_in_temporary_folder() -> None:

@@ -94,3 +94,48 @@ def test_numba_is_loaded_by_the_first_call_and_loops_call_and_inline_each_other(
     assert done.stdout == "False 42 loop\n", done.stderr
     kept = {file.name.split("-")[0].split(".")[1] for file in (tmp_path / "mine").rglob("*.nbi")}
     assert kept == {"called", "loop"}
+
+
+CALLER = """
+from prior_sg.services.compiled import compiled
+import {module} as other
+from {module} import LEAST, called
+
+@compiled()
+def loop(x):
+    return called(x) + LEAST
+
+@compiled()
+def by_module(x):
+    return other.called(x)
+
+print(loop(20), by_module(20), *(sum(one.met()) for one in (loop, by_module)), loop.met()[1], by_module.met()[1])
+"""
+CALLED = """
+from prior_sg.services.compiled import compiled
+
+LEAST = {least}
+
+@compiled()
+def deepest(x):
+    return {deepest}
+
+@compiled()
+def called(x):
+    return deepest(x)
+"""
+
+
+def test_what_is_kept_is_made_anew_when_what_it_calls_or_names_has_changed_in_another_file(program, tmp_path):
+    program.write_text(CALLER.format(module="called_by_it"))
+
+    def tells(least, deepest):
+        (program.parent / "called_by_it.py").write_text(CALLED.format(least=least, deepest=deepest))
+        done = run(program, NUMBA_CACHE_DIR=str(tmp_path / "mine"))
+        assert done.returncode == 0, done.stderr
+        return done.stdout.split()
+
+    assert tells(1, "x * 2") == ["41", "40", "1", "1", "0", "0"]
+    assert tells(1, "x * 2") == ["41", "40", "1", "1", "1", "1"]  # read from the disk
+    assert tells(2, "x * 2") == ["42", "40", "1", "1", "0", "1"]
+    assert tells(2, "x * 3") == ["62", "60", "1", "1", "0", "0"]
