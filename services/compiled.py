@@ -19,6 +19,7 @@ from prior_sg.services.folders import temporary_cache
 
 F = TypeVar("F", bound=Callable)
 log = logging.getLogger(__name__)
+WITHOUT_REFERENCES = 2  # form of marshal that tells equal code alike; later ones depend on who else holds its parts
 
 if find_spec("numba") is None:  # told at the start, not at the first input
     raise ModuleNotFoundError("No module named 'numba'", name="numba")
@@ -114,7 +115,7 @@ def made_of(function: Callable) -> str:
         for name, value in _named(waiting.pop()):
             if isinstance(value, Loop):
                 called = value.py_func
-                digest.update(marshal.dumps((name, called.__code__)))
+                digest.update(marshal.dumps((name, called.__code__), WITHOUT_REFERENCES))
                 if called not in met:
                     met.add(called)
                     waiting.append(called)
