@@ -125,10 +125,10 @@ def test_what_an_explorer_has_seen_around_its_openings():
     before = at_the_kitchen()
     assert before.touching == [2.0] and before.nearby == [0.0]
     assert before.storey_m2[0] == pytest.approx(explorer.known.sum() * CELL_M**2, rel=0.1)
-    assert fading(3.5, cfg.border_m) < before.at_border[0] < 1
+    assert fading(np.array(3.5), cfg.border_m) < before.at_border[0] < 1
     explorer.known |= PLAN.regions == 1
     after = at_the_kitchen()
-    assert fading(8.0, cfg.nearby_m) < after.nearby[0] < fading(4.0, cfg.nearby_m)
+    assert fading(np.array(8.0), cfg.nearby_m) < after.nearby[0] < fading(np.array(4.0), cfg.nearby_m)
     assert after.at_border == before.at_border
 
 

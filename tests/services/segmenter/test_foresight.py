@@ -240,14 +240,14 @@ def test_what_the_map_holds_around_an_opening():
     way = Transition(region=8, edge=(0, 1), position_m=(1.0, 3.5, 1.0), clearance_m=0.4, door=True)
     held = {
         7: region(7, "hall", [8, 9], hull_m=square(0, 0), position_m=(1, 0, 1), transitions=[way]),
-        8: region(8, "bath", [7], hull_m=square(3, 0), position_m=(4, 1, 1), area_m2=4.0),
+        8: region(8, "bath", [7], hull_m=[(3, 0), *square(3, 0)], position_m=(4, 1, 1), area_m2=4.0),
         9: region(9, "bath", [7], hull_m=square(1, 1), position_m=(1, 1, 1), place_count=1),
         10: region(10, "kitchen", hull_m=square(0, 0), position_m=(1, 1, 4)),
     }
     result = around_of(openings, held, CFG)
     assert result.touching == [2.0] and result.storey_m2 == [13.0]
-    assert result.nearby == pytest.approx([fading(2.0, CFG.nearby_m) + fading(3 * CFG.steepness, CFG.nearby_m)])
-    assert result.at_border == pytest.approx([fading(2.0, CFG.border_m)])
+    assert result.nearby == pytest.approx([fading(np.array((2.0, 3 * CFG.steepness)), CFG.nearby_m).sum()])
+    assert result.at_border == pytest.approx(fading(np.array([2.0]), CFG.border_m))
     alone = around_of(openings, {7: region(7, "hall")}, CFG)
     assert (alone.nearby, alone.at_border, alone.storey_m2) == ([0.0], [0.0], [0.0])
 

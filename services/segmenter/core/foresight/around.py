@@ -8,10 +8,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 
 from prior_sg.schemas.regions import Region
 from prior_sg.services.segmenter.core.foresight.config import ForesightConfig
 from prior_sg.services.segmenter.core.foresight.openings import Openings
+
+TINY_M2 = 1e-9  # corners of small outlines are rounded onto each other
 
 
 @dataclass(frozen=True)
@@ -38,7 +41,7 @@ def around_of(openings: Openings, regions: Mapping[int, Region], cfg: ForesightC
     touching = np.array([len(regions[region].neighbour_ids) for region in openings.regions.tolist()], float)
     large = [one for one in regions.values() if one.place_count >= cfg.least_places and one.hull_m]
     ways_m = np.array([way.position_m for one in regions.values() for way in one.transitions]).reshape(-1, 3)
-    off_m = np.linalg.norm(openings.beyond_m[:, None] - ways_m[None], axis=2)
+    off_m = scipy.spatial.distance.cdist(openings.beyond_m, ways_m)
     heights_m = np.array([one.position_m[2] for one in large])
     areas_m2 = np.array([one.area_m2 for one in large])
     rise_m = np.abs(openings.positions_m[:, 2:] - heights_m)
@@ -60,9 +63,10 @@ def _distances_m(points_m: np.ndarray, hulls_m: list[np.ndarray]) -> np.ndarray:
     starts = np.cumsum([0, *(len(hull) for hull in hulls_m[:-1])])
     corners = np.concatenate(hulls_m)
     sides = np.concatenate([np.roll(hull, -1, axis=0) - hull for hull in hulls_m])
-    off = points_m[:, None] - corners
-    along = np.clip((off * sides).sum(axis=2) / (sides**2).sum(axis=1), 0.0, 1.0)
-    away_m = np.linalg.norm(off - along[:, :, None] * sides, axis=2)
-    left = sides[:, 0] * off[:, :, 1] - sides[:, 1] * off[:, :, 0]
-    inside = np.minimum.reduceat(left, starts, axis=1) >= 0
-    return np.where(inside, 0.0, np.minimum.reduceat(away_m, starts, axis=1))
+    (x_m, y_m), (across_m, along_m) = corners.T, sides.T
+    off_x_m, off_y_m = points_m[:, :1] - x_m, points_m[:, 1:] - y_m
+    sides_m2 = np.maximum(across_m**2 + along_m**2, TINY_M2)
+    share = np.clip((off_x_m * across_m + off_y_m * along_m) / sides_m2, 0.0, 1.0)
+    away_m2 = (off_x_m - share * across_m) ** 2 + (off_y_m - share * along_m) ** 2
+    inside = np.minimum.reduceat(across_m * off_y_m - along_m * off_x_m, starts, axis=1) >= 0
+    return np.where(inside, 0.0, np.sqrt(np.minimum.reduceat(away_m2, starts, axis=1)))
