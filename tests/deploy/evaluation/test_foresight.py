@@ -269,6 +269,18 @@ def test_chances_are_judged_against_how_often_things_happen():
     assert told["within_brier_rate"] == told["missing_brier_rate"] == pytest.approx(2 / 9)
     said = beyond(walk[0].views, expected(home_trial().prior, walk[0].found, ForesightConfig()), ForesightConfig())
     assert told["within_brier"] == pytest.approx(((said.within[0] - [0, 1, 0]) ** 2).mean())
+    assert told["within_nll"] == pytest.approx(-np.log(np.abs(said.within[0] - [1, 0, 1])).mean())
+    assert "within_right" not in told and "within_nll_error" not in told
+
+
+def test_chances_are_judged_by_which_of_two_openings_they_prefer():
+    """The kitchen is behind the wide opening in one world, behind the narrow one in the other; the bath behind both."""
+    walks = []
+    for wide in (True, False):
+        met = np.array([[False, True, wide], [False, True, not wide], [False, True, not wide]])
+        walks.append(([moment([SAME] * 3, np.array([4.0, 0.7, 0.7]), met=met)], home_trial().prior))
+    for walk, right in zip(([walks[0]], [walks[1]], walks), (1.0, 0.0, 0.5), strict=True):
+        assert chance_figures(walk, ForesightConfig())["within_right"] == right
 
 
 def test_fitting_learns_from_maps_which_openings_lead_anywhere():
