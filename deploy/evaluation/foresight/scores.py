@@ -90,7 +90,8 @@ def chance_figures(worlds: Sequence[tuple[Sequence[Moment], Prior]], cfg: Foresi
     (`said`), how often it was so (`true`); `rate` is the score of whoever knows nothing but that. Of what begins behind
     openings, means over worlds as well: the likelihood, and how often of two openings of one moment the one that a
     region begins behind was given the larger chance (`right`; a tie is half right)."""
-    nll, right = [], []
+    nll: list[float] = []
+    right: list[float] = []
     within: list[tuple[np.ndarray, np.ndarray]] = []
     missing: list[tuple[np.ndarray, np.ndarray]] = []
     for moments, prior in worlds:
@@ -103,9 +104,9 @@ def chance_figures(worlds: Sequence[tuple[Sequence[Moment], Prior]], cfg: Foresi
                 rights += _rights(said.within, moment.met)
         if len(within) > first:
             chance, there = (np.concatenate(column) for column in zip(*within[first:], strict=True))
-            nll.append(-np.log(np.maximum(np.where(there, chance, 1 - chance), LEAST)).mean())
+            nll.append(-float(np.log(np.maximum(np.where(there, chance, 1 - chance), LEAST)).mean()))
         if rights:
-            right.append(np.mean(rights))
+            right.append(float(np.mean(rights)))
     found = _means({"within_nll": nll, "within_right": right})
     for name, pairs in (("within", within), ("missing", missing)):
         chance, there = (np.concatenate(column).astype(float) for column in zip(*pairs, strict=True))

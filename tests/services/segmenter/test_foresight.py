@@ -232,8 +232,8 @@ def square(x_m, y_m, side_m=3.0):
 
 
 def test_what_the_map_holds_around_an_opening():
-    """One looks north out of region 7 to (1, 1.5, 1): regions that were found count as they are near, its own and
-    pieces do not, and one above it is far and on another storey."""
+    """One looks north out of region 7, over (1, 0.5, 1) to (1, 1.5, 1): regions that were found count as they are near,
+    its own and pieces do not, and one above it is far and on another storey."""
     graph, places = a_map()
     openings = openings_of(graph, places, opened((10, (0, 1, 0), 2.0)), CFG)
     np.testing.assert_allclose(openings.beyond_m, [[1.0, 0.5 + CFG.beyond_m, 1.0]])
@@ -247,7 +247,7 @@ def test_what_the_map_holds_around_an_opening():
     result = around_of(openings, held, CFG)
     assert result.touching == [2.0] and result.storey_m2 == [13.0]
     assert result.nearby == pytest.approx([fading(np.array((2.0, 3 * CFG.steepness)), CFG.nearby_m).sum()])
-    assert result.at_border == pytest.approx(fading(np.array([2.0]), CFG.border_m))
+    assert result.at_border == pytest.approx(fading(np.array([3.0]), CFG.border_m))
     alone = around_of(openings, {7: region(7, "hall")}, CFG)
     assert (alone.nearby, alone.at_border, alone.storey_m2) == ([0.0], [0.0], [0.0])
 

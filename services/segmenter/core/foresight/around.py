@@ -41,7 +41,9 @@ def around_of(openings: Openings, regions: Mapping[int, Region], cfg: ForesightC
     touching = np.array([len(regions[region].neighbour_ids) for region in openings.regions.tolist()], float)
     large = [one for one in regions.values() if one.place_count >= cfg.least_places and one.hull_m]
     ways_m = np.array([way.position_m for one in regions.values() for way in one.transitions]).reshape(-1, 3)
-    off_m = scipy.spatial.distance.cdist(openings.beyond_m, ways_m)
+    outward_m = openings.beyond_m - openings.positions_m
+    outward = outward_m / np.linalg.norm(outward_m, axis=1, keepdims=True)
+    off_m = scipy.spatial.distance.cdist(openings.beyond_m - cfg.beyond_m * outward, ways_m)
     heights_m = np.array([one.position_m[2] for one in large])
     areas_m2 = np.array([one.area_m2 for one in large])
     rise_m = np.abs(openings.positions_m[:, 2:] - heights_m)
