@@ -50,21 +50,17 @@ class Rows(NamedTuple):
     goes_on: np.ndarray  # (event,) bool
     other: np.ndarray  # (event of another region, label, feature)
     came: np.ndarray  # (event of another region,) label
-    within: np.ndarray  # (event and label, feature)
-    met: np.ndarray  # (event and label,) bool
 
 
 def fitted(walks: Sequence[Walk], cfg: ForesightConfig = ForesightConfig()) -> ForesightConfig:
     """The settings that make what was revealed likeliest."""
     rows = [_rows(*walk, cfg) for walk in walks if any(len(moment.outcomes) for moment in walk[0])]
     same = _least(lambda weights, one: _loss(weights, one.same, one.goes_on), rows, np.zeros(rows[0].same.shape[1]))
-    within = _least(lambda weights, one: _loss(weights, one.within, one.met), rows, within_weights(cfg), LOOSE)
     other = _least(_other_loss, [one for one in rows if len(one.came)], np.array(THOUGHT))
     adjacency, existence, again, once, often, count, met = np.round(other, 2).tolist()
     *by_width, by_area, by_spread = np.round(same, 2).tolist()
-    cfg = msgspec.structs.replace(cfg, **dict(zip(WITHIN, np.round(within, 2).tolist(), strict=True)))
     return msgspec.structs.replace(
-        _with_missing(walks, cfg),
+        _with_missing(walks, fitted_within(walks, cfg)),
         same_by_width=tuple(by_width),
         same_by_area=by_area,
         same_by_spread=by_spread,
@@ -76,6 +72,13 @@ def fitted(walks: Sequence[Walk], cfg: ForesightConfig = ForesightConfig()) -> F
         found_count=count,
         met=met,
     )
+
+
+def fitted_within(walks: Sequence[Walk], cfg: ForesightConfig) -> ForesightConfig:
+    """The settings with the best weights of what begins behind an opening."""
+    rows = [_within(*walk, cfg) for walk in walks if any(len(moment.outcomes) for moment in walk[0])]
+    within = _least(lambda weights, one: _loss(weights, *one), rows, within_weights(cfg), LOOSE)
+    return msgspec.structs.replace(cfg, **dict(zip(WITHIN, np.round(within, 2).tolist(), strict=True)))
 
 
 def fitted_to_maps(maps: Sequence[Walk], walks: Sequence[Walk], cfg: ForesightConfig) -> ForesightConfig:
@@ -99,16 +102,21 @@ def _rows(walk: Sequence[Moment], prior: Prior, cfg: ForesightConfig) -> Rows:
     chains = [expected(prior, moment.found, cfg) for moment in kept]
     same = [same_features(moment.views, chain.spread, cfg) for moment, chain in zip(kept, chains, strict=True)]
     other = [features(prior, moment.found)[moment.views.beliefs.argmax(axis=1)] for moment in kept]
-    within = [
-        within_features(moment.views, chain, len(moment.outcomes)) for moment, chain in zip(kept, chains, strict=True)
-    ]
     changes = came != SAME
     return Rows(
         np.concatenate(same),
         ~changes,
         np.concatenate(other)[changes],
         came[changes],
-        np.concatenate([one.reshape(-1, one.shape[2]) for one in within]),
+    )
+
+
+def _within(walk: Sequence[Moment], prior: Prior, cfg: ForesightConfig) -> tuple[np.ndarray, np.ndarray]:
+    """What the model reads of each label at each opening (event and label, feature), and whether it begins there."""
+    kept = [moment for moment in walk if len(moment.outcomes)]
+    rows = [within_features(moment.views, expected(prior, moment.found, cfg), len(moment.outcomes)) for moment in kept]
+    return (
+        np.concatenate([one.reshape(-1, one.shape[2]) for one in rows]),
         np.concatenate([moment.met.reshape(-1) for moment in kept]),
     )
 
@@ -167,14 +175,18 @@ def main() -> None:
     parser.add_argument(
         "--maps", nargs="*", default=[], metavar="world:KIND:SEEDS", help="maps that are fitted to, too"
     )
-    parser.add_argument("--keep", action="store_true", help="what explorers alone tell stays as it is set")
+    kept = parser.add_mutually_exclusive_group()
+    kept.add_argument("--keep", action="store_true", help="what explorers alone tell stays as it is set")
+    kept.add_argument("--within", action="store_true", help="only what begins behind openings is fitted")
     given = parser.parse_args()
     walks = []
     for kind in given.kinds.split(","):
         for seed in TUNED[: given.seeds]:
             one = trial(kind, seed)
             walks.append((list(moments(one)), one.prior))
-    cfg = ForesightConfig() if given.keep else fitted(walks)
+    cfg = ForesightConfig()
+    if not given.keep:
+        cfg = (fitted_within if given.within else fitted)(walks, cfg)
     names = [name for text in given.maps for name in named_worlds(text)]
     perceiver = Perceiver({}, Cache(CACHE), lambda *_: None, ENCODER)
     maps = [mapped(name.kind, name.seed, perceiver) for name in names]

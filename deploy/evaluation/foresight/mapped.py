@@ -100,7 +100,7 @@ def _moment(state: State, ground: Ground, prior: Prior) -> Moment:
     new = (seen_m2 < FOUND_M2) & (ground.labels >= 0) & ground.walkable
     outcomes, met, led = behind(openings, ground, known, new, cfg)
     return Moment(
-        views_of(openings, state.regions.known),
+        views_of(openings, state.regions.known, cfg),
         found_in(state.regions.known, prior, cfg),
         outcomes,
         met,

@@ -75,12 +75,7 @@ def figures(worlds: Sequence[Judged]) -> dict[str, float]:
         "top1_another": [(world.ranks_another[world.another] < 1.5).mean() for world in worlds if world.another.any()],
         "top3_another": [(world.ranks_another[world.another] <= 3).mean() for world in worlds if world.another.any()],
     }
-    found = {name: float(np.mean(values)) for name, values in one.items() if values}
-    found |= {
-        f"{name}_error": float(np.std(values, ddof=1) / len(values) ** 0.5)
-        for name, values in one.items()
-        if len(values) > 1
-    }
+    found = _means(one)
     sure = np.concatenate([world.sure for world in worlds])
     right = np.concatenate([world.ranks < 1.5 for world in worlds]).astype(float)
     return found | {
@@ -92,16 +87,27 @@ def figures(worlds: Sequence[Judged]) -> dict[str, float]:
 
 def chance_figures(worlds: Sequence[tuple[Sequence[Moment], Prior]], cfg: ForesightConfig) -> dict[str, float]:
     """Calibration and Brier score of what is said to begin behind each opening, and to be missing: how often on average
-    (`said`), how often it was so (`true`); `rate` is the score of whoever knows nothing but that."""
+    (`said`), how often it was so (`true`); `rate` is the score of whoever knows nothing but that. Of what begins behind
+    openings, means over worlds as well: the likelihood, and how often of two openings of one moment the one that a
+    region begins behind was given the larger chance (`right`; a tie is half right)."""
+    nll: list[float] = []
+    right: list[float] = []
     within: list[tuple[np.ndarray, np.ndarray]] = []
     missing: list[tuple[np.ndarray, np.ndarray]] = []
     for moments, prior in worlds:
+        first, rights = len(within), []
         for moment in moments:
             if len(moment.outcomes):
                 said = beyond(moment.views, expected(prior, moment.found, cfg), cfg)
                 within.append((said.within.reshape(-1), moment.met.reshape(-1)))
                 missing.append((said.missing, moment.left))
-    found = {}
+                rights += _rights(said.within, moment.met)
+        if len(within) > first:
+            chance, there = (np.concatenate(column) for column in zip(*within[first:], strict=True))
+            nll.append(-float(np.log(np.maximum(np.where(there, chance, 1 - chance), LEAST)).mean()))
+        if rights:
+            right.append(float(np.mean(rights)))
+    found = _means({"within_nll": nll, "within_right": right})
     for name, pairs in (("within", within), ("missing", missing)):
         chance, there = (np.concatenate(column).astype(float) for column in zip(*pairs, strict=True))
         found[f"{name}_ece"] = calibration_error(chance, there)
@@ -109,6 +115,27 @@ def chance_figures(worlds: Sequence[tuple[Sequence[Moment], Prior]], cfg: Foresi
         found[f"{name}_brier"] = float(((chance - there) ** 2).mean())
         found[f"{name}_brier_rate"] = float(((there.mean() - there) ** 2).mean())
     return found
+
+
+def _rights(chances: np.ndarray, met: np.ndarray) -> list[float]:
+    """Of each label that begins behind some of the openings and not behind others, how often the chances (opening,
+    label) are in the right order."""
+    found = []
+    for label in np.flatnonzero(met.any(axis=0) & ~met.all(axis=0)).tolist():
+        there = met[:, label]
+        ahead = chances[there, label][:, None] - chances[~there, label]
+        found.append(float((ahead > 0).mean() + (ahead == 0).mean() / 2))
+    return found
+
+
+def _means(worlds: Mapping[str, Sequence[float]]) -> dict[str, float]:
+    """Means over worlds with standard errors, where there are enough."""
+    found = {name: float(np.mean(values)) for name, values in worlds.items() if values}
+    return found | {
+        f"{name}_error": float(np.std(values, ddof=1) / len(values) ** 0.5)
+        for name, values in worlds.items()
+        if len(values) > 1
+    }
 
 
 def search_figures(walked_m: Mapping[str, Sequence[float]]) -> dict[str, float]:

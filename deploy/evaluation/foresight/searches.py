@@ -46,7 +46,7 @@ def ours(sight: Sight) -> int:
     one, cfg = sight.quest.trial, sight.cfg
     expectation = expected(one.prior, one.found(sight.explorer, sight.seen_m2), cfg)
     origins = one.origins(sight.explorer, sight.frontiers, sight.seen_m2)
-    foreseen = beyond(one.views(sight.frontiers, origins, sight.seen_m2), expectation, cfg)
+    foreseen = beyond(one.views(sight.explorer, sight.frontiers, origins, sight.seen_m2, cfg), expectation, cfg)
     ways_m = sight.frontiers.steps * CELL_M / STRAIGHT
     return int(chances_per_metre(ways_m, foreseen.within[:, sight.quest.goal], cfg.look_m).argmax())
 

@@ -8,6 +8,7 @@ from functools import lru_cache
 import numpy as np
 
 from prior_sg.deploy.evaluation.foresight.explorer import Explorer, Frontiers, Plan, crossings, plan_of, starts_of
+from prior_sg.deploy.evaluation.foresight.surroundings import surroundings
 from prior_sg.deploy.evaluation.priors import library_prior
 from prior_sg.deploy.evaluation.worlds import KINDS, world_of
 from prior_sg.deploy.evaluation.worlds.plan import Unbuildable
@@ -15,6 +16,7 @@ from prior_sg.deploy.settings import DEMO_TASK
 from prior_sg.schemas.priors import Prior
 from prior_sg.schemas.regions import NO_REGION
 from prior_sg.services.segmenter.core.foresight.beyond import Views
+from prior_sg.services.segmenter.core.foresight.config import ForesightConfig
 from prior_sg.services.segmenter.core.foresight.expectation import Found
 
 ERRORS = 0.15  # share of the regions that are taken for another label
@@ -71,12 +73,20 @@ class Trial:
             origin[region] = np.bincount(sides[sides[:, 0] == region, 1]).argmax()
         return origin[frontiers.regions]
 
-    def views(self, frontiers: Frontiers, origins: np.ndarray, seen_m2: np.ndarray) -> Views:
+    def views(
+        self,
+        explorer: Explorer,
+        frontiers: Frontiers,
+        origins: np.ndarray,
+        seen_m2: np.ndarray,
+        cfg: ForesightConfig = ForesightConfig(),
+    ) -> Views:
         """The openings of one moment."""
         count = len(self.prior.regions)
         beliefs = np.full((len(origins), count), (1 - SURE) / max(count - 1, 1))
         beliefs[np.arange(len(beliefs)), self.taken[origins]] = SURE
-        return Views(beliefs, frontiers.widths_m, seen_m2[origins])
+        around = surroundings(explorer, frontiers, origins, self.crossings, found=seen_m2 >= FOUND_M2, cfg=cfg)
+        return Views(beliefs, frontiers.widths_m, seen_m2[origins], around)
 
 
 @dataclass(frozen=True)
@@ -138,7 +148,7 @@ def moments(one: Trial) -> Iterator[Moment]:
         origins = one.origins(explorer, frontiers, seen_m2)
         outcomes = np.where(revealed == origins, SAME, np.where(known, one.labels[revealed], SAME))
         kept = np.flatnonzero(known & (one.labels[np.maximum(revealed, 0)] >= 0))
-        views = one.views(frontiers, origins, seen_m2)
+        views = one.views(explorer, frontiers, origins, seen_m2)
         count = len(one.prior.regions)
         new = (seen_m2 < FOUND_M2) & (one.labels >= 0) & walkable
         met = np.zeros((len(kept), count), bool)
@@ -146,7 +156,7 @@ def moments(one: Trial) -> Iterator[Moment]:
             regions = explorer.met(frontiers.nodes[at])
             met[row, one.labels[regions[new[regions]]]] = True
         yield Moment(
-            Views(views.beliefs[kept], views.widths_m[kept], views.areas_m2[kept]),
+            Views(views.beliefs[kept], views.widths_m[kept], views.areas_m2[kept], views.around.of(kept)),
             one.found(explorer, seen_m2),
             outcomes[kept],
             met,

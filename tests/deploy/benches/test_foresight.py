@@ -10,12 +10,13 @@ from prior_sg.deploy.evaluation.foresight.trials import SAME, Moment
 from prior_sg.services.segmenter.core.foresight.beyond import Views
 from prior_sg.services.segmenter.core.foresight.config import ForesightConfig
 from prior_sg.services.segmenter.core.foresight.expectation import Found
+from tests.help.foreseen import around
 from tests.help.world import prior
 
 
 def moment(outcomes):
     count = len(outcomes)
-    views = Views(np.tile(np.eye(3)[0], (count, 1)), np.full(count, 0.9), np.ones(count))
+    views = Views(np.tile(np.eye(3)[0], (count, 1)), np.full(count, 0.9), np.ones(count), around(count))
     met = np.array([[one == label for label in range(3)] for one in outcomes]).reshape(-1, 3)
     return Moment(views, Found(np.array([1.0, 0, 0]), np.zeros((3, 3))), np.array(outcomes), met, np.ones(3, bool))
 

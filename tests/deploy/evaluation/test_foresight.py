@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from prior_sg.deploy.evaluation.foresight.explorer import Explorer, Plan, crossings
-from prior_sg.deploy.evaluation.foresight.fitting import fitted, fitted_to_maps
+from prior_sg.deploy.evaluation.foresight.fitting import fitted, fitted_to_maps, fitted_within
 from prior_sg.deploy.evaluation.foresight.loops import FAR
 from prior_sg.deploy.evaluation.foresight.mapped import behind, covered, ground_of
 from prior_sg.deploy.evaluation.foresight.predictors import PREDICTORS
@@ -15,11 +15,13 @@ from prior_sg.deploy.evaluation.foresight.scores import chance_figures, figures,
 from prior_sg.deploy.evaluation.foresight.searches import POLICIES, Quest, metres
 from prior_sg.deploy.evaluation.foresight.trials import SAME, Moment, Trial, go
 from prior_sg.deploy.evaluation.worlds.ways import CELL_M, LEVELS, ways_of
+from prior_sg.services.segmenter.core.foresight.around import fading
 from prior_sg.services.segmenter.core.foresight.beyond import Views, beyond, leads, leads_features
 from prior_sg.services.segmenter.core.foresight.config import ForesightConfig
 from prior_sg.services.segmenter.core.foresight.expectation import Found, expected
 from prior_sg.services.segmenter.core.foresight.openings import Openings
 from prior_sg.services.segmenter.core.map.received import ReceivedGraph
+from tests.help.foreseen import around
 from tests.help.world import prior
 
 LABELS = ["hall", "bath", "kitchen"]
@@ -108,6 +110,28 @@ def test_regions_that_touch_through_a_door_are_found_as_such():
     assert found.borders.tolist() == [[0, 1, 1], [1, 0, 0], [1, 0, 0]]
 
 
+def test_what_an_explorer_has_seen_around_its_openings():
+    """From the hall, whose rooms on both sides were seen through doors alone; then the bath is known, too."""
+    one, explorer, cfg = home_trial(), Explorer(PLAN, HALL), ForesightConfig()
+    explorer.known |= PLAN.regions == 0
+
+    def at_the_kitchen():
+        frontiers, seen_m2 = explorer.frontiers(explorer.reach()[0]), explorer.seen_m2()
+        views = one.views(explorer, frontiers, one.origins(explorer, frontiers, seen_m2), seen_m2)
+        found = views.around.of(frontiers.centers_m[:, 0] > PLAN.position_m(np.array([HALL]))[0, 0])
+        assert len(found.touching) == 1
+        return found
+
+    before = at_the_kitchen()
+    assert before.touching == [2.0] and before.nearby == [0.0]
+    assert before.storey_m2[0] == pytest.approx(explorer.known.sum() * CELL_M**2, rel=0.1)
+    assert fading(np.array(3.5), cfg.border_m) < before.at_border[0] < 1
+    explorer.known |= PLAN.regions == 1
+    after = at_the_kitchen()
+    assert fading(np.array(8.0), cfg.nearby_m) < after.nearby[0] < fading(np.array(4.0), cfg.nearby_m)
+    assert after.at_border == before.at_border
+
+
 @pytest.mark.parametrize("policy", POLICIES)
 def test_every_policy_finds_what_is_there(policy):
     walked_m = metres(Quest(home_trial(), 1, node(3 * ROOM, ROOM // 2)), POLICIES[policy], ForesightConfig())
@@ -116,9 +140,8 @@ def test_every_policy_finds_what_is_there(policy):
 
 def moment(outcomes, widths_m=None, label=0, met=None, left=None):
     count = len(outcomes)
-    views = Views(
-        np.tile(np.eye(3)[label], (count, 1)), np.full(count, 0.9) if widths_m is None else widths_m, np.ones(count)
-    )
+    widths_m = np.full(count, 0.9) if widths_m is None else widths_m
+    views = Views(np.tile(np.eye(3)[label], (count, 1)), widths_m, np.ones(count), around(count))
     return Moment(
         views,
         Found(np.array([1.0, 0, 0]), np.zeros((3, 3))),
@@ -188,6 +211,9 @@ def test_fitting_finds_the_weights_that_made_the_events():
     said, wanted_said = (beyond(seen.views, expected(the_prior, seen.found, one), one) for one in (found, true))
     np.testing.assert_allclose(said.within, wanted_said.within, atol=0.06)
     np.testing.assert_allclose(said.missing, wanted_said.missing, atol=0.1)
+    alone = fitted_within([(walk, the_prior)], cfg)
+    for name in cfg.__struct_fields__:
+        assert getattr(alone, name) == getattr(found if name.startswith("within_") else cfg, name)
 
 
 def test_what_begins_behind_a_door_is_met_behind_that_door_alone():
@@ -243,6 +269,18 @@ def test_chances_are_judged_against_how_often_things_happen():
     assert told["within_brier_rate"] == told["missing_brier_rate"] == pytest.approx(2 / 9)
     said = beyond(walk[0].views, expected(home_trial().prior, walk[0].found, ForesightConfig()), ForesightConfig())
     assert told["within_brier"] == pytest.approx(((said.within[0] - [0, 1, 0]) ** 2).mean())
+    assert told["within_nll"] == pytest.approx(-np.log(np.abs(said.within[0] - [1, 0, 1])).mean())
+    assert "within_right" not in told and "within_nll_error" not in told
+
+
+def test_chances_are_judged_by_which_of_two_openings_they_prefer():
+    """The kitchen is behind the wide opening in one world, behind the narrow one in the other; the bath behind both."""
+    walks = []
+    for wide in (True, False):
+        met = np.array([[False, True, wide], [False, True, not wide], [False, True, not wide]])
+        walks.append(([moment([SAME] * 3, np.array([4.0, 0.7, 0.7]), met=met)], home_trial().prior))
+    for walk, right in zip(([walks[0]], [walks[1]], walks), (1.0, 0.0, 0.5), strict=True):
+        assert chance_figures(walk, ForesightConfig())["within_right"] == right
 
 
 def test_fitting_learns_from_maps_which_openings_lead_anywhere():

@@ -6,10 +6,11 @@ import pytest
 
 from prior_sg.schemas.foresight import Foresight
 from prior_sg.schemas.priors import RegionPrior
-from prior_sg.schemas.regions import RegionDelta
+from prior_sg.schemas.regions import Region, RegionDelta, Transition
 from prior_sg.schemas.status import Tick
 from prior_sg.services.segmenter.core import update
 from prior_sg.services.segmenter.core.config import Config
+from prior_sg.services.segmenter.core.foresight.around import around_of, fading
 from prior_sg.services.segmenter.core.foresight.beyond import Views, beyond, leads, leads_features
 from prior_sg.services.segmenter.core.foresight.config import ForesightConfig
 from prior_sg.services.segmenter.core.foresight.expectation import Found, expected
@@ -21,6 +22,7 @@ from prior_sg.services.segmenter.core.map.received import ReceivedGraph
 from prior_sg.services.segmenter.core.map.table import Places
 from prior_sg.services.segmenter.core.report import snapshot
 from prior_sg.services.segmenter.core.state import empty
+from tests.help.foreseen import around
 from tests.help.world import ROBOT, place_delta, place_grid, prior, task, text, walk
 
 CFG = ForesightConfig()
@@ -44,8 +46,9 @@ def found(**counts):
     return Found(regions, np.zeros((4, 4)))
 
 
-def views(label="hall", width_m=0.9, area_m2=8.0):
-    return Views(np.eye(4)[[LABELS.index(label)]], np.array([width_m]), np.array([area_m2]))
+def views(label="hall", width_m=0.9, area_m2=8.0, **columns):
+    beliefs = np.eye(4)[[LABELS.index(label)]]
+    return Views(beliefs, np.array([width_m]), np.array([area_m2]), around(1, **columns))
 
 
 def foreseen(the_prior, the_found, the_views=None, cfg=CFG):
@@ -63,7 +66,7 @@ def random_case(seed):
     the_prior = prior(LABELS, adjacency=((adjacency + adjacency.T) / 2).astype(np.float32), regions=regions)
     borders = rng.integers(0, 3, (4, 4)).astype(float)
     the_found = Found(rng.integers(0, 4, 4).astype(float), borders + borders.T)
-    many = Views(rng.dirichlet(np.ones(4), 7), rng.uniform(0.3, 6, 7), rng.uniform(0, 60, 7))
+    many = Views(rng.dirichlet(np.ones(4), 7), rng.uniform(0.3, 6, 7), rng.uniform(0, 60, 7), around(7))
     return the_prior, the_found, many
 
 
@@ -86,10 +89,10 @@ def test_a_corridor_leads_to_more_than_a_room_at_its_end():
 
 def test_many_openings_do_not_make_sure_what_one_does_not():
     """Openings of one map lead to the same rooms: fourteen make a third bath likelier, not certain."""
-    many = Views(np.tile(np.eye(4)[0], (14, 1)), np.full(14, 0.9), np.full(14, 8.0))
+    many = Views(np.tile(np.eye(4)[0], (14, 1)), np.full(14, 0.9), np.full(14, 8.0), around(14))
     one, all_of_them = (foreseen(home(), found(bath=2), some).missing[1] for some in (views(), many))
     assert one < all_of_them < 0.5
-    assert foreseen(home(), found(), Views(np.zeros((0, 4)), np.zeros(0), np.zeros(0))).missing.max() == 0
+    assert foreseen(home(), found(), Views(np.zeros((0, 4)), np.zeros(0), np.zeros(0), around(0))).missing.max() == 0
 
 
 def test_what_is_not_expected_at_all_is_not_missing():
@@ -117,7 +120,7 @@ def looking(widths_m, rises, unseen):
     count = len(widths_m)
     areas_m2 = np.full(count, 8.0)
     signs = leads_features(np.array(widths_m), np.array(rises), np.array(unseen))
-    return Views(np.tile(np.eye(4)[0], (count, 1)), np.array(widths_m), areas_m2, signs)
+    return Views(np.tile(np.eye(4)[0], (count, 1)), np.array(widths_m), areas_m2, around(count), signs)
 
 
 def test_shadows_ceilings_and_cracks_seldom_lead_anywhere():
@@ -131,7 +134,7 @@ def test_what_may_lead_nowhere_says_less_of_all_that_may_be_behind(seed):
     the_prior, the_found, many = random_case(seed)
     rng = np.random.default_rng(seed)
     signs = leads_features(many.widths_m, rng.uniform(0, 0.7, 7), rng.uniform(0, 1, 7))
-    unsure = Views(many.beliefs, many.widths_m, many.areas_m2, signs)
+    unsure = Views(many.beliefs, many.widths_m, many.areas_m2, many.around, signs)
     sure, result = foreseen(the_prior, the_found, many), foreseen(the_prior, the_found, unsure)
     chance = leads(unsure, CFG)
     np.testing.assert_allclose(result.same + result.next.sum(axis=1), 1.0)
@@ -219,18 +222,48 @@ def test_only_what_changes_visibly_is_news():
     assert [differs(now, msgspec.structs.replace(now, openings=[one]), CFG) for one in moved] == [False, True]
 
 
-def region(number, label, neighbours=()):
-    from prior_sg.schemas.regions import Region
+def region(number, label, neighbours=(), **fields):
+    usual = {"place_count": 9, "probability": 0.9, "position_m": (0, 0, 0), "area_m2": 9.0}
+    return Region(id=number, label=label, neighbour_ids=list(neighbours), **(usual | fields))
 
-    return Region(
-        id=number,
-        label=label,
-        place_count=9,
-        probability=0.9,
-        position_m=(0, 0, 0),
-        area_m2=9.0,
-        neighbour_ids=list(neighbours),
+
+def square(x_m, y_m, side_m=3.0):
+    return [(x_m, y_m), (x_m + side_m, y_m), (x_m + side_m, y_m + side_m), (x_m, y_m + side_m)]
+
+
+def test_what_the_map_holds_around_an_opening():
+    """One looks north out of region 7, over (1, 0.5, 1) to (1, 1.5, 1): regions that were found count as they are near,
+    its own and pieces do not, and one above it is far and on another storey."""
+    graph, places = a_map()
+    openings = openings_of(graph, places, opened((10, (0, 1, 0), 2.0)), CFG)
+    np.testing.assert_allclose(openings.beyond_m, [[1.0, 0.5 + CFG.beyond_m, 1.0]])
+    way = Transition(region=8, edge=(0, 1), position_m=(1.0, 3.5, 1.0), clearance_m=0.4, door=True)
+    held = {
+        7: region(7, "hall", [8, 9], hull_m=square(0, 0), position_m=(1, 0, 1), transitions=[way]),
+        8: region(8, "bath", [7], hull_m=[(3, 0), *square(3, 0)], position_m=(4, 1, 1), area_m2=4.0),
+        9: region(9, "bath", [7], hull_m=square(1, 1), position_m=(1, 1, 1), place_count=1),
+        10: region(10, "kitchen", hull_m=square(0, 0), position_m=(1, 1, 4)),
+    }
+    result = around_of(openings, held, CFG)
+    assert result.touching == [2.0] and result.storey_m2 == [13.0]
+    assert result.nearby == pytest.approx([fading(np.array((2.0, 3 * CFG.steepness)), CFG.nearby_m).sum()])
+    assert result.at_border == pytest.approx(fading(np.array([3.0]), CFG.border_m))
+    alone = around_of(openings, {7: region(7, "hall")}, CFG)
+    assert (alone.nearby, alone.at_border, alone.storey_m2) == ([0.0], [0.0], [0.0])
+
+
+@pytest.mark.parametrize(("what", "more"), [("touching", True), ("nearby", False), ("storey_m2", False)])
+def test_more_begins_behind_regions_that_touch_many_and_less_amid_what_was_found(what, more):
+    few, many = (foreseen(home(), found(), views(**{what: value})).within for value in (1.0, 9.0))
+    assert ((many > 1.2 * few) if more else (few > 1.2 * many)).all()
+
+
+def test_beside_a_border_what_the_region_touches_says_less():
+    near, far = (
+        [foreseen(home(hall_bath=value), found(), views(at_border=border)).within[0, 1] for value in (0.9, 0.1)]
+        for border in (1.0, 0.0)
     )
+    assert near[0] / near[1] < 0.8 * far[0] / far[1]
 
 
 def test_regions_and_borders_are_counted_by_label():

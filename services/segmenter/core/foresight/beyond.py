@@ -3,7 +3,8 @@
     P(it leads anywhere)       = sigmoid(by its width, its direction and what is covered behind it)
     P(the same region goes on) = sigmoid(by the opening's width + by what was seen of the region + by its label)
     P(another region r)        = P(leads) (1 - P(goes on)) sum_i P(i) T(i, r)
-    P(r within some metres)    = P(leads) sigmoid(by the opening, by the label of the region it opens from, by r)
+    P(r within some metres)    = P(leads) sigmoid(by the opening and what is around it, by the label of the region it
+                                 opens from, by r)
 
 with P(i) the belief of the region it opens from and T from `expectation`. Of a map's openings most lead nowhere: they
 are shadows of furniture, gaps in depth, ceilings. P(goes on) and P(r) are of what is seen first, the last of all that
@@ -14,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from prior_sg.services.segmenter.core.foresight.around import Around
 from prior_sg.services.segmenter.core.foresight.config import ForesightConfig
 from prior_sg.services.segmenter.core.foresight.expectation import FLOOR, Expectation
 
@@ -25,6 +27,7 @@ class Views:
     beliefs: np.ndarray  # (opening, label) of the region it opens from, rows sum to one
     widths_m: np.ndarray  # (opening,)
     areas_m2: np.ndarray  # (opening,) seen of that region
+    around: Around
     signs: np.ndarray | None = None  # (opening, feature) of `leads_features`; None = all are known to lead somewhere
 
 
@@ -72,15 +75,20 @@ def within_features(views: Views, expectation: Expectation, leading: float) -> n
     `within_weights`, for openings that lead somewhere; so many of the map's do."""
     count, labels = views.beliefs.shape
     beside = np.log(np.maximum(views.beliefs @ expectation.spread, FLOOR))
+    around = views.around
     of_openings = (np.ones(count), np.log(views.widths_m), np.log1p(views.areas_m2), beside)
+    of_around = (np.log1p(around.touching), np.log1p(around.nearby), np.log1p(around.storey_m2))
+    adjacency = np.log(np.maximum(views.beliefs @ expectation.adjacency, FLOOR))
     columns = (
         *(np.broadcast_to(column[:, None], (count, labels)) for column in of_openings),
         np.full((count, labels), np.log(max(leading, 1.0))),
-        np.log(np.maximum(views.beliefs @ expectation.adjacency, FLOOR)),
+        adjacency,
         np.broadcast_to(np.log(np.maximum(expectation.existence, FLOOR)), (count, labels)),
         views.beliefs,
         np.broadcast_to(expectation.found == 1, (count, labels)).astype(float),
         np.broadcast_to(expectation.found >= 2, (count, labels)).astype(float),
+        *(np.broadcast_to(column[:, None], (count, labels)) for column in of_around),
+        around.at_border[:, None] * adjacency,
     )
     return np.stack(columns, axis=2)
 
@@ -91,6 +99,7 @@ def within_weights(cfg: ForesightConfig) -> np.ndarray:
         [
             *(cfg.within_bias, cfg.within_width, cfg.within_area, cfg.within_spread, cfg.within_openings),
             *(cfg.within_adjacency, cfg.within_existence, cfg.within_again, cfg.within_once, cfg.within_often),
+            *(cfg.within_touching, cfg.within_nearby, cfg.within_storey, cfg.within_at_border),
         ]
     )
 

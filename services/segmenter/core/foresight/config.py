@@ -18,6 +18,10 @@ class ForesightConfig(msgspec.Struct, frozen=True, kw_only=True):
     covered_m: float = 0.3  # beside a place's sphere, what was not seen of its free space: corners
     beyond_m: float = 1.0  # how far beyond the edge of what was seen an expected region is put
     least_places: int = 3  # a region of fewer places does not count as found
+    nearby_m: float = 4.0  # how far a region is felt around an opening: less by e at each so many metres
+    border_m: float = 1.0  # the same of a way between two regions
+    steepness: float = 3.0  # a metre of height keeps as far apart as so many along the floor
+    storey_m: float = 1.5  # what lies higher or lower is on another storey
 
     # That there is unobserved floor behind an opening at all, and it is no gap or shadow: logit.
     leads_bias: float = -1.36
@@ -41,16 +45,20 @@ class ForesightConfig(msgspec.Struct, frozen=True, kw_only=True):
     met: float = 0.47  # by log(1 + number of such borders in this map)
 
     # That a region of a label begins within REACH_M behind an opening: logit.
-    within_bias: float = 0.84
-    within_width: float = 0.17  # by log of the opening's width / m
-    within_area: float = -0.14  # by log(1 + seen area of the region it opens from / m2)
-    within_spread: float = 1.25  # by log of the mean number of other regions that touch one of its label
-    within_openings: float = -0.32  # by log of how many openings of the map lead anywhere
-    within_adjacency: float = 0.42  # by log P(ri <-> rj)
-    within_existence: float = 1.49  # by log P(r)
-    within_again: float = -2.5  # by the belief that the region it opens from has that label
-    within_once: float = -1.16  # such a region has been found ...
-    within_often: float = -0.29  # ... or several
+    within_bias: float = 2.19
+    within_width: float = 0.36  # by log of the opening's width / m
+    within_area: float = -0.2  # by log(1 + seen area of the region it opens from / m2)
+    within_spread: float = 0.67  # by log of the mean number of other regions that touch one of its label
+    within_openings: float = -0.13  # by log of how many openings of the map lead anywhere
+    within_adjacency: float = 0.5  # by log P(ri <-> rj)
+    within_existence: float = 1.27  # by log P(r)
+    within_again: float = -2.6  # by the belief that the region it opens from has that label
+    within_once: float = -0.9  # such a region has been found ...
+    within_often: float = 0.13  # ... or several
+    within_touching: float = 0.89  # by log(1 + regions that touch the one it opens from)
+    within_nearby: float = -1.0  # by log(1 + other regions around it)
+    within_storey: float = -0.41  # by log(1 + seen area of its storey / m2)
+    within_at_border: float = -0.6  # by log P(ri <-> rj), as near as a way into another region is
 
     # That one more region of a label is behind any of the openings: logit.
     missing_bias: float = 0.5

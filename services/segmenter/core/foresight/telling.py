@@ -7,6 +7,7 @@ import numpy as np
 from prior_sg.schemas.foresight import ForeseenLabel, Foresight, MissingLabel, Opening
 from prior_sg.schemas.priors import Prior
 from prior_sg.schemas.regions import Region
+from prior_sg.services.segmenter.core.foresight.around import around_of
 from prior_sg.services.segmenter.core.foresight.beyond import Beyond, Views, beyond, leads_features
 from prior_sg.services.segmenter.core.foresight.config import ForesightConfig
 from prior_sg.services.segmenter.core.foresight.expectation import Found, expected
@@ -19,7 +20,7 @@ def foresight(openings: Openings, regions: Mapping[int, Region], prior: Prior, c
     """What lies beyond the openings of a map with these regions."""
     names = [region.name for region in prior.regions]
     found = found_in(regions, prior, cfg)
-    foreseen = beyond(views_of(openings, regions), expected(prior, found, cfg), cfg)
+    foreseen = beyond(views_of(openings, regions, cfg), expected(prior, found, cfg), cfg)
     missing = foreseen.missing
     return Foresight(
         openings=[
@@ -41,11 +42,11 @@ def found_in(regions: Mapping[int, Region], prior: Prior, cfg: ForesightConfig) 
     return Found.of(regions.values(), [region.name for region in prior.regions], cfg.least_places)
 
 
-def views_of(openings: Openings, regions: Mapping[int, Region]) -> Views:
+def views_of(openings: Openings, regions: Mapping[int, Region], cfg: ForesightConfig) -> Views:
     """What the openings tell of what is behind them."""
     areas_m2 = np.array([regions[region].area_m2 for region in openings.regions.tolist()])
     signs = leads_features(openings.widths_m, openings.rises, openings.unseen)
-    return Views(openings.beliefs, openings.widths_m, areas_m2, signs)
+    return Views(openings.beliefs, openings.widths_m, areas_m2, around_of(openings, regions, cfg), signs)
 
 
 def differs(told: Foresight | None, now: Foresight, cfg: ForesightConfig) -> bool:
