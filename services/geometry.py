@@ -19,7 +19,7 @@ def pose_from_quaternion(position_m: np.ndarray, quaternion_xyzw: np.ndarray) ->
 
 
 def quaternion_of(motion: np.ndarray) -> np.ndarray:
-    """x y z w of a rigid motion's rotation, up to the sign of all."""
+    """x y z w of a rigid motion's rotation, w not negative."""
     r = motion[:3, :3]
     squares = np.array(  # four times the products of the components, row by row
         (
@@ -30,7 +30,7 @@ def quaternion_of(motion: np.ndarray) -> np.ndarray:
         )
     )
     row = squares[int(np.argmax(np.diag(squares)))]
-    return row / np.linalg.norm(row)
+    return np.asarray(row / np.copysign(np.linalg.norm(row), row[3]))
 
 
 def inverse(pose: np.ndarray) -> np.ndarray:

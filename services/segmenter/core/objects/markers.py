@@ -103,8 +103,7 @@ def located(key: MarkerKey, sightings: Mapping[tuple[int, int], Sighting], cfg: 
         gap_m = max(float(np.linalg.norm(other[:3, 3] - best[:3, 3])) for other in others)
         doubt = f"it has been seen at {len(spots)} spots, up to {gap_m:.1f} m from each other"
     x, y, z = best[:3, 3].tolist()
-    quaternion = quaternion_of(best)
-    qx, qy, qz, qw = (quaternion if quaternion[3] >= 0 else -quaternion).tolist()
+    qx, qy, qz, qw = quaternion_of(best).tolist()
     return SceneMarker(
         dictionary=key.dictionary,
         id=key.id,
