@@ -1,9 +1,9 @@
 """`prior-sg bench markers`: do two robots' maps find together by one printed marker, and not by a wrong one?
 
 The homes, parts and drifting poses are those of `bench merge`, without any objects. Papers are printed into the views
-where both parts see wall, found there as the worker finds them, and held as the segmenter holds them; no two sightings
-of the two parts are of one view. Then the same number is put where it must mislead: on two papers of one home of which
-each robot has seen one, and in two homes.
+where both parts see wall, found there as the worker finds them, and held as the segmenter holds them; where both parts
+have one view, each has noise of its own in it. Then the same number is put where it must mislead: on two papers of one
+home of which each robot has seen one, and in two homes.
 """
 
 import itertools
@@ -92,9 +92,8 @@ def hung(walks: Walks, seed: int) -> Hung:
     frames = keyframes(of_world(WorldName(walks.kind, seed), ""))
     both = parts_of(seed)
     parts = walks.part(seed, both[0]), walks.part(seed, both[1])
-    rows = _rows(len(frames), both)
-    spots = _spots(frames, rows)
-    markers = tuple(_seen(frames, seed, number, rows[number], spots) for number in (0, 1))
+    spots = _spots(frames, _rows(len(frames), both))
+    markers = tuple(_seen(frames, seed, number, spots) for number in (0, 1))
     maps = tuple(map_of(msgspec.structs.replace(part.scene, objects=[])) for part in parts)
     return Hung(seed, parts, (maps[0], maps[1]), (markers[0], markers[1]))
 
@@ -144,12 +143,9 @@ def _strangers(homes: Sequence[Hung]) -> Iterator[tuple[Hung, Hung, tuple[int, i
 
 
 def _rows(count: int, both: tuple[Part, Part]) -> tuple[list[int], list[int]]:
-    """The views of each part, of those that both have every second."""
-    first, second = (range(round(part.start * count), round(part.stop * count)) for part in both)
-    return (
-        [row for row in first if row not in second or row % 2 == 0],
-        [row for row in second if row not in first or row % 2 == 1],
-    )
+    """The views of each part."""
+    first, second = (list(range(round(part.start * count), round(part.stop * count))) for part in both)
+    return first, second
 
 
 def _spots(frames: list[Keyframe], rows: tuple[list[int], list[int]]) -> list[np.ndarray]:
@@ -177,18 +173,13 @@ def _shows(depth_m: np.ndarray, camera: Intrinsics, world_from_camera: np.ndarra
     return abs(float(depth_m[row, column]) - z) < 0.1 and bool(way @ spot[:3, 2] > 0.4 * np.linalg.norm(way))
 
 
-def _seen(
-    frames: list[Keyframe], seed: int, number: int, rows: list[int], spots: list[np.ndarray]
-) -> dict[int, SceneMarker]:
-    """The papers as one part's robot has them, from some of its views."""
+def _seen(frames: list[Keyframe], seed: int, number: int, spots: list[np.ndarray]) -> dict[int, SceneMarker]:
+    """The papers as one part's robot has them."""
     part: Part = parts_of(seed)[number]
     chosen, poses, _ = told_poses(part, frames, np.random.default_rng([seed, part.seed]))
-    first = round(part.start * len(frames))
     rng = np.random.default_rng([seed, 79, number])
     sightings: dict[int, dict[tuple[int, int], Sighting]] = {}
-    for row, (frame, told) in enumerate(zip(chosen, poses, strict=True), first):
-        if row not in rows:
-            continue
+    for row, (frame, told) in enumerate(zip(chosen, poses, strict=True)):
         depth_m = _depth_m(frame)
         depth_m += NOISE_M * depth_m**2 * rng.normal(size=depth_m.shape).astype(np.float32)
         camera, depth_m = _finer(frame.intrinsics, depth_m)

@@ -7,7 +7,7 @@ import pytest
 
 from prior_sg.deploy.benches import main, markers
 from prior_sg.deploy.evaluation.errors import EvaluationError
-from prior_sg.deploy.evaluation.partial_walks import Part, PartialMap
+from prior_sg.deploy.evaluation.partial_walks import PartialMap
 from prior_sg.deploy.evaluation.printed import wall_spots
 from prior_sg.deploy.fleet.core.finding.frames import level
 from prior_sg.deploy.fleet.core.finding.matching import map_of
@@ -42,11 +42,6 @@ def test_papers_that_mislead_are_counted():
     assert (same["twin_pairs"], same["twin_accepted"], same["different_pairs"]) == (4, 0, 16)
     assert same["different_accepted"] == 8  # one paper of each, for the houses are one
     assert markers.misled([hung(1), hung(2, WIDE)], 5)["different_pairs"] == 5
-
-
-def test_no_view_is_of_both_parts():
-    first, second = markers._rows(10, (Part(0.0, 0.7, 1), Part(0.3, 1.0, 2)))
-    assert first == [0, 1, 2, 4, 6] and second == [3, 5, 7, 8, 9]
 
 
 def test_papers_hang_upright_on_walls_and_look_into_the_room():
