@@ -26,5 +26,5 @@ class MatchConfig(msgspec.Struct, frozen=True, kw_only=True):
     markers: bool = True  # whether printed markers that both maps show are followed
     markers_m: float = 0.3  # by which shared markers may lie apart
     markers_rad: float = 0.35  # or be turned to each other
-    markers_walls_least: int = 60  # points of walls from which on walls may contradict markers
+    markers_walls_least: int = 20  # points of walls from which on walls may contradict markers
     rival_most: float = 0.6  # of the best one's evidence that a second hypothesis may have

@@ -40,7 +40,8 @@ def by_markers(a: Scene, b: Scene, cfg: MatchConfig) -> Marked | None:
     poses = np.array([[pose_of(held[key]) for key in shared] for held in (of_a, of_b)])
     motion = fitted(_limbs(poses[0]), _limbs(poses[1]))
     why = _fault_of(motion, poses, shared, b.robot, cfg)
-    return Marked(None if why else motion, *poses[:, :, :3, 3], why)
+    spots_a_m, spots_b_m = poses[:, :, :3, 3]
+    return Marked(None if why else motion, spots_a_m, spots_b_m, why)
 
 
 def doubts_of(a: Scene, b: Scene) -> str:
