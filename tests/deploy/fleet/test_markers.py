@@ -97,6 +97,12 @@ def test_a_marker_that_hangs_twice_says_nothing_and_that_is_said():
     assert answer.why.startswith("marker 7 (apriltag_36h11) says nothing, for in r2 it has been seen at 2 spots")
 
 
+def test_markers_beyond_all_numbers_are_not_shared():
+    first, second = two([(7, HALL)], [(7, HALL)])
+    beyond = msgspec.structs.replace(second.markers[0], position_m=(1e300, 0.0, 0.0))
+    assert found(first, msgspec.structs.replace(second, markers=[beyond])).b_from_a is None
+
+
 def test_they_can_be_left_out():
     first, second = two([(7, HALL)], [(7, HALL)])
     assert found(first, second, MatchConfig(markers=False)).b_from_a is None

@@ -87,6 +87,12 @@ def test_two_close_by_in_one_keyframe_are_doubted():
     assert found.doubt == "it has been seen twice in one keyframe"
 
 
+@pytest.mark.parametrize("changes", [{"marker_sides_px": np.zeros(1, np.float32)}, {"shift_m": (1e308, 0.0, 0.0)}])
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+def test_sightings_beyond_all_numbers_put_a_marker_nowhere(changes):
+    assert held(*(sighting(n, HUNG, **changes) for n in range(3))).news({}, CFG) == []
+
+
 def test_only_so_many_are_kept_of_each_spot():
     cfg = MarkerConfig(sightings=3)
     markers = held(*(sighting(n, HUNG if n % 2 else ELSEWHERE) for n in range(12)), cfg=cfg)
@@ -95,8 +101,10 @@ def test_only_so_many_are_kept_of_each_spot():
 
 
 def test_another_space_tells_nothing_new():
-    markers = held(*(sighting(n, HUNG, space=space) for n in range(2) for space in ("a", "b")))
-    assert len(markers.seen[KEY]) == 2
+    markers = held(*(sighting(n, HUNG, space="a") for n in range(3)))
+    assert markers.news({}, CFG)
+    markers.observe(sighting(2, ELSEWHERE, space="b"), sighting(2).world_from_camera, CFG)
+    assert len(markers.seen[KEY]) == 3 and not markers.changed
 
 
 class Run:

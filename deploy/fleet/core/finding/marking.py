@@ -14,6 +14,7 @@ from prior_sg.schemas.markers import MarkerKey, SceneMarker
 from prior_sg.schemas.scene import Scene
 from prior_sg.services.geometry import inverse, pose_from_quaternion, rotation_angle_rad, transform
 
+FARTHEST_M = 1e6  # from a map's zero; what is told of beyond is nonsense, and its squares are no numbers
 ARM_M = 1.0  # a spot that is 5 cm off counts as much as a heading that is 3 degrees off
 
 
@@ -33,7 +34,7 @@ def pose_of(marker: SceneMarker) -> np.ndarray:
 
 def by_markers(a: Scene, b: Scene, cfg: MatchConfig) -> Marked | None:
     """How b lies to a by their markers; None where they share none, or none that both are sure of."""
-    of_a, of_b = ({marker.key: marker for marker in scene.markers if not marker.doubt} for scene in (a, b))
+    of_a, of_b = ({marker.key: marker for marker in scene.markers if _sure(marker)} for scene in (a, b))
     shared = sorted(of_a.keys() & of_b.keys())
     if not shared:
         return None
@@ -42,6 +43,10 @@ def by_markers(a: Scene, b: Scene, cfg: MatchConfig) -> Marked | None:
     why = _fault_of(motion, poses, shared, b.robot, cfg)
     spots_a_m, spots_b_m = poses[:, :, :3, 3]
     return Marked(None if why else motion, spots_a_m, spots_b_m, why)
+
+
+def _sure(marker: SceneMarker) -> bool:
+    return not marker.doubt and max(map(abs, marker.position_m)) < FARTHEST_M
 
 
 def doubts_of(a: Scene, b: Scene) -> str:

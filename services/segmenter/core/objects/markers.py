@@ -96,6 +96,8 @@ def located(key: MarkerKey, sightings: Mapping[tuple[int, int], Sighting], cfg: 
         return None
     values = list(sightings.values())
     best, *others = [_mean(poses[rows], np.array([values[row].side_px for row in rows])) for rows in spots]
+    if not np.isfinite(best).all():  # of sightings without size, or beyond all numbers
+        return None
     doubt = ""
     if sum(which > 0 for _, which in names) >= LEAST_TWICE:
         doubt = "it has been seen twice in one keyframe"
