@@ -122,7 +122,7 @@ def misled(homes: Sequence[Hung], most: int, cfg: MatchConfig = CFG) -> dict[str
     twins = [(home, home, (0, 1), pair) for home in homes for pair in itertools.permutations(home.shared, 2)]
     strangers = list(_strangers(homes))
     order = np.random.default_rng(0).permutation(len(strangers))[:most].tolist()
-    found = {}
+    found: dict[str, float] = {}
     for name, tries in (("twin", twins), ("different", [strangers[at] for at in order])):
         taken = 0
         for one, other, parts, papers in tries:

@@ -7,7 +7,7 @@ import pytest
 from prior_sg.deploy.fleet.core.finding.config import MatchConfig
 from prior_sg.deploy.fleet.core.finding.frames import apart, level
 from prior_sg.deploy.fleet.core.finding.marking import by_markers, pose_of
-from prior_sg.deploy.fleet.core.finding.matching import map_of, match
+from prior_sg.deploy.fleet.core.finding.matching import again, map_of, match
 from prior_sg.deploy.fleet.core.marks import GONE
 from prior_sg.deploy.fleet.core.update import Config
 from prior_sg.deploy.showing.export import scene_json
@@ -54,6 +54,15 @@ def test_one_marker_gives_the_motion_and_walls_mend_its_heading():
     assert answer.b_from_a is not None and answer.by_markers
     gap_m, gap_rad = apart(answer.b_from_a, MOVED, np.array((4.0, 4.0, 1.0)))
     assert gap_m < 0.1 and gap_rad < np.radians(1)
+
+
+def test_a_relation_by_markers_lasts_where_maps_share_hardly_any_floor():
+    first = houses.scene(rooms=houses.ROOMS[:2], markers=[(7, HALL)], **BARE)
+    second = houses.scene("r2", MOVED, rooms=houses.ROOMS[2:], markers=[(7, HALL)], **BARE)
+    held = again(MOVED, map_of(first), map_of(second), MATCH)
+    assert held.b_from_a == pytest.approx(MOVED) and held.by_markers
+    bare = again(MOVED, map_of(first), map_of(msgspec.structs.replace(second, markers=[])), MATCH)
+    assert bare.b_from_a is None and "they share only 0 m2" in bare.why
 
 
 def test_a_marker_on_the_floor_tells_the_heading_too():
