@@ -125,8 +125,8 @@ def _add_measuring(commands: Commands) -> None:
     bench.add_argument(
         "name",
         help="bus, places, features, kernel, swap, segmenter, task, learning, encoder_swap, queries, e2e, store, "
-        "memory, start, all of these, or exchange, fleet, foresight, levels, markers, merge, pool, store_crashes, lidar, view, "
-        "hydra",
+        "memory, start, all of these, or exchange, fleet, foresight, levels, markers, merge, pool, store_crashes, "
+        "lidar, view, hydra",
     )
     bench.add_argument("--seconds", type=float, default=300.0, help="how long pool lasts (default: %(default)s)")
     bench.add_argument(
