@@ -37,13 +37,13 @@ class Intrinsics(msgspec.Struct, frozen=True):
             raise ValueError("focal lengths must be positive")
 
 
-def check_pose(world_from_camera: np.ndarray) -> None:
+def check_pose(poses: np.ndarray, name: str = "world_from_camera") -> None:
     """Raise ValueError unless the matrix, or each of several, is a rigid motion."""
-    for rows in world_from_camera.reshape(-1, 4, 4).tolist():
-        _check_rows(*rows)
+    for rows in poses.reshape(-1, 4, 4).tolist():
+        _check_rows(name, *rows)
 
 
-def _check_rows(one: list[float], two: list[float], three: list[float], last: list[float]) -> None:
+def _check_rows(name: str, one: list[float], two: list[float], three: list[float], last: list[float]) -> None:
     """Plain numbers: for a single matrix, which every keyframe carries, NumPy would take five times as long."""
     (a, b, c, _), (d, e, f, _), (g, h, i, _) = one, two, three
     if not (  # also where huge entries made one of these infinite or not a number
@@ -54,11 +54,11 @@ def _check_rows(one: list[float], two: list[float], three: list[float], last: li
         and abs(a * g + b * h + c * i) <= ROTATION_TOLERANCE
         and abs(d * g + e * h + f * i) <= ROTATION_TOLERANCE
     ):
-        raise ValueError("world_from_camera: rotation is not orthonormal")
+        raise ValueError(f"{name}: rotation is not orthonormal")
     if a * (e * i - f * h) + b * (f * g - d * i) + c * (d * h - e * g) <= 0:
-        raise ValueError("world_from_camera: rotation mirrors")
+        raise ValueError(f"{name}: rotation mirrors")
     if last != [0.0, 0.0, 0.0, 1.0]:
-        raise ValueError("world_from_camera: last row is not 0 0 0 1")
+        raise ValueError(f"{name}: last row is not 0 0 0 1")
 
 
 class Keyframe(Message, frozen=True, kw_only=True):

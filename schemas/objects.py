@@ -1,4 +1,4 @@
-"""Objects: what a detector saw in one keyframe, and what association over time made of it, as deltas."""
+"""Objects and printed markers: what was seen in one keyframe, and what association over time made of it, as deltas."""
 
 from typing import Annotated
 
@@ -7,9 +7,13 @@ import numpy as np
 
 from prior_sg.schemas.codec import Message, Number, NumberOrNone, Part, Shape, Stamp
 from prior_sg.schemas.frames import Intrinsics, Pose, check_pose
+from prior_sg.schemas.markers import SceneMarker
 from prior_sg.schemas.members import MapMember
 
 _NO_NAMES = msgspec.field(default_factory=lambda: np.zeros(0, np.int16))
+_NO_MARKERS = msgspec.field(default_factory=lambda: np.zeros(0, np.int32))
+_NO_SIDES = msgspec.field(default_factory=lambda: np.zeros(0, np.float32))
+_NO_POSES = msgspec.field(default_factory=lambda: np.zeros((0, 4, 4)))
 _NO_MERGES = msgspec.field(default_factory=lambda: np.zeros((0, 2), np.int64))
 
 
@@ -37,9 +41,17 @@ class Detections(Message, frozen=True, kw_only=True):
     surface_m: Annotated[np.ndarray, Shape("float16", "row", "column")]  # coarse depth image, 0 = no measurement
     sought: list[str] = []  # the names that a prompted detector was asked for
     names: Annotated[np.ndarray, Shape("int16", "named")] = _NO_NAMES  # of each detection, the index into `sought`
+    marker_dictionary: str = ""  # of the markers that were looked for; empty = none were
+    marker_size_m: float = 0.0  # side of their black squares
+    marker_ids: Annotated[np.ndarray, Shape("int32", "marker")] = _NO_MARKERS
+    marker_sides_px: Annotated[np.ndarray, Shape("float32", "marker")] = _NO_SIDES  # mean of the four, as seen
+    camera_from_marker: Annotated[np.ndarray, Shape("float64", "marker", 4, 4)] = _NO_POSES  # frame as in SceneMarker
 
     def check(self) -> None:
         check_pose(self.world_from_camera)
+        check_pose(self.camera_from_marker, "camera_from_marker")
+        if len(self.marker_ids) and not (self.marker_dictionary and self.marker_size_m > 0):
+            raise ValueError("marker_ids: without a dictionary and a size")
         if len(self.names) != (len(self.scores) if self.sought else 0):
             raise ValueError("names: not one per detection")
         if len(self.names) and not (self.names.min() >= 0 and self.names.max() < len(self.sought)):
@@ -77,3 +89,4 @@ class ObjectDelta(Message, frozen=True, kw_only=True):
     objects: list[SceneObject]
     removed_ids: Annotated[np.ndarray, Shape("int64", "removed")]
     merged_ids: Annotated[np.ndarray, Shape("int64", "merged", 2)] = _NO_MERGES  # (gone, into)
+    markers: list[SceneMarker] = []  # to be upserted, too; markers stay as they were last told

@@ -8,6 +8,7 @@ import numpy as np
 from prior_sg.schemas.codec import Message, Number, NumberOrNone, Part, Shape, Stamp
 from prior_sg.schemas.foresight import Foresight
 from prior_sg.schemas.levels import LevelNode
+from prior_sg.schemas.markers import SceneMarker
 from prior_sg.schemas.objects import SceneObject
 from prior_sg.schemas.regions import Region
 
@@ -106,6 +107,7 @@ class Scene(Message, frozen=True, kw_only=True):
     revision: NumberOrNone = -1  # of the store, as in SceneRevision; -1 = nothing stored
     nodes: list[LevelNode] = []  # of the levels above regions, from below, by id
     foresight: Foresight = Foresight()  # what is expected beyond: predictions, none of which has been seen
+    markers: list[SceneMarker] = []  # by dictionary and id
 
     def unnumbered(self) -> "Scene":
         """The same without its revision, which counts what a store has applied: of one and the same scene it is another

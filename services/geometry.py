@@ -18,6 +18,21 @@ def pose_from_quaternion(position_m: np.ndarray, quaternion_xyzw: np.ndarray) ->
     return pose
 
 
+def quaternion_of(motion: np.ndarray) -> np.ndarray:
+    """x y z w of a rigid motion's rotation, w not negative."""
+    r = motion[:3, :3]
+    squares = np.array(  # four times the products of the components, row by row
+        (
+            (1 + r[0, 0] - r[1, 1] - r[2, 2], r[0, 1] + r[1, 0], r[0, 2] + r[2, 0], r[2, 1] - r[1, 2]),
+            (r[0, 1] + r[1, 0], 1 - r[0, 0] + r[1, 1] - r[2, 2], r[1, 2] + r[2, 1], r[0, 2] - r[2, 0]),
+            (r[0, 2] + r[2, 0], r[1, 2] + r[2, 1], 1 - r[0, 0] - r[1, 1] + r[2, 2], r[1, 0] - r[0, 1]),
+            (r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1], 1 + np.trace(r)),
+        )
+    )
+    row = squares[int(np.argmax(np.diag(squares)))]
+    return np.asarray(row / np.copysign(np.linalg.norm(row), row[3]))
+
+
 def inverse(pose: np.ndarray) -> np.ndarray:
     """Inverse of a 4 x 4 rigid motion."""
     result = np.eye(4)

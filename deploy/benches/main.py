@@ -153,15 +153,26 @@ def merge(asked: Asked) -> tuple[dict, dict]:
     """Maps of two robots that find together, of worlds of one kind; see `prior_sg.deploy.benches.merge`. Raises
     EvaluationError."""
     from prior_sg.deploy.benches.merge import merge_bench
+
+    return merge_bench(report=asked.report, **_worlds_of(asked, "merge"))
+
+
+def markers(asked: Asked) -> tuple[dict, dict]:
+    """The same by printed markers; see `prior_sg.deploy.benches.markers`. Raises EvaluationError."""
+    from prior_sg.deploy.benches.markers import markers_bench
+
+    return markers_bench(report=asked.report, **_worlds_of(asked, "markers"))
+
+
+def _worlds_of(asked: Asked, bench: str) -> dict[str, Any]:
+    """Seeds and kind of the worlds that were named, as keywords; none where none were. Raises EvaluationError."""
     from prior_sg.deploy.evaluation.datasets import named_worlds
     from prior_sg.deploy.evaluation.errors import EvaluationError
 
-    if not asked.paths:
-        return merge_bench(report=asked.report)
     worlds = [world for path in asked.paths for world in named_worlds(str(path))]
     if len({world.kind for world in worlds}) > 1:
-        raise EvaluationError("merge walks worlds of one kind: name one, such as world:home:80-91")
-    return merge_bench([world.seed for world in worlds], kind=worlds[0].kind, report=asked.report)
+        raise EvaluationError(f"{bench} walks worlds of one kind: name one, such as world:home:80-91")
+    return {"seeds": [world.seed for world in worlds], "kind": worlds[0].kind} if worlds else {}
 
 
 def e2e() -> tuple[dict, dict]:
@@ -215,10 +226,15 @@ LONG: dict[str, Callable[[Asked], tuple[dict, dict]]] = {  # no part of `all`; t
     "view": lambda asked: view(),  # needs an extra and a browser
     "hydra": lambda asked: hydra(),  # needs an extra
     "merge": merge,  # maps dozens of homes, which it keeps
+    "markers": markers,  # the same homes
 }
 
 
-TAKERS = {"on": ("places", "foresight", "merge"), "worlds": ("learning",), "seeds": ("foresight",)}  # by option
+TAKERS = {
+    "on": ("places", "foresight", "merge", "markers"),
+    "worlds": ("learning",),
+    "seeds": ("foresight",),
+}  # by option
 
 
 def learning_in_worlds(asked: Asked) -> tuple[dict, dict]:

@@ -49,6 +49,11 @@ def add_commands(commands: Commands) -> None:
         metavar="FILE",
         help=f"keeps the merged map's numbers from one start to the next (default: {MEMORY.format('NAME')})",
     )
+    fleet.add_argument(
+        "--without-markers",
+        action="store_true",
+        help="printed markers tell nothing of how maps lie (one was moved, or printed twice)",
+    )
     add_bus(fleet, robot=False)
 
 
@@ -70,6 +75,7 @@ def transforms_of(texts: list[str], robots: list[str], same_frame: bool) -> dict
 def cmd_fleet(arguments: argparse.Namespace) -> int:
     """Run the bridge."""
     from prior_sg.deploy.fleet.bridge import SERVICE
+    from prior_sg.deploy.fleet.core.finding.config import MatchConfig
     from prior_sg.deploy.fleet.core.update import Config
     from prior_sg.deploy.running.serve import stay
     from prior_sg.services.runtime.service import Identity
@@ -80,6 +86,7 @@ def cmd_fleet(arguments: argparse.Namespace) -> int:
             transforms=transforms_of(arguments.transform, arguments.robots, arguments.same_frame),
             stored=tuple(arguments.stored),
             memory=MEMORY.format(arguments.name) if arguments.memory is None else arguments.memory,
+            match=MatchConfig(markers=not arguments.without_markers),
         )
     except ValueError as error:
         raise UserError(str(error)) from error

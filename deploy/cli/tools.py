@@ -125,8 +125,8 @@ def _add_measuring(commands: Commands) -> None:
     bench.add_argument(
         "name",
         help="bus, places, features, kernel, swap, segmenter, task, learning, encoder_swap, queries, e2e, store, "
-        "memory, start, all of these, or exchange, fleet, foresight, levels, merge, pool, store_crashes, lidar, view, "
-        "hydra",
+        "memory, start, all of these, or exchange, fleet, foresight, levels, markers, merge, pool, store_crashes, "
+        "lidar, view, hydra",
     )
     bench.add_argument("--seconds", type=float, default=300.0, help="how long pool lasts (default: %(default)s)")
     bench.add_argument(
@@ -135,7 +135,7 @@ def _add_measuring(commands: Commands) -> None:
         type=Path,
         default=[],
         metavar="PATH",
-        help="measure places or merge on these instead, or map these for foresight, such as world:home:80-91",
+        help="measure places, merge or markers on these instead, or map these for foresight, such as world:home:80-91",
     )
     bench.add_argument("--seeds", type=int, default=0, help="of each kind of world, for foresight (default: all four)")
     bench.add_argument("--presets", nargs="+", default=["indoor"], help="of the place graph, with --on")

@@ -119,11 +119,7 @@ class Walks:
         self, part: Part, perception: Perception, frames: list[Keyframe], rng: np.random.Generator
     ) -> tuple[list[Keyframe], np.ndarray, tuple[Pyramid, ...]]:
         """The keyframes of a part as they are told, how they lie, and what is seen in them."""
-        chosen = frames[round(part.start * len(frames)) : max(round(part.stop * len(frames)), 1)]
-        poses, own_from_world = [np.array(frame.world_from_camera) for frame in chosen], np.eye(4)
-        if part.seed:
-            own_from_world = moved(rng)
-            poses = drifting([own_from_world @ pose for pose in poses], rng)
+        chosen, poses, own_from_world = told_poses(part, frames, rng)
         told = [
             msgspec.structs.replace(frame, robot=ROBOT, frame_id=number, world_from_camera=pose)
             for number, (frame, pose) in enumerate(zip(chosen, poses, strict=True))
@@ -155,6 +151,18 @@ class Walks:
         scene = Variant(self.config).run(Case(seen, dataset.prior, dataset.truth))
         objects = detected(dataset.objects, voxels, own_from_world, np.random.default_rng([seed, part.seed, 1]))
         return PartialMap(msgspec.structs.replace(scene, objects=objects), own_from_world, voxels)
+
+
+def told_poses(
+    part: Part, frames: list[Keyframe], rng: np.random.Generator
+) -> tuple[list[Keyframe], list[np.ndarray], np.ndarray]:
+    """The keyframes of a part, the poses (4, 4) that its robot tells of them, and how its frame lies to the world's."""
+    chosen = frames[round(part.start * len(frames)) : max(round(part.stop * len(frames)), 1)]
+    poses, own_from_world = [np.array(frame.world_from_camera) for frame in chosen], np.eye(4)
+    if part.seed:
+        own_from_world = moved(rng)
+        poses = drifting([own_from_world @ pose for pose in poses], rng)
+    return chosen, poses, own_from_world
 
 
 def keyframes(dataset: Dataset) -> list[Keyframe]:

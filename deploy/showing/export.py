@@ -17,6 +17,7 @@
                     frontier {direction [x, y, z], area_m2}, ellipse {half_axes_m, angle_rad}, hull_m [[x, y]]}]
     objects       [{id, label, probability, known, position_m, min_m, max_m, frames, place,    place = the nearest
                     members [{robot, session, id}]}]
+    markers       [{dictionary, id, size_m, position_m, quaternion_xyzw, frames, doubt}]   as schemas/markers.py has it
     edges         [{a, b, clearance_m}]           between places
     trajectory_m  [[x, y, z]]                     camera centres in order of time
     foresight     {is_predicted true, openings [{is_predicted true, place_id, position_m, beyond_m, width_m, region,
@@ -90,6 +91,7 @@ def scene_json(scene: Scene) -> dict[str, Any]:
             for row, place_id in enumerate(scene.place_ids.tolist())
         ],
         "objects": [_object_json(item, place) for item, place in objects_with_places(scene)],
+        "markers": [_plain(marker) for marker in scene.markers],
         "edges": [
             {"a": a, "b": b, "clearance_m": _short(clearance_m)}
             for (a, b), clearance_m in zip(scene.edges.tolist(), scene.clearances_m, strict=True)

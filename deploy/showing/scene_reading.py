@@ -7,6 +7,7 @@ import numpy as np
 
 from prior_sg.schemas.foresight import Foresight
 from prior_sg.schemas.levels import LevelNode
+from prior_sg.schemas.markers import SceneMarker
 from prior_sg.schemas.objects import SceneObject
 from prior_sg.schemas.regions import NO_REGION, Region
 from prior_sg.schemas.scene import Scene
@@ -41,6 +42,7 @@ def scene_of_json(told: dict[str, Any]) -> Scene:
         revision=-1,  # of no store
         nodes=[msgspec.convert(node, LevelNode) for node in told.get("levels", ())],  # files before had none
         foresight=msgspec.convert(told.get("foresight", {}), Foresight),
+        markers=[msgspec.convert(marker, SceneMarker) for marker in told.get("markers", ())],
         **_openings([place for place in places if place["frontier"]]),
         **_grounds([place for place in places if place["ellipse"]]),
     )

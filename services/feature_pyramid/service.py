@@ -38,7 +38,7 @@ def step(state: Worker, message: Message, cfg: Config) -> Iterator[Output]:
     split = len(seen.selection.crops)
     yield PYRAMID, pyramid(state, message, seen, embeddings[:split])
     if seen.sought or not state.detector.prompted:
-        yield DETECTIONS, detections(state, message, seen, embeddings[split:])
+        yield DETECTIONS, detections(state, message, seen, embeddings[split:], cfg)
 
 
 def answer_text(state: Worker, request: TextRequest, cfg: Config) -> TextEmbeddings:

@@ -15,6 +15,7 @@ from prior_sg.services import images, intent
 from prior_sg.services.feature_pyramid.core.config import Config
 from prior_sg.services.feature_pyramid.core.crops import Selection, coarse_surface, select_crops
 from prior_sg.services.feature_pyramid.core.lift import lift, object_crops
+from prior_sg.services.feature_pyramid.core.markers import NO_MARKERS, MarkersSeen, seen_markers
 from prior_sg.services.feature_pyramid.core.upright import quarter_turns, turned
 from prior_sg.services.feature_pyramid.detectors.base import Detector, Found, Shot
 from prior_sg.services.feature_pyramid.encoders.base import Encoder
@@ -23,6 +24,7 @@ from prior_sg.services.losses import Losses
 
 log = logging.getLogger(__name__)
 NOT_ENCODED, WITHOUT_CROPS = "keyframes not encoded", "keyframes without crops"
+MARKERS_LEFT_OUT = "markers left out"
 
 
 class View(NamedTuple):
@@ -34,6 +36,7 @@ class View(NamedTuple):
     points_camera_m: list[np.ndarray]  # of each object, (point, 3)
     crops: list[np.ndarray]  # RGB, uint8 (side, side, 3), upright: those selected, then one of each object
     surface_m: np.ndarray
+    markers: MarkersSeen
     fault: str  # why its images cannot be used; empty = they can
 
 
@@ -74,6 +77,8 @@ def look_at(state: Worker, frame: Keyframe, cfg: Config) -> tuple[View, np.ndarr
         reason = "no depth within range" if not seen.surface_m.any() else "no crop sees enough space at its depth"
         state.losses.add(WITHOUT_CROPS, reason, of=f"keyframe {frame.frame_id}")
         log.warning("keyframe without crops", extra={"frame": frame.frame_id, "reason": reason})
+    for fault in seen.markers.faults:
+        state.losses.add(MARKERS_LEFT_OUT, fault, of=f"keyframe {frame.frame_id}")
     return seen, state.encoded.pop(key) if key in state.encoded else encode(state, seen)
 
 
@@ -96,7 +101,9 @@ def view(frame: Keyframe, detector: Detector, sought: tuple[str, ...], cfg: Conf
     found, points_camera_m = lift(found, depth_m, camera, cfg)
     cut = selection.crops.cut(color) + object_crops(found, camera.width_px, camera.height_px).cut(color)
     crops = [turned(crop, quarter_turns(frame.world_from_camera)) for crop in cut]
-    return View(selection, sought, found, points_camera_m, crops, coarse_surface(depth_m, cfg.surface_cell_px), fault)
+    markers = NO_MARKERS if fault else seen_markers(color, depth_m, camera, cfg.markers)
+    surface_m = coarse_surface(depth_m, cfg.surface_cell_px)
+    return View(selection, sought, found, points_camera_m, crops, surface_m, markers, fault)
 
 
 def encode(state: Worker, seen: View) -> np.ndarray:
@@ -138,7 +145,7 @@ def pyramid(state: Worker, frame: Keyframe, seen: View, embeddings: np.ndarray) 
     )
 
 
-def detections(state: Worker, frame: Keyframe, seen: View, embeddings: np.ndarray) -> Detections:
+def detections(state: Worker, frame: Keyframe, seen: View, embeddings: np.ndarray, cfg: Config) -> Detections:
     """What association over time needs of a keyframe; also without objects, for a look that finds nothing counts."""
     return Detections(
         robot=frame.robot,
@@ -158,6 +165,11 @@ def detections(state: Worker, frame: Keyframe, seen: View, embeddings: np.ndarra
         surface_m=seen.surface_m.astype(np.float16),
         sought=list(seen.sought),
         names=np.array([one.name for one in seen.found if seen.sought], np.int16),
+        marker_dictionary=cfg.markers.dictionary,
+        marker_size_m=cfg.markers.size_m,
+        marker_ids=seen.markers.ids,
+        marker_sides_px=seen.markers.sides_px,
+        camera_from_marker=seen.markers.camera_from_marker,
     )
 
 

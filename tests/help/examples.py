@@ -8,6 +8,7 @@ from prior_sg.schemas import (
     foresight,
     frames,
     levels,
+    markers,
     members,
     objects,
     places,
@@ -175,6 +176,15 @@ OBJECT = objects.SceneObject(
     max_m=(1.5, 2.5, 1.0),
     frames=3,
     members=[MEMBER],
+)
+MARKER = markers.SceneMarker(
+    dictionary="apriltag_36h11",
+    id=7,
+    size_m=0.25,
+    position_m=(1.0, 2.0, 1.5),
+    quaternion_xyzw=(0.5, 0.5, 0.5, 0.5),
+    frames=3,
+    doubt="it has been seen at 2 spots",
 )
 SPOT = queries.Spot(point_m=(1.0, 2.0, 3.0), what="region", id=4, label="hall", here=True)
 FORESIGHT = foresight.Foresight(
@@ -467,6 +477,11 @@ EXAMPLES: list[Message] = [
         surface_m=f2([1, 2, 3], [4, 5, 6]),
         sought=["sink", "stove"],
         names=i2(1),
+        marker_dictionary="apriltag_36h11",
+        marker_size_m=0.25,
+        marker_ids=np.array([7], np.int32),
+        marker_sides_px=f4(40),
+        camera_from_marker=POSE[None],
     ),
     objects.ObjectDelta(
         robot="r",
@@ -478,6 +493,7 @@ EXAMPLES: list[Message] = [
         objects=[OBJECT],
         removed_ids=i8(7),
         merged_ids=i8([5, 4]),
+        markers=[MARKER],
     ),
     scene.SceneRevision(robot="r", epoch=1, revision=2, stamp_ns=3, places=4, edges=5, regions=6),
     scene.SceneRequest(robot="r", revision=7, stamp_ns=8),
@@ -522,6 +538,7 @@ EXAMPLES: list[Message] = [
         revision=9,
         nodes=[LEVEL_NODE],
         foresight=FORESIGHT,
+        markers=[MARKER],
     ),
     queries.SceneQuery(robot="r", questions=QUESTIONS),
     queries.SceneAnswer(robot="r", revision=2, stamp_ns=3, answers=ANSWERS),

@@ -2,11 +2,12 @@
 
 import numpy as np
 
+from prior_sg.schemas.markers import SceneMarker
 from prior_sg.schemas.objects import ObjectDelta, SceneObject
 from prior_sg.schemas.places import PlaceDelta
 from prior_sg.schemas.regions import Region, RegionDelta
 from prior_sg.schemas.scene import Scene
-from prior_sg.services.geometry import transform
+from prior_sg.services.geometry import quaternion_of, transform
 
 # label, x0, y0, x1, y1
 ROOMS = [
@@ -61,8 +62,28 @@ def places(rooms=ROOMS, step_m=STEP_M, offset_m=0.0):
     return spots, radii, owners, edges
 
 
-def scene(robot="r1", own_from_world=None, *, rooms=ROOMS, things=THINGS, offset_m=0.0, noise_m=0.0, seed=0, wrong=()):
-    """A map of some rooms, in a frame of its own; `wrong` numbers objects whose name is another's."""
+def marker(number, world_from_marker, doubt=""):
+    """A printed marker as a map has it."""
+    x, y, z = world_from_marker[:3, 3].tolist()
+    quaternion_xyzw = tuple(quaternion_of(world_from_marker).tolist())
+    fields = {"position_m": (x, y, z), "quaternion_xyzw": quaternion_xyzw, "frames": 4, "doubt": doubt}
+    return SceneMarker(dictionary="apriltag_36h11", id=number, size_m=0.2, **fields)
+
+
+def scene(
+    robot="r1",
+    own_from_world=None,
+    *,
+    rooms=ROOMS,
+    things=THINGS,
+    offset_m=0.0,
+    noise_m=0.0,
+    seed=0,
+    wrong=(),
+    markers=(),
+):
+    """A map of some rooms, in a frame of its own; `wrong` numbers objects whose name is another's; `markers` are
+    numbers and poses in the world."""
     pose = np.eye(4) if own_from_world is None else own_from_world
     rng = np.random.default_rng(seed)
     spots, radii, owners, edges = places(rooms, offset_m=offset_m)
@@ -118,6 +139,7 @@ def scene(robot="r1", own_from_world=None, *, rooms=ROOMS, things=THINGS, offset
         clearances_m=np.minimum(*radii[edges].T).astype(np.float32) if len(edges) else np.zeros(0, np.float32),
         trajectory=positions_m[:1].astype(np.float32),
         objects=objects,
+        markers=[marker(number, pose @ world_from_marker) for number, world_from_marker in markers],
     )
 
 
@@ -171,4 +193,5 @@ def deltas(held, epoch=1):
         snapshot=True,
         objects=held.objects,
         removed_ids=none,
+        markers=held.markers,
     )

@@ -134,6 +134,18 @@ def test_what_was_written_before_merged_maps_named_their_members_names_none(name
     assert decode(type(message), msgpack.packb(fields)) == msgspec.structs.replace(message, **bare)
 
 
+@pytest.mark.parametrize("name", ["Detections", "ObjectDelta", "Scene"])
+def test_what_was_written_before_markers_were_looked_for_has_none(name):
+    message = next(example for example in EXAMPLES if by_name(example) == name)
+    fields = msgpack.unpackb(encode(message), ext_hook=msgpack.ExtType)
+    added = {field for field in fields if "marker" in field}
+    assert added
+    found = decode(type(message), msgpack.packb({field: fields[field] for field in fields if field not in added}))
+    bare = {"markers": []} if name != "Detections" else {field: getattr(found, field) for field in added}
+    assert found == msgspec.structs.replace(message, **bare)
+    assert not any(len(getattr(found, field)) for field in added if field != "marker_size_m")
+
+
 def test_what_was_asked_before_routes_could_begin_here_begins_elsewhere():
     asked = msgpack.packb({"point_m": [1.0, 2.0, 3.0], "what": None, "id": None, "label": ""})
     assert msgspec.msgpack.decode(asked, type=Spot) == Spot(point_m=(1.0, 2.0, 3.0))

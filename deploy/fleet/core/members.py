@@ -6,6 +6,7 @@ import numpy as np
 
 from prior_sg.deploy.fleet.core.finding.matching import Map, map_of
 from prior_sg.deploy.fleet.core.ids import Name
+from prior_sg.schemas.markers import MarkerKey
 from prior_sg.schemas.objects import ObjectDelta
 from prior_sg.schemas.places import PlaceDelta
 from prior_sg.schemas.regions import RegionDelta
@@ -37,6 +38,7 @@ class Member:
     relation: Relation | None = None
     why: str = "it has not been looked at yet"  # there is no relation
     tried_places: int = 0  # of the map when a relation was last sought
+    tried_markers: frozenset[MarkerKey] = frozenset()  # that it shared then
     changed: bool = True  # since the merged scene was last made
     unfitted: bool = True  # changed since the relation was last looked at
     _map: Map | None = None
@@ -56,6 +58,10 @@ class Member:
         """Of the map's trajectory."""
         graph = self.graph
         return [frame for frame, seen in sorted(graph.sightings.items()) if seen.epoch == graph.place_cursor.epoch]
+
+    def sure_markers(self) -> set[MarkerKey]:
+        """The markers that stand at one spot."""
+        return {key for key, marker in self.graph.markers.items() if not marker.doubt}
 
     def touch(self) -> None:
         """Something of the map has changed."""
@@ -161,6 +167,7 @@ def member_of_scene(scene: Scene, session: int = 0) -> Member:
     }
     graph.regions = {region.id: region for region in scene.regions}
     graph.objects = {item.id: item for item in scene.objects}
+    graph.markers = {marker.key: marker for marker in scene.markers}
     graph.alignment = scenes.Alignment(
         scene.prior_digest, scene.environment, scene.task, scene.space, tuple(scene.labels)
     )

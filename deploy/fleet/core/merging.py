@@ -10,6 +10,7 @@ import numpy as np
 from prior_sg.deploy.fleet.core.believing import Believed, believed
 from prior_sg.deploy.fleet.core.fusing import Fused, Placed, fused, openings
 from prior_sg.deploy.fleet.core.ids import Ids, Name
+from prior_sg.deploy.fleet.core.marks import markers_of
 from prior_sg.deploy.fleet.core.things import joined, things_of
 from prior_sg.schemas.members import MapMember
 from prior_sg.schemas.objects import SceneObject
@@ -92,6 +93,7 @@ def merged(robot: str, sources: Sequence[Source], memory: Memory) -> Merged:
         frontier_directions=directions.astype(np.float32),
         frontier_areas_m2=areas.astype(np.float32),
         origin_m=maps[0].scene.origin_m,
+        markers=markers_of(maps),
     )
     return Merged(scene, frame_ids)
 

@@ -6,9 +6,11 @@ from dataclasses import dataclass, field
 import msgspec
 import numpy as np
 
+from prior_sg.deploy.fleet.core.marks import GONE
 from prior_sg.deploy.fleet.core.merging import Merged
 from prior_sg.deploy.told import ToldGraph, ToldObjects
 from prior_sg.schemas.codec import Message
+from prior_sg.schemas.markers import MarkerKey, SceneMarker
 from prior_sg.schemas.objects import ObjectDelta
 from prior_sg.schemas.places import PlaceDelta
 from prior_sg.schemas.regions import RegionDelta
@@ -29,6 +31,7 @@ class Teller:
     graph: ToldGraph = field(default_factory=ToldGraph)
     objects: ToldObjects = field(default_factory=ToldObjects)
     regions: Ledger = field(default_factory=Ledger)
+    markers: dict[MarkerKey, SceneMarker] = field(default_factory=dict)
     cameras_m: dict[int, np.ndarray] = field(default_factory=dict)  # (3,) by frame id
     place_revision: int = -1
     object_revision: int = -1
@@ -48,9 +51,12 @@ class Teller:
         if delta is not None:
             yield delta
         news, gone = self.objects.follow(scene.objects, min_change_m)
-        if news or gone:
+        marks = self._marks(scene)
+        if news or gone or marks:
             self.object_revision += 1
-            yield msgspec.structs.replace(self._objects(), objects=news, removed_ids=np.array(gone, np.int64))
+            self.markers |= {marker.key: marker for marker in marks}
+            removed_ids = np.array(gone, np.int64)
+            yield msgspec.structs.replace(self._objects(), objects=news, removed_ids=removed_ids, markers=marks)
 
     def places_snapshot(self) -> PlaceDelta:
         """Everything that was told of places."""
@@ -63,7 +69,14 @@ class Teller:
 
     def objects_snapshot(self) -> ObjectDelta:
         """Everything that was told of objects."""
-        return msgspec.structs.replace(self._objects(), snapshot=True, objects=self.objects.all())
+        markers = [marker for _, marker in sorted(self.markers.items())]
+        return msgspec.structs.replace(self._objects(), snapshot=True, objects=self.objects.all(), markers=markers)
+
+    def _marks(self, scene: Scene) -> list[SceneMarker]:
+        """Markers that are new, stand otherwise or are gone."""
+        now = {marker.key: marker for marker in scene.markers}
+        gone = {key: msgspec.structs.replace(self.markers[key], doubt=GONE) for key in self.markers.keys() - now.keys()}
+        return [marker for key, marker in sorted((now | gone).items()) if self.markers.get(key) != marker]
 
     def _heading(self, event: str) -> Heading:
         stamp_ns, origin_m = (0, (0.0, 0.0, 0.0)) if self.scene is None else (self.scene.stamp_ns, self.scene.origin_m)

@@ -12,14 +12,14 @@ import numpy as np
 
 from prior_sg.deploy.fleet.core.finding.config import MatchConfig
 from prior_sg.deploy.fleet.core.finding.frames import apart, level
-from prior_sg.deploy.fleet.core.finding.matching import fault_of, map_of, match, weighed
-from prior_sg.deploy.fleet.core.finding.refine import refined
+from prior_sg.deploy.fleet.core.finding.matching import again, map_of, match
 from prior_sg.deploy.fleet.core.ids import Name
 from prior_sg.deploy.fleet.core.members import Delta, Followed, Member, Relation
 from prior_sg.deploy.fleet.core.merging import Memory, Merged, Source, merged
 from prior_sg.deploy.fleet.core.sessions import Change, Present, remembered, said
 from prior_sg.deploy.fleet.core.telling import Teller
 from prior_sg.schemas.codec import Message
+from prior_sg.schemas.markers import MarkerKey
 from prior_sg.schemas.names import fault_of_robot
 from prior_sg.schemas.objects import ObjectDelta
 from prior_sg.schemas.places import PlaceDelta
@@ -31,7 +31,6 @@ from prior_sg.services.scene_store.core import graph as scenes
 
 GROWN = 1.1  # times as many places as when it was looked at last: a map is looked at again
 REST_TICKS = 5  # from one fitting of a relation to the next, of a map that changes and hardly grows
-DOUBT = 0.8  # of what is asked for when maps are first related: a relation that has less is given up
 
 
 class Config(msgspec.Struct, frozen=True, kw_only=True):
@@ -196,7 +195,8 @@ def relate(state: State, cfg: Config) -> None:
         first.relation, first.why = Relation(np.eye(4), given=True, places=len(first.graph.places)), ""
         state.events.append(f"the frame of {first.name.robot} is that of {state.robot}")
     for one in members:
-        if one.relation is None and len(one.graph.places) >= GROWN * one.tried_places:
+        grown = len(one.graph.places) >= GROWN * one.tried_places
+        if one.relation is None and (grown or _shared(one, members) != one.tried_markers):
             _seek(state, one, members, cfg)
         elif one.to_fit and _due(state, one):
             _correct(state, one, members, cfg)
@@ -235,19 +235,28 @@ def _others(state: State, one: Member, members: list[Member]) -> Scene | None:
     return merged_of(state.robot, others, Memory())[0].scene if others else None
 
 
+def _shared(one: Member, members: list[Member]) -> frozenset[MarkerKey]:
+    """The markers of a map that related ones are sure of, too."""
+    related = [other for other in members if other is not one and other.relation is not None]
+    return frozenset(one.sure_markers() & {key for other in related for key in other.sure_markers()})
+
+
 def _seek(state: State, one: Member, members: list[Member], cfg: Config) -> None:
     """Match an unrelated map with all that are related."""
     others = _others(state, one, members)
-    one.tried_places = len(one.graph.places)
+    one.tried_places, one.tried_markers = len(one.graph.places), _shared(one, members)
     if others is None:
         return
     found = match(one.map(), map_of(others), cfg.match)
+    if found.by_markers and found.why and found.why != one.why:
+        state.events.append(f"{one.name.robot} is not merged: {found.why}")
     one.why = found.why
     if found.b_from_a is not None:
         one.relation = Relation(found.b_from_a, given=False, places=len(one.graph.places), tick=state.ticks)
         one.touch()
         one.unfitted = False
-        state.events.append(f"{one.name.robot} has been found in the map of {state.robot}")
+        way = " by markers" if found.by_markers else ""
+        state.events.append(f"{one.name.robot} has been found in the map of {state.robot}{way}")
 
 
 def _correct(state: State, one: Member, members: list[Member], cfg: Config) -> None:
@@ -256,13 +265,9 @@ def _correct(state: State, one: Member, members: list[Member], cfg: Config) -> N
     others = _others(state, one, members)
     if others is None:
         return
-    other = map_of(others)
-    pose = refined(one.relation.fleet_from_own, one.map().shape, other.shape)
-    evidence = weighed(pose, one.map(), other).evidence
-    lenient = msgspec.structs.replace(
-        cfg.match, fitting_least=DOUBT * cfg.match.fitting_least, landmarks_least=0, evidence_least=0.0
-    )
-    if not fault_of(evidence, lenient):
+    found = again(one.relation.fleet_from_own, one.map(), map_of(others), cfg.match)
+    pose = found.b_from_a
+    if pose is not None:
         gap_m, gap_rad = apart(pose, one.relation.fleet_from_own, one.map().shape.centers_m.mean(axis=0))
         moves = gap_m > cfg.min_change_m or gap_rad > cfg.min_change_m
         kept = pose if moves else one.relation.fleet_from_own
@@ -270,11 +275,11 @@ def _correct(state: State, one: Member, members: list[Member], cfg: Config) -> N
         one.unfitted = False
         one.changed |= moves
         return
-    one.relation = None
+    one.relation, one.why = None, found.why
     state.memory.frames.pop(one.written, None)
     _seek(state, one, members, cfg)
     if one.relation is None:
-        state.events.append(f"{one.name.robot} fits no longer: {fault_of(evidence, lenient)}")
+        state.events.append(f"{one.name.robot} fits no longer: {found.why}")
         one.touch()
 
 

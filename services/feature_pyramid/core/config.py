@@ -3,6 +3,7 @@
 import msgspec
 
 from prior_sg.schemas.features import DEFAULT_SPACE
+from prior_sg.services.feature_pyramid.core.markers import MarkersConfig
 from prior_sg.services.feature_pyramid.core.segments import SegmentsConfig
 from prior_sg.services.images import MAX_PRINCIPAL_OFFSET
 
@@ -29,6 +30,7 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
     detector_threshold: float = 0.3  # least score of what those find; the networks' authors advise 0.2 to 0.35
     object_point_m: float = 0.05  # side of the cubes of which a detection keeps one point each
     segments: SegmentsConfig = SegmentsConfig()  # of the detector segments; its grid is every detector's
+    markers: MarkersConfig = MarkersConfig()  # printed ones, by which maps of several robots find together
 
     def __post_init__(self) -> None:
         if self.smallest_crop_px < 0 or self.layers < 1 or self.surface_cell_px < 1:

@@ -16,8 +16,10 @@ CANDIDATES = 4  # former places looked at for each
 
 
 def legacy_of(told: PlaceDelta | Scene, next_id: int = 0) -> Legacy:
-    """What a snapshot or the stored scene says; `next_id` where more is known."""
-    frames = frozenset(told.past_frame_ids.tolist()) if isinstance(told, PlaceDelta) else frozenset()
+    """What a snapshot or the stored scene says; `next_id` where more is known. No keyframe has a negative number: one
+    that a snapshot names cannot be asked for."""
+    past = told.past_frame_ids.tolist() if isinstance(told, PlaceDelta) else []
+    frames = frozenset(frame_id for frame_id in past if frame_id >= 0)
     ids = np.array(told.place_ids)
     return Legacy(ids, np.array(told.positions_m, np.float64), max(next_id, int(ids.max(initial=-1)) + 1), frames)
 

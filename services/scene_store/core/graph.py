@@ -13,6 +13,7 @@ import numpy as np
 
 from prior_sg.schemas.foresight import Foresight
 from prior_sg.schemas.levels import LevelName, LevelNode, rank
+from prior_sg.schemas.markers import MarkerKey, SceneMarker
 from prior_sg.schemas.objects import ObjectDelta, SceneObject
 from prior_sg.schemas.places import PlaceDelta
 from prior_sg.schemas.priors import Task
@@ -100,6 +101,7 @@ class Graph:
     nodes: dict[tuple[LevelName, int], LevelNode] = field(default_factory=dict)  # of the levels above regions
     beliefs: dict[int, Belief] = field(default_factory=dict)  # by place id
     objects: dict[int, SceneObject] = field(default_factory=dict)
+    markers: dict[MarkerKey, SceneMarker] = field(default_factory=dict)
     alignment: Alignment = field(default_factory=Alignment)
     foresight: Foresight = field(default_factory=Foresight)
     task: Task | None = None
@@ -215,12 +217,14 @@ def apply_objects(graph: Graph, delta: ObjectDelta) -> Changes:
     changes = Changes(replaced=delta.snapshot or delta.epoch != graph.object_cursor.epoch)
     if changes.replaced:
         graph.objects.clear()
+        graph.markers.clear()
     for gone in [*delta.removed_ids.tolist(), *delta.merged_ids[:, 0].tolist()]:
         graph.objects.pop(gone, None)
         changes.objects.add(gone)
     for entry in delta.objects:
         graph.objects[entry.id] = entry
         changes.objects.add(entry.id)
+    graph.markers.update({marker.key: marker for marker in delta.markers})
     graph.object_cursor = Cursor(delta.epoch, delta.revision, delta.stamp_ns)
     graph.revision += 1
     return changes
@@ -302,6 +306,7 @@ def scene(graph: Graph) -> Scene:
         revision=graph.revision,
         nodes=sorted(graph.nodes.values(), key=rank),
         foresight=graph.foresight,
+        markers=[graph.markers[key] for key in sorted(graph.markers)],
         **_details(graph),
     )
 

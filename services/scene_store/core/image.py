@@ -7,6 +7,7 @@ import numpy as np
 from prior_sg.schemas.codec import Message, Shape
 from prior_sg.schemas.foresight import Foresight
 from prior_sg.schemas.levels import LevelNode
+from prior_sg.schemas.markers import SceneMarker
 from prior_sg.schemas.objects import SceneObject
 from prior_sg.schemas.priors import Task
 from prior_sg.schemas.regions import Region
@@ -48,6 +49,7 @@ class GraphImage(Message, frozen=True, kw_only=True):
     given: Task | None  # the newest task
     nodes: list[LevelNode] = []
     foresight: Foresight = Foresight()
+    markers: list[SceneMarker] = []
 
 
 def image_of(graph: core.Graph) -> GraphImage:
@@ -88,6 +90,7 @@ def image_of(graph: core.Graph) -> GraphImage:
         given=graph.task,
         nodes=list(graph.nodes.values()),
         foresight=graph.foresight,
+        markers=list(graph.markers.values()),
     )
 
 
@@ -102,6 +105,7 @@ def graph_of(image: GraphImage) -> core.Graph:
     }
     _restore_regions(graph, image)
     graph.objects = {entry.id: entry for entry in image.objects}
+    graph.markers = {entry.key: entry for entry in image.markers}
     return graph
 
 

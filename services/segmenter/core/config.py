@@ -16,6 +16,7 @@ from prior_sg.services.segmenter.core.experts.context import ObjectSettings
 from prior_sg.services.segmenter.core.foresight.config import ForesightConfig
 from prior_sg.services.segmenter.core.layers.stacking import LayersConfig
 from prior_sg.services.segmenter.core.map.inclination import GeometryConfig
+from prior_sg.services.segmenter.core.objects.markers import MarkerConfig
 from prior_sg.services.segmenter.core.objects.sizes import SizeConfig
 from prior_sg.services.segmenter.core.objects.track import TrackingConfig
 
@@ -53,6 +54,7 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
     geometry: GeometryConfig = msgspec.field(default_factory=GeometryConfig)
     objects: ObjectSettings = msgspec.field(default_factory=ObjectSettings)
     tracking: TrackingConfig = msgspec.field(default_factory=TrackingConfig)
+    markers: MarkerConfig = msgspec.field(default_factory=MarkerConfig)
     sizes: SizeConfig = msgspec.field(default_factory=SizeConfig)
     beta: float = 2.0  # weight of the pairwise term (paper)
     adjacency: AdjacencyConfig = msgspec.field(default_factory=AdjacencyConfig)  # beyond the paper

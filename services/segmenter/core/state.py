@@ -13,6 +13,7 @@ from prior_sg.services.segmenter.core.evidence.seen import Seen
 from prior_sg.services.segmenter.core.labelling import Labelling
 from prior_sg.services.segmenter.core.layers.layer_map import LayerMap
 from prior_sg.services.segmenter.core.map.place_map import PlaceMap
+from prior_sg.services.segmenter.core.objects.markers import MarkerMap
 from prior_sg.services.segmenter.core.objects.object_map import ObjectMap
 from prior_sg.services.segmenter.core.objects.tracks import Tracks
 from prior_sg.services.segmenter.core.prior_report import PriorReport
@@ -30,6 +31,7 @@ class State:
     seen: Seen
     objects: ObjectMap
     labelling: Labelling
+    markers: MarkerMap = field(default_factory=MarkerMap)
     map: PlaceMap = field(default_factory=PlaceMap)
     regions: RegionMap = field(default_factory=RegionMap)
     layers: LayerMap = field(default_factory=LayerMap)

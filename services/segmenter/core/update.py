@@ -41,6 +41,7 @@ def update(state: State, message: Message, cfg: Config) -> Iterator[Message]:
         return
     if switched or idle:
         yield from follow_objects(state, cfg)
+        yield from follow_markers(state, cfg)
     if switched or (state.labelling.dirty and isinstance(message, Pyramid | Tick)):
         yield from _segment(state, switched, idle, cfg)
     if idle and state.report.due(not state.labelling.dirty, cfg.evidence_ticks):
@@ -103,14 +104,16 @@ def observe(state: State, pyramid: Pyramid, cfg: Config) -> None:
 
 
 def detect(state: State, detections: Detections, cfg: Config) -> None:
-    """Associate one frame's detections; those of a space that is not in force wait for it, if it may take over."""
+    """Associate one frame's detections; those of a space that is not in force wait for it, if it may take over. Of
+    markers all tell the same, whatever the space."""
+    pose = state.corrections.pose(detections.frame_id, detections.world_from_camera)
+    state.markers.observe(detections, pose, cfg.markers)
     if state.catching_up.silent and state.objects.holds(detections):
         return
     of = f"keyframe {detections.frame_id}, {detections.space}"
     if detections.space != state.seen.spaces.force and not cfg.spaces.follow:
         state.seen.losses.add("detections ignored", "their space is not in force", of=of)
         return
-    pose = state.corrections.pose(detections.frame_id, detections.world_from_camera)
     if state.objects.observe(msgspec.structs.replace(detections, world_from_camera=pose), cfg.tracking):
         state.heard(detections.stamp_ns)
     else:
@@ -126,6 +129,7 @@ def correct_poses(state: State, update: PoseUpdate, cfg: Config) -> None:
     if poses is None:
         return
     state.objects.move(poses)
+    state.markers.move(poses)
     affected = np.flatnonzero(state.seen.move(poses, state.map.graph.positions_m, cfg))
     if len(affected):
         _integrate_afresh(state, affected, cfg)
@@ -185,6 +189,16 @@ def follow_objects(state: State, cfg: Config) -> Iterator[ObjectDelta]:
     if delta is not None:
         if prior is not None:
             inference.see_objects(state, objects.ledger.view(), cfg)
+        yield delta
+
+
+def follow_markers(state: State, cfg: Config) -> Iterator[ObjectDelta]:
+    """Tell which markers stand where; they wait for no prior."""
+    ledger = state.objects.ledger
+    delta = ledger.tell_markers(
+        state.robot, state.epoch, state.stamp_ns, state.markers.news(ledger.markers, cfg.markers)
+    )
+    if delta is not None:
         yield delta
 
 

@@ -12,7 +12,7 @@ from prior_sg.deploy.cli import check as command
 from prior_sg.deploy.cli.main import main
 from prior_sg.deploy.inspecting.beside import truth_beside
 from prior_sg.deploy.inspecting.check import check, kind_of, look
-from prior_sg.services.ingest.core.inspection.conventions import quaternion_of
+from prior_sg.services.geometry import quaternion_of
 from prior_sg.services.ingest.core.selection import Config
 from prior_sg.services.ingest.sources import SourceError, open_source
 from tests.help import room

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from prior_sg.schemas.frames import Intrinsics
-from prior_sg.services.geometry import pose_from_quaternion
+from prior_sg.services.geometry import pose_from_quaternion, quaternion_of
 from prior_sg.services.ingest.core.inspection import Picker, Reading, Recording, Shot, conventions, gravity, inspect
-from prior_sg.services.ingest.core.inspection.conventions import quaternion_of, rotations
+from prior_sg.services.ingest.core.inspection.conventions import rotations
 from prior_sg.services.ingest.core.inspection.sample import pairs_of
 from tests.help import room
 

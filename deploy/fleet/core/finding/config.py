@@ -23,4 +23,8 @@ class MatchConfig(msgspec.Struct, frozen=True, kw_only=True):
     fitting_least: float = 0.55  # share of the walls that both can tell of and both have
     landmarks_least: int = 3  # objects that agree
     evidence_least: float = 8.0  # log-likelihood ratio of all that was found, against chance
+    markers: bool = True  # whether printed markers that both maps show are followed
+    markers_m: float = 0.3  # by which shared markers may lie apart
+    markers_rad: float = 0.35  # or be turned to each other
+    markers_walls_least: int = 20  # points of walls from which on walls may contradict markers
     rival_most: float = 0.6  # of the best one's evidence that a second hypothesis may have

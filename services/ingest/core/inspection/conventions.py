@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 import msgspec
 import numpy as np
 
-from prior_sg.services.geometry import inverse, pose_from_quaternion
+from prior_sg.services.geometry import inverse, pose_from_quaternion, quaternion_of
 from prior_sg.services.ingest.core.agreement import NOTHING, Agreement, DepthView, agreement, grid_points, with_poses
 from prior_sg.services.ingest.core.detection import LIKELY_M
 from prior_sg.services.ingest.core.inspection.findings import Finding, note, ok, problem
@@ -342,21 +342,6 @@ def _reordered(motion: np.ndarray, order: str) -> np.ndarray:
     """The motion whose quaternion has the numbers of this one's read in `order` instead of the other one."""
     quaternion_xyzw = quaternion_of(motion)
     return pose_from_quaternion(motion[:3, 3], np.roll(quaternion_xyzw, -1 if order == "wxyz" else 1))
-
-
-def quaternion_of(motion: np.ndarray) -> np.ndarray:
-    """x y z w of a rigid motion's rotation, up to the sign of all."""
-    r = motion[:3, :3]
-    squares = np.array(  # four times the products of the components, row by row
-        (
-            (1 + r[0, 0] - r[1, 1] - r[2, 2], r[0, 1] + r[1, 0], r[0, 2] + r[2, 0], r[2, 1] - r[1, 2]),
-            (r[0, 1] + r[1, 0], 1 - r[0, 0] + r[1, 1] - r[2, 2], r[1, 2] + r[2, 1], r[0, 2] - r[2, 0]),
-            (r[0, 2] + r[2, 0], r[1, 2] + r[2, 1], 1 - r[0, 0] - r[1, 1] + r[2, 2], r[1, 0] - r[0, 1]),
-            (r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1], 1 + np.trace(r)),
-        )
-    )
-    row = squares[int(np.argmax(np.diag(squares)))]
-    return row / np.linalg.norm(row)
 
 
 def _score(found: Agreement) -> float:

@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from prior_sg.schemas.markers import MarkerKey, SceneMarker
 from prior_sg.schemas.objects import ObjectDelta, SceneObject
 from prior_sg.services.segmenter.core.experts.context import ObjectView
 from prior_sg.services.segmenter.core.objects.names import Named
@@ -16,6 +17,7 @@ class ObjectLedger:
     """What followers know."""
 
     told: dict[int, Named] = field(default_factory=dict)
+    markers: dict[MarkerKey, SceneMarker] = field(default_factory=dict)
     digest: str = ""
     revision: int = -1
     stamp_ns: int = 0
@@ -35,7 +37,9 @@ class ObjectLedger:
 
     def snapshot(self, robot: str, epoch: int) -> ObjectDelta:
         """Everything told so far; before the first delta, the empty state that it follows on."""
-        return self._delta(robot, epoch, [item.entry for _, item in sorted(self.told.items())], snapshot=True)
+        entries = [item.entry for _, item in sorted(self.told.items())]
+        markers = [marker for _, marker in sorted(self.markers.items())]
+        return self._delta(robot, epoch, entries, markers=markers, snapshot=True)
 
     def tell(
         self,
@@ -65,6 +69,14 @@ class ObjectLedger:
         self.digest, self.revision, self.stamp_ns = digest, self.revision + 1, stamp_ns
         return self._delta(robot, epoch, [item.entry for item in upserts], removed, joined)
 
+    def tell_markers(self, robot: str, epoch: int, stamp_ns: int, news: list[SceneMarker]) -> ObjectDelta | None:
+        """The delta of markers that stand otherwise than was told; None without any."""
+        if not news:
+            return None
+        self.markers |= {marker.key: marker for marker in news}
+        self.revision, self.stamp_ns = self.revision + 1, stamp_ns
+        return self._delta(robot, epoch, [], markers=news)
+
     def _delta(
         self,
         robot: str,
@@ -73,6 +85,7 @@ class ObjectLedger:
         removed: list[int] | None = None,
         joined: list[tuple[int, int]] | None = None,
         *,
+        markers: list[SceneMarker] | None = None,
         snapshot: bool = False,
     ) -> ObjectDelta:
         return ObjectDelta(
@@ -85,6 +98,7 @@ class ObjectLedger:
             objects=entries,
             removed_ids=np.array(removed or [], np.int64),
             merged_ids=np.array(joined or [], np.int64).reshape(-1, 2),
+            markers=markers or [],
         )
 
 
