@@ -15,6 +15,7 @@ from prior_sg.deploy.evaluation.robots import WalkingRobot
 from prior_sg.deploy.fleet.bridge import SERVICE as FLEET
 from prior_sg.deploy.fleet.core.update import Config
 from prior_sg.deploy.running.inprocess import InProcess
+from prior_sg.schemas.levels import regions_in
 from prior_sg.schemas.places import PlaceDelta
 from prior_sg.schemas.scene import Scene, SceneRequest
 from prior_sg.schemas.topics import PLACE_DELTA, SCENE
@@ -100,6 +101,12 @@ def _in_turn(robots: list[WalkingRobot]) -> Iterator[list]:
 
 
 def summary(scene: Scene) -> str:
-    """The merged map in one sentence."""
-    regions = ", ".join(f"{region.label} {region.area_m2:.0f} m2" for region in scene.regions)
-    return f"{len(scene.place_ids)} places, {len(scene.objects)} objects, {len(scene.regions)} regions: {regions}"
+    """The merged map in one sentence, its regions by floor."""
+    on, counts = regions_in(scene.nodes, "floor"), f"{len(scene.place_ids)} places, {len(scene.objects)} objects"
+    floors = [
+        f"{node.label}: "
+        + ", ".join(f"{one.label} {one.area_m2:.0f} m2" for one in scene.regions if on[one.id] == node.id)
+        for node in scene.nodes
+        if node.level == "floor"
+    ]
+    return f"{counts}, {len(scene.regions)} regions; {'; '.join(floors)}"
