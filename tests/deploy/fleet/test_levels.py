@@ -1,5 +1,7 @@
 """Levels of the merged map: storeys, floors and buildings of its geometry, zones of a robot's prior, ids that last."""
 
+import json
+
 import msgspec
 import numpy as np
 import pytest
@@ -9,6 +11,11 @@ from prior_sg.deploy.fleet.core.finding.frames import level
 from prior_sg.deploy.fleet.core.ids import Name
 from prior_sg.deploy.fleet.core.levels import in_force, names_levels
 from prior_sg.deploy.fleet.core.merging import Memory, Source, levelled, merged
+from prior_sg.deploy.showing.dsg import save_spark_dsg
+from prior_sg.deploy.showing.dsg_reading import load_spark_dsg
+from prior_sg.deploy.showing.export import scene_json
+from prior_sg.deploy.showing.scene_reading import scene_of_json
+from prior_sg.deploy.viewing.drawing import Painter
 from prior_sg.schemas.levels import LevelNode, regions_in
 from prior_sg.services.geometry import inverse
 from prior_sg.services.segmenter.core.layers.layer_map import LayerMap
@@ -116,6 +123,17 @@ def test_levels_are_found_again_only_where_a_region_has_changed(monkeypatch):
     (changed,) = asked[1:]
     assert {region.label for region in again.regions if region.id in changed} == {"bedroom"}
     assert again.nodes == found(sources, Memory(), PRIOR).nodes  # as when all of it is found at once
+
+
+def test_files_and_the_page_know_the_levels_of_a_merged_map(tmp_path):
+    scene = found(below_and_above(), Memory(), PRIOR)
+    told = json.loads(json.dumps(scene_json(scene)))
+    assert [level["label"] for level in told["levels"] if level["level"] == "floor"] == ["floor 0", "floor 1"]
+    assert scene_of_json(told).nodes == scene.nodes
+    save_spark_dsg(scene, tmp_path / "dsg.json")
+    assert load_spark_dsg(tmp_path / "dsg.json").nodes == scene.nodes
+    drawn = Painter().draw(scene)
+    assert {f"/floors/{node.id}/name" for node in scene.nodes if node.level == "floor"} <= drawn.keys()
 
 
 @pytest.mark.parametrize(
