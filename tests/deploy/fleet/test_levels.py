@@ -115,10 +115,10 @@ def test_levels_are_found_again_only_where_a_region_has_changed(monkeypatch):
     assert found(sources, memory, PRIOR).nodes == scene.nodes and asked == [None]
     first = sources[0].scene
     bedroom = next(region.id for region in first.regions if region.label == "bedroom")
-    surer = first.posteriors.copy()
-    surer[first.place_regions == bedroom] = 0.001
-    surer[first.place_regions == bedroom, houses.LABELS.index("bedroom")] = 0.995
-    sources[0] = sources[0]._replace(scene=msgspec.structs.replace(first, posteriors=surer))
+    other = first.posteriors.copy()  # the region is described as before, but its next likely label is another
+    for label, value in (("bathroom", 0.03), ("kitchen", 0.01)):
+        other[first.place_regions == bedroom, houses.LABELS.index(label)] = value
+    sources[0] = sources[0]._replace(scene=msgspec.structs.replace(first, posteriors=other))
     again = found(sources, memory, PRIOR)
     (changed,) = asked[1:]
     assert {region.label for region in again.regions if region.id in changed} == {"bedroom"}
