@@ -185,8 +185,8 @@ def worth(walks: Walks, outcome: Outcome) -> dict[str, float]:
         if score in WORTH
     }
     for name, scene in scenes.items():
-        for above, score in level_scores(scene, whole.voxels, truth).items():
-            found |= {f"f1_s_{above}_{name}": score["f1_s"], f"f1_g_{above}_{name}": score["f1_g"]}
+        for above, of_level in level_scores(scene, whole.voxels, truth).items():
+            found |= {f"{score}_{above}_{name}": value for score, value in of_level.items()}
     found["f1_s_better_part"] = max(evaluate(scene, whole.voxels, truth)["f1_s"] for scene in alone)
     there: dict[str, list[float]] = {}
     for part in alone:
