@@ -131,14 +131,16 @@ def tall(robot="r1", own_from_world=None, *, below=ROOMS, above=ROOMS):
         if not rooms:
             continue
         one = scene(robot, rooms=rooms, things=[])
+        radii_m = np.minimum(one.radii_m, 0.4 * STOREY_M)
         spots = one.positions_m.astype(float)
-        spots[:, 2] = number * STOREY_M + one.radii_m  # each place's free space ends at the floor
+        spots[:, 2] = number * STOREY_M + radii_m  # each place's free space ends at the floor
         hallways += [int(p) + places for p in one.place_ids if rooms[one.place_regions[p]][0] == "hallway"][:1]
         storeys.append(
             msgspec.structs.replace(
                 one,
                 place_ids=one.place_ids + places,
                 positions_m=transform(pose, spots).astype(np.float32),
+                radii_m=radii_m,
                 place_regions=one.place_regions + regions,
                 edges=one.edges + places,
                 regions=[msgspec.structs.replace(region, id=region.id + regions) for region in one.regions],
@@ -151,9 +153,7 @@ def tall(robot="r1", own_from_world=None, *, below=ROOMS, above=ROOMS):
         storeys[0],
         regions=[region for one in storeys for region in one.regions],
         edges=np.concatenate([*(one.edges for one in storeys), stairs]),
-        clearances_m=np.concatenate(
-            [*(one.clearances_m for one in storeys), np.full(len(stairs), DOOR_M, np.float32)]
-        ),
+        clearances_m=np.concatenate([*(one.clearances_m for one in storeys), np.full(len(stairs), DOOR_M, np.float32)]),
         **{name: np.concatenate([getattr(one, name) for one in storeys]) for name in columns},
     )
 
