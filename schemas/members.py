@@ -7,7 +7,7 @@ class MapMember(Part, frozen=True, kw_only=True):
     """One robot's region or object that a merged one is made of."""
 
     robot: str
-    session: Number = 0  # of the robot's map, as the merged map counts them; the highest is the present one
+    session: Number = 0  # of the robot's map, as the merged map counts them; never another's
     id: int  # in that map
 
 

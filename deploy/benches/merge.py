@@ -5,7 +5,8 @@ matcher's answer is right when it is within RIGHT_M at the middle of the first m
 part is then matched with the parts of other homes: any answer but a refusal is a false accept. Where maps have found
 together, the merged scene is judged beside one walk through the whole home, with and without drift, and, where a part
 has been, beside that part: scores leave out what a map does not cover, so that over the whole home half a map may seem
-better than a whole one.
+better than a whole one. Where the truth of a kind of world knows levels above regions, the robots' prior is one for a
+task that names them, and levels of the merged map are scored beside those of the whole walks.
 """
 
 import itertools
@@ -17,6 +18,8 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
+from prior_sg.deploy.evaluation.level_metrics import level_scores
+from prior_sg.deploy.evaluation.levels import TASKS
 from prior_sg.deploy.evaluation.metrics import assign, evaluate
 from prior_sg.deploy.evaluation.partial_walks import Part, PartialMap, Walks
 from prior_sg.deploy.fleet.core.finding.config import MatchConfig
@@ -25,8 +28,10 @@ from prior_sg.deploy.fleet.core.finding.matching import Map, map_of, match, weig
 from prior_sg.deploy.fleet.core.finding.verify import Evidence
 from prior_sg.deploy.fleet.core.ids import Name
 from prior_sg.deploy.fleet.core.members import Relation, member_of_scene
-from prior_sg.deploy.fleet.core.merging import Memory, Source, merged
+from prior_sg.deploy.fleet.core.merging import Memory, Source, levelled, merged
 from prior_sg.deploy.fleet.core.update import merged_of
+from prior_sg.schemas.levels import LEVELS
+from prior_sg.schemas.priors import Prior
 from prior_sg.schemas.scene import Scene
 from prior_sg.services.geometry import inverse, transform
 
@@ -80,7 +85,7 @@ def merge_bench(
     report: Callable[[str], None] = lambda text: None,
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Success, errors, false accepts, and what merged scenes are worth. `report` hears what is being done."""
-    walks = Walks(folder, kind=kind)
+    walks = Walks(folder, kind=kind, task=TASKS.get(kind, ""))
     outcomes, scores = [], []
     for number, seed in enumerate(seeds, 1):
         report(f"{kind} {seed}, {number} of {len(seeds)}")
@@ -165,12 +170,13 @@ def worth(walks: Walks, outcome: Outcome) -> dict[str, float]:
         Source(Name(f"robot{k}", 0), part.scene, pose)
         for k, (part, pose) in enumerate(zip((first, second), poses, strict=True))
     ]
+    prior = walks.prior(outcome.two.seed)
     alone = [merged("home", [source], Memory()).scene for source in sources]
     one_robot = Source(Name("robot", 0), drifting.scene, inverse(drifting.own_from_world))
     scenes = {
-        "merged": merged("home", sources, Memory()).scene,
+        "merged": _with_levels(sources, prior),
         "full": whole.scene,
-        "full_drifting": merged("home", [one_robot], Memory()).scene,
+        "full_drifting": _with_levels([one_robot], prior),
     }
     found = {
         f"{score}_{name}": value
@@ -178,6 +184,9 @@ def worth(walks: Walks, outcome: Outcome) -> dict[str, float]:
         for score, value in evaluate(scene, whole.voxels, truth).items()
         if score in WORTH
     }
+    for name, scene in scenes.items():
+        for above, of_level in level_scores(scene, whole.voxels, truth).items():
+            found |= {f"{score}_{above}_{name}": value for score, value in of_level.items()}
     found["f1_s_better_part"] = max(evaluate(scene, whole.voxels, truth)["f1_s"] for scene in alone)
     there: dict[str, list[float]] = {}
     for part in alone:
@@ -189,16 +198,26 @@ def worth(walks: Walks, outcome: Outcome) -> dict[str, float]:
     return found | {name: statistics.mean(values) for name, values in there.items()}
 
 
+def _with_levels(sources: list[Source], prior: Prior) -> Scene:
+    """The merged scene, its levels by the prior as far as that names some."""
+    memory = Memory()
+    return levelled(merged("home", sources, memory), memory, prior).scene
+
+
 def means(scores: list[dict[str, float]]) -> dict[str, float]:
     """Means over homes, and what F1_S of merged scenes has on that of others, with its standard error."""
     if not scores:
         return {}
     found = {name: statistics.mean(one[name] for one in scores) for name in scores[0]}
-    for where, rival in (("", "full"), ("", "full_drifting"), ("where_a_part_was_", "part")):
+    whole = [("", rival, f"gain_on_{rival}") for rival in ("full", "full_drifting")]
+    above = [(f"{one}_", rival, f"gain_{one}_on_{rival}") for one in LEVELS for _, rival, _ in whole]
+    for where, rival, name in (*whole, ("where_a_part_was_", "part", "gain_on_part"), *above):
+        if f"f1_s_{where}merged" not in scores[0]:
+            continue
         gaps = [one[f"f1_s_{where}merged"] - one[f"f1_s_{where}{rival}"] for one in scores]
-        found[f"gain_on_{rival}"] = statistics.mean(gaps)
+        found[name] = statistics.mean(gaps)
         if len(gaps) > 1:
-            found[f"gain_on_{rival}_sem"] = statistics.stdev(gaps) / len(gaps) ** 0.5
+            found[f"{name}_sem"] = statistics.stdev(gaps) / len(gaps) ** 0.5
     return found
 
 

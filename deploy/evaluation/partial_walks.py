@@ -26,6 +26,7 @@ from prior_sg.schemas.features import Pyramid
 from prior_sg.schemas.frames import Keyframe
 from prior_sg.schemas.objects import SceneObject
 from prior_sg.schemas.places import MapRequest, SnapshotRequest, VoxelMap
+from prior_sg.schemas.priors import Prior
 from prior_sg.schemas.scene import Scene
 from prior_sg.schemas.topics import KEYFRAME, PLACE_SNAPSHOT, VOXEL_MAP
 from prior_sg.services.geometry import inverse, transform
@@ -71,15 +72,16 @@ class Kept(msgspec.Struct):
 
 
 class Walks:
-    """Makes partial maps of generated homes and keeps them in a folder."""
+    """Makes partial maps of generated homes and keeps them in a folder; the robots' prior is one for the task."""
 
-    def __init__(self, folder: Path, config: Config | None = None, kind: str = "home") -> None:
-        self.cache, self.config, self.kind = Cache(folder), config or Config(), kind
+    def __init__(self, folder: Path, config: Config | None = None, kind: str = "home", task: str = "") -> None:
+        self.cache, self.config, self.kind, self.task = Cache(folder), config or Config(), kind, task
         self._home: tuple[int, Dataset, Perception, list[Keyframe]] | None = None
 
     def part(self, seed: int, part: Part) -> PartialMap:
         """A part of the walk through a home."""
         key = {"world": [self.kind, seed], "part": list(part), "encoder": ENCODER, "code": CODE}
+        key |= {"task": self.task} if self.task else {}
         found = self.cache.get("partial", key)
         if found is None:
             made = self._make(seed, part)
@@ -94,10 +96,14 @@ class Walks:
         """The true regions of a home."""
         return world_of(self.kind, seed).truth
 
+    def prior(self, seed: int) -> Prior:
+        """The robots' prior there."""
+        return of_world(WorldName(self.kind, seed), self.task).prior
+
     def home(self, seed: int) -> tuple[Dataset, Perception, list[Keyframe]]:
         """A home as a simulated encoder sees the whole walk, and its keyframes."""
         if self._home is None or self._home[0] != seed:
-            dataset = of_world(WorldName(self.kind, seed), "")
+            dataset = of_world(WorldName(self.kind, seed), self.task)
             perceiver = Perceiver({}, self.cache, lambda *_: None)
             encoder = SimulatedEncoder(*ENCODER, seed)
             perception = seen_by(encoder, perceiver.layout(dataset), dataset)

@@ -65,13 +65,17 @@ class WalkingRobot:
         self._objects: dict[int, SceneObject] = {}
         self._revision = -1
 
-    def steps(self) -> Iterator[list[tuple[Topic, Message]]]:
-        """What the robot tells after each keyframe: changes of places, regions and objects."""
+    @property
+    def task(self) -> Task:
+        """What its prior answers."""
         prior = self._prior
-        task = Task(
+        return Task(
             robot=self.name, stamp_ns=1, environment=prior.environment, task=prior.task, regions=prior.vocabulary
         )
-        published = self._pipeline.publish(TASK, task) + self._pipeline.publish(PRIOR, prior)
+
+    def steps(self) -> Iterator[list[tuple[Topic, Message]]]:
+        """What the robot tells after each keyframe: changes of places, regions and objects."""
+        published = self._pipeline.publish(TASK, self.task) + self._pipeline.publish(PRIOR, self._prior)
         for number, frame in enumerate(self.frames, 1):
             published += self._pipeline.publish(KEYFRAME, msgspec.structs.replace(frame, robot=self.name))
             if (pyramid := self._pyramids.get(frame.frame_id)) is not None:

@@ -8,7 +8,6 @@ import logging
 from collections.abc import Awaitable, Callable, Iterator
 
 from prior_sg.deploy.fleet.core import update
-from prior_sg.deploy.fleet.core.ids import Name
 from prior_sg.deploy.fleet.core.members import Followed, Member
 from prior_sg.deploy.fleet.core.telling import Teller
 from prior_sg.deploy.fleet.core.update import Config, KeepNumbers, Lacking, NumbersKept, State
@@ -16,6 +15,7 @@ from prior_sg.deploy.fleet.keeping import keep, kept_memory, stored_members
 from prior_sg.schemas.codec import Message
 from prior_sg.schemas.objects import ObjectDelta
 from prior_sg.schemas.places import PlaceDelta, SnapshotRequest
+from prior_sg.schemas.priors import PriorRequest
 from prior_sg.schemas.regions import RegionDelta
 from prior_sg.schemas.status import Loss
 from prior_sg.schemas.topics import (
@@ -23,6 +23,7 @@ from prior_sg.schemas.topics import (
     OBJECT_SNAPSHOT,
     PLACE_DELTA,
     PLACE_SNAPSHOT,
+    PRIORS,
     REGION_DELTA,
     REGION_SNAPSHOT,
     topic_of,
@@ -39,10 +40,10 @@ def init(cfg: Config, identity: Identity) -> State:
     if identity.robot in cfg.robots:
         raise ServiceError(f"{identity.robot} is one of the robots: give the merged map another name")
     memory = kept_memory(cfg.memory)
-    former = stored_members(cfg.stored)
-    sessions = {one.name.robot: one.name.session + 1 for one in former}
+    former = stored_members(cfg.stored, memory.sessions)
     followed = {
-        robot: Followed(Member(Name(robot, sessions.get(robot, 0)), scenes.Graph(robot))) for robot in cfg.robots
+        robot: Followed(Member(memory.sessions.following(robot), scenes.Graph(robot)), sessions=memory.sessions)
+        for robot in cfg.robots
     }
     return State(identity.robot, followed, Teller(identity.robot, identity.epoch), former=former, memory=memory)
 
@@ -53,6 +54,8 @@ def step(state: State, message: Message, cfg: Config) -> Iterator[Output]:
         match output:
             case Lacking():
                 yield Ask(SNAPSHOTS[output.kind], SnapshotRequest(robot=output.robot))
+            case PriorRequest():
+                yield Ask(PRIORS, output)
             case KeepNumbers():
                 yield Ask(KEEP_NUMBERS, output)
             case _:
@@ -105,7 +108,7 @@ SERVICE = Service(
     reads=(PLACE_DELTA, REGION_DELTA, OBJECT_DELTA),
     reads_of=lambda cfg: cfg.robots,
     writes=(PLACE_DELTA, REGION_DELTA, OBJECT_DELTA),
-    asks=(PLACE_SNAPSHOT, REGION_SNAPSHOT, OBJECT_SNAPSHOT),
+    asks=(PLACE_SNAPSHOT, REGION_SNAPSHOT, OBJECT_SNAPSHOT, PRIORS),
     errands=(KEEP_NUMBERS,),
     answers={PLACE_SNAPSHOT: _places, REGION_SNAPSHOT: _regions, OBJECT_SNAPSHOT: _objects},
     tick_s=1.0,

@@ -7,11 +7,13 @@ import msgspec
 import numpy as np
 
 from prior_sg.deploy.errors import UserError
-from prior_sg.deploy.fleet.core.ids import KINDS, Ids, Kind, Name
+from prior_sg.deploy.fleet.core.ids import KINDS, Ids, Kind, Name, Session, Sessions
+from prior_sg.deploy.fleet.core.levels import Levels
 from prior_sg.deploy.fleet.core.members import Member, member_of_scene
 from prior_sg.deploy.fleet.core.merging import Memory
 from prior_sg.deploy.fleet.core.update import Numbers
 from prior_sg.services.runtime.service import ServiceError
+from prior_sg.services.segmenter.core.layers.layer_map import LayerMap
 
 
 def kept_memory(path: str) -> Memory:
@@ -27,7 +29,22 @@ def kept_memory(path: str) -> Memory:
     for kind, robot, session, number, given in numbers.given:
         ids.adopt(_kind(kind, path), Name(robot, session), number, given)
     frames = {(Name(robot, session), epoch): _pose(rows, path) for robot, session, epoch, rows in numbers.frames}
-    return Memory(ids, dict(numbers.region_of), numbers.next_region, frames)
+    levels = Levels(LayerMap(dict(numbers.next_nodes)))
+    for level, region, node in numbers.node_of:
+        levels.node_of.setdefault(level, {})[region] = node
+    return Memory(ids, dict(numbers.region_of), numbers.next_region, frames, _sessions(numbers), levels)
+
+
+def _sessions(numbers: Numbers) -> Sessions:
+    """As kept; of a file from before they were, what it says of whose numbers it holds."""
+    found = Sessions()
+    for robot, session, epochs, spots in numbers.sessions:
+        found.known[Name(robot, session)] = Session({*epochs}, {place: (x, y, z) for place, x, y, z in spots})
+    for _, robot, session, _, _ in numbers.given:
+        found.note(Name(robot, session))
+    for robot, session, epoch, _ in numbers.frames:
+        found.note(Name(robot, session), epoch)
+    return found
 
 
 def _pose(rows: Sequence[float], path: str) -> np.ndarray:
@@ -52,11 +69,10 @@ def keep(path: str, content: bytes) -> None:
     partial.replace(file)
 
 
-def stored_members(named: Sequence[str]) -> list[Member]:
+def stored_members(named: Sequence[str], sessions: Sessions) -> list[Member]:
     """The maps of former sessions, each given as ROBOT=PATH, the oldest first. Raises ServiceError."""
     from prior_sg.deploy.showing.reading import read_material
 
-    sessions: dict[str, int] = {}
     found = []
     for text in named:
         robot, _, path = text.partition("=")
@@ -66,7 +82,7 @@ def stored_members(named: Sequence[str]) -> list[Member]:
             scene = read_material(path, robot).scene
         except UserError as error:
             raise ServiceError(str(error)) from error
-        session = sessions.get(robot, 0)
-        sessions[robot] = session + 1
-        found.append(member_of_scene(msgspec.structs.replace(scene, robot=robot), session))
+        spots_m = dict(zip(scene.place_ids.tolist(), scene.positions_m.tolist(), strict=True))
+        name = sessions.name_of(robot, spots_m)
+        found.append(member_of_scene(msgspec.structs.replace(scene, robot=robot), name.session))
     return found

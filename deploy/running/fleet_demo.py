@@ -15,9 +15,10 @@ from prior_sg.deploy.evaluation.robots import WalkingRobot
 from prior_sg.deploy.fleet.bridge import SERVICE as FLEET
 from prior_sg.deploy.fleet.core.update import Config
 from prior_sg.deploy.running.inprocess import InProcess
+from prior_sg.schemas.levels import regions_in
 from prior_sg.schemas.places import PlaceDelta
 from prior_sg.schemas.scene import Scene, SceneRequest
-from prior_sg.schemas.topics import PLACE_DELTA, SCENE
+from prior_sg.schemas.topics import PLACE_DELTA, SCENE, TASK
 from prior_sg.services.registry import BY_NAME
 from prior_sg.services.runtime.bus import BusError, LocalBus, message_in
 from prior_sg.services.runtime.client import BusClient
@@ -41,6 +42,8 @@ class FleetDemo:
         self._services = InProcess(NAME, out)
         store = BY_NAME["scene_store"]
         self._services.host(store, store.config(path=str(out / "scene.sqlite")), "scene_store-1")
+        gateway = BY_NAME["prior_gateway"]
+        self._services.host(gateway, gateway.config(archive=""), "prior_gateway-1")
         self._services.host(FLEET, Config(robots=ROBOTS), "fleet-1")
         self.client = BusClient(self.bus())
         self.client.listen(PLACE_DELTA, NAME, self._saw)
@@ -52,6 +55,8 @@ class FleetDemo:
 
     def walk(self, step_s: float = STEP_S) -> None:
         """Both robots at once, until they have arrived or `stop` is called. Raises ChildFailed."""
+        for robot in self.robots:
+            self.client.publish(TASK, robot.task)
         for told in _in_turn(self.robots):
             started_s = time.monotonic()
             for topic, message in told:
@@ -100,6 +105,12 @@ def _in_turn(robots: list[WalkingRobot]) -> Iterator[list]:
 
 
 def summary(scene: Scene) -> str:
-    """The merged map in one sentence."""
-    regions = ", ".join(f"{region.label} {region.area_m2:.0f} m2" for region in scene.regions)
-    return f"{len(scene.place_ids)} places, {len(scene.objects)} objects, {len(scene.regions)} regions: {regions}"
+    """The merged map in one sentence, its regions by floor."""
+    on, counts = regions_in(scene.nodes, "floor"), f"{len(scene.place_ids)} places, {len(scene.objects)} objects"
+    floors = [
+        f"{node.label}: "
+        + ", ".join(f"{one.label} {one.area_m2:.0f} m2" for one in scene.regions if on[one.id] == node.id)
+        for node in sorted(scene.nodes, key=lambda node: node.position_m[2])
+        if node.level == "floor"
+    ]
+    return f"{counts}, {len(scene.regions)} regions; {'; '.join(floors)}"

@@ -1,5 +1,6 @@
 """Small houses as maps: rectangles with doors, places whose radius is the distance to the walls, and objects."""
 
+import msgspec
 import numpy as np
 
 from prior_sg.schemas.markers import SceneMarker
@@ -35,6 +36,7 @@ THINGS = [
 STEP_M = 0.5
 DOOR_M = 0.4  # half its width
 LABELS = sorted({room[0] for room in ROOMS})
+STOREY_M = 3.0
 
 
 def places(rooms=ROOMS, step_m=STEP_M, offset_m=0.0):
@@ -143,6 +145,41 @@ def scene(
     )
 
 
+def tall(robot="r1", own_from_world=None, *, below=ROOMS, above=ROOMS):
+    """A map of two storeys of such rooms, their hallways joined: rooms above have the numbers after those below."""
+    pose = np.eye(4) if own_from_world is None else own_from_world
+    storeys, regions, places, hallways = [], 0, 0, []
+    for number, rooms in enumerate((below, above)):
+        if not rooms:
+            continue
+        one = scene(robot, rooms=rooms, things=[])
+        radii_m = np.minimum(one.radii_m, 0.4 * STOREY_M)
+        spots = one.positions_m.astype(float)
+        spots[:, 2] = number * STOREY_M + radii_m  # each place's free space ends at the floor
+        hallways += [int(p) + places for p in one.place_ids if rooms[one.place_regions[p]][0] == "hallway"][:1]
+        storeys.append(
+            msgspec.structs.replace(
+                one,
+                place_ids=one.place_ids + places,
+                positions_m=transform(pose, spots).astype(np.float32),
+                radii_m=radii_m,
+                place_regions=one.place_regions + regions,
+                edges=one.edges + places,
+                regions=[msgspec.structs.replace(region, id=region.id + regions) for region in one.regions],
+            )
+        )
+        regions, places = regions + len(rooms), places + len(spots)
+    stairs = np.array([hallways] if len(hallways) == 2 else [], np.int64).reshape(-1, 2)
+    columns = ("place_ids", "positions_m", "radii_m", "basis_points", "place_regions", "posteriors", "unknown")
+    return msgspec.structs.replace(
+        storeys[0],
+        regions=[region for one in storeys for region in one.regions],
+        edges=np.concatenate([*(one.edges for one in storeys), stairs]),
+        clearances_m=np.concatenate([*(one.clearances_m for one in storeys), np.full(len(stairs), DOOR_M, np.float32)]),
+        **{name: np.concatenate([getattr(one, name) for one in storeys]) for name in columns},
+    )
+
+
 def deltas(held, epoch=1):
     """A scene as its robot tells it: places, regions, objects."""
     none = np.zeros(0, np.int64)
@@ -176,6 +213,7 @@ def deltas(held, epoch=1):
         snapshot=True,
         labels=held.labels,
         regions=held.regions,
+        nodes=held.nodes,
         removed_ids=none,
         place_ids=held.place_ids,
         place_regions=held.place_regions,

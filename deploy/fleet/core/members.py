@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from prior_sg.deploy.fleet.core.finding.matching import Map, map_of
-from prior_sg.deploy.fleet.core.ids import Name
+from prior_sg.deploy.fleet.core.ids import Name, Sessions
 from prior_sg.schemas.markers import MarkerKey
 from prior_sg.schemas.objects import ObjectDelta
 from prior_sg.schemas.places import PlaceDelta
@@ -82,6 +82,7 @@ class Followed:
     places: Follower[PlaceDelta] = field(default_factory=Follower)
     regions: Follower[RegionDelta] = field(default_factory=Follower)
     objects: Follower[ObjectDelta] = field(default_factory=Follower)
+    sessions: Sessions = field(default_factory=Sessions)
 
     def take(self, delta: Delta) -> Member | None:
         """Apply what is due of a delta. Returns the member of the session before, where a new one has begun.
@@ -121,10 +122,16 @@ class Followed:
     def _begun(self, delta: PlaceDelta) -> Member | None:
         """A new writer that knows nothing of the former places begins a session: the former map stays as it is."""
         former, graph = self.member, self.member.graph
-        anew = graph.place_cursor.epoch not in (-1, delta.epoch) and len(graph.places) > 0
-        if not anew or _goes_on(graph, delta):
+        if graph.place_cursor.epoch == delta.epoch:
             return None
-        name = Name(former.name.robot, former.name.session + 1)
+        if graph.place_cursor.epoch == -1:
+            spots_m = dict(zip(delta.place_ids.tolist(), delta.positions_m.tolist(), strict=True))
+            former.name = self.sessions.name_of(former.name.robot, spots_m, delta.epoch)
+            return None
+        if not graph.places or _goes_on(graph, delta):
+            self.sessions.note(former.name, delta.epoch)
+            return None
+        name = self.sessions.begin(former.name.robot, delta.epoch)
         fresh = scenes.Graph(former.name.robot, place_cursor=graph.place_cursor)
         self.member = Member(name, fresh)
         former.former = True
@@ -166,6 +173,7 @@ def member_of_scene(scene: Scene, session: int = 0) -> Member:
         for place, region, posterior, unknown in beliefs
     }
     graph.regions = {region.id: region for region in scene.regions}
+    graph.nodes = {(node.level, node.id): node for node in scene.nodes}
     graph.objects = {item.id: item for item in scene.objects}
     graph.markers = {marker.key: marker for marker in scene.markers}
     graph.alignment = scenes.Alignment(

@@ -1,23 +1,26 @@
 """One scene of several maps, with numbers that never change (pure)."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import msgspec
 import numpy as np
 
-from prior_sg.deploy.fleet.core.believing import Believed, believed
+from prior_sg.deploy.fleet.core.believing import CFG, Believed, believed
 from prior_sg.deploy.fleet.core.fusing import Fused, Placed, fused, openings
-from prior_sg.deploy.fleet.core.ids import Ids, Name
+from prior_sg.deploy.fleet.core.ids import Ids, Name, Sessions
+from prior_sg.deploy.fleet.core.levels import Ground, Levels, ground_of
 from prior_sg.deploy.fleet.core.marks import markers_of
 from prior_sg.deploy.fleet.core.things import joined, things_of
 from prior_sg.schemas.members import MapMember
 from prior_sg.schemas.objects import SceneObject
+from prior_sg.schemas.priors import Prior
 from prior_sg.schemas.regions import NO_REGION, Region
 from prior_sg.schemas.scene import Scene
 from prior_sg.services.geometry import transform
 from prior_sg.services.segmenter.core.experts.context import ObjectView
+from prior_sg.services.segmenter.core.layers.storeys import split
 from prior_sg.services.segmenter.core.map.received import ReceivedGraph
 from prior_sg.services.segmenter.core.regions import components
 
@@ -44,6 +47,8 @@ class Memory:
     next_region: int = 0
     frames: dict[tuple[Name, int], np.ndarray] = field(default_factory=dict)  # fleet_from_own (4, 4) of each map, by
     # the epoch of who writes its places: how maps lay when the fleet was followed last
+    sessions: Sessions = field(default_factory=Sessions)
+    levels: Levels = field(default_factory=Levels)
 
 
 @dataclass(frozen=True)
@@ -52,6 +57,7 @@ class Merged:
 
     scene: Scene
     frame_ids: np.ndarray  # (frame,) of the scene's trajectory
+    ground: Ground
 
 
 def merged(robot: str, sources: Sequence[Source], memory: Memory) -> Merged:
@@ -62,7 +68,8 @@ def merged(robot: str, sources: Sequence[Source], memory: Memory) -> Merged:
     ]
     found = fused(maps)
     beliefs = believed(maps, found)
-    regions = _regions_of(found, beliefs, memory)
+    ground = ground_of(found, beliefs.labels, all(len(one.scene.surface_ids) for one in maps))
+    regions = _regions_of(ground, beliefs, memory)
     objects, members = _objects(maps, memory), _members(maps, found, regions)
     described = _described(found, beliefs, regions, objects, _parents(maps))
     nodes, directions, areas = openings(maps, found)
@@ -95,7 +102,12 @@ def merged(robot: str, sources: Sequence[Source], memory: Memory) -> Merged:
         origin_m=maps[0].scene.origin_m,
         markers=markers_of(maps),
     )
-    return Merged(scene, frame_ids)
+    return Merged(scene, frame_ids, ground)
+
+
+def levelled(found: Merged, memory: Memory, prior: Prior | None) -> Merged:
+    """The same with levels above its regions, those that this prior names among them."""
+    return replace(found, scene=memory.levels.renew(found.scene, found.ground, prior))
 
 
 def _cameras(sources: Sequence[Source], memory: Memory) -> tuple[np.ndarray, np.ndarray]:
@@ -110,19 +122,16 @@ def _cameras(sources: Sequence[Source], memory: Memory) -> tuple[np.ndarray, np.
     return every[order], where_m[order]
 
 
-def _regions_of(found: Fused, beliefs: Believed, memory: Memory) -> np.ndarray:
-    """Region (node,) of each node: connected nodes of one label, under the id that most of them had."""
-    labelled = np.flatnonzero(beliefs.labels >= 0)
-    rank = np.full(len(found.ids), -1)
-    rank[labelled] = np.arange(len(labelled))
-    edges = rank[found.edges]
-    edges = edges[(edges >= 0).all(axis=1)]
-    component = components.numbered(beliefs.labels[labelled], edges)
-    previous = np.array([memory.region_of.get(int(i), NO_REGION) for i in found.ids[labelled]], np.int64)
-    regions = np.full(len(found.ids), NO_REGION, np.int64)
+def _regions_of(ground: Ground, beliefs: Believed, memory: Memory) -> np.ndarray:
+    """Region (node,) of each node: connected nodes of one label and storey, under the id that most of them had."""
+    labelled, graph = ground.rows, ground.graph
+    component = components.numbered(beliefs.labels[labelled], graph.edges)
+    component = split(component, graph.edges, ground.storeys, CFG.layers.storeys)
+    previous = np.array([memory.region_of.get(number, NO_REGION) for number in graph.ids.tolist()], np.int64)
+    regions = np.full(len(beliefs.labels), NO_REGION, np.int64)
     if len(labelled):
         regions[labelled], memory.next_region = components.track(component, previous, memory.next_region)
-    memory.region_of.update(zip(found.ids[labelled].tolist(), regions[labelled].tolist(), strict=True))
+    memory.region_of.update(zip(graph.ids.tolist(), regions[labelled].tolist(), strict=True))
     return regions
 
 
@@ -209,8 +218,3 @@ def _most(keys: np.ndarray, counts: np.ndarray) -> np.ndarray:
 def _sorted(members: list[tuple[str, int, int]]) -> list[MapMember]:
     """By robot, session and number, so that what has not changed is not told again."""
     return [MapMember(robot=robot, session=session, id=number) for robot, session, number in sorted(members)]
-
-
-def renamed(scene: Scene, robot: str) -> Scene:
-    """The same scene under another robot's name."""
-    return msgspec.structs.replace(scene, robot=robot)

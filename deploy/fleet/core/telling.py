@@ -118,7 +118,7 @@ class Teller:
             now,
             {region.id: region for region in scene.regions},
             [],
-            nodes={},
+            nodes={(node.level, node.id): node for node in scene.nodes},
             everything=everything,
             tolerance=posterior_change,
         )

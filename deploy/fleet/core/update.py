@@ -14,15 +14,18 @@ from prior_sg.deploy.fleet.core.finding.config import MatchConfig
 from prior_sg.deploy.fleet.core.finding.frames import apart, level
 from prior_sg.deploy.fleet.core.finding.matching import again, map_of, match
 from prior_sg.deploy.fleet.core.ids import Name
+from prior_sg.deploy.fleet.core.levels import names_levels
 from prior_sg.deploy.fleet.core.members import Delta, Followed, Member, Relation
-from prior_sg.deploy.fleet.core.merging import Memory, Merged, Source, merged
+from prior_sg.deploy.fleet.core.merging import Memory, Merged, Source, levelled, merged
 from prior_sg.deploy.fleet.core.sessions import Change, Present, remembered, said
 from prior_sg.deploy.fleet.core.telling import Teller
-from prior_sg.schemas.codec import Message
+from prior_sg.schemas.codec import Message, copied
+from prior_sg.schemas.levels import LevelName
 from prior_sg.schemas.markers import MarkerKey
 from prior_sg.schemas.names import fault_of_robot
 from prior_sg.schemas.objects import ObjectDelta
 from prior_sg.schemas.places import PlaceDelta
+from prior_sg.schemas.priors import Prior, PriorList, PriorRequest
 from prior_sg.schemas.regions import RegionDelta
 from prior_sg.schemas.scene import Scene
 from prior_sg.schemas.status import Tick
@@ -31,6 +34,7 @@ from prior_sg.services.scene_store.core import graph as scenes
 
 GROWN = 1.1  # times as many places as when it was looked at last: a map is looked at again
 REST_TICKS = 5  # from one fitting of a relation to the next, of a map that changes and hardly grows
+ASK_TICKS = 30  # from one question for a prior that nobody knew to the next
 
 
 class Config(msgspec.Struct, frozen=True, kw_only=True):
@@ -67,8 +71,16 @@ class State:
     events: list[str] = field(default_factory=list)  # to be told with the next delta
     noted: set[tuple[Name, int]] = field(default_factory=set)  # objects of former sessions whose change was told
     ticks: int = 0
+    wanted: str = ""  # digest of the prior whose levels the merged map follows; empty = of none
+    prior: tuple[str, Prior] | None = None  # the last that was wanted and came, with its digest
+    asked_tick: int = 0  # when one was asked for
     kept_ids: int = 0  # numbers that are kept on disk
     losses: Losses = field(default_factory=Losses)
+
+    @property
+    def in_force(self) -> Prior | None:
+        """The prior whose levels the merged map follows, once it is there."""
+        return self.prior[1] if self.prior is not None and self.prior[0] == self.wanted else None
 
     def members(self) -> list[Member]:
         """All, the present ones first; among them the order of the command."""
@@ -80,6 +92,10 @@ def update(state: State, message: Message, cfg: Config) -> Iterator[Message]:
     match_for = {PlaceDelta, RegionDelta, ObjectDelta}
     if type(message) in match_for and message.robot in state.followed:  # type: ignore[attr-defined]
         yield from _follow(state, message)  # type: ignore[arg-type]
+    elif isinstance(message, PriorList):
+        for prior in message.priors:
+            if prior.digest() == state.wanted:
+                state.prior = state.wanted, copied(prior)
     elif isinstance(message, Tick):
         yield from _tick(state, cfg)
 
@@ -98,6 +114,10 @@ class Numbers(msgspec.Struct, frozen=True, kw_only=True):
     region_of: list[tuple[int, int]]  # place, region
     next_region: int
     frames: list[tuple[str, int, int, list[float]]] = []  # robot, session, epoch of its places, fleet_from_own by rows
+    sessions: list[tuple[str, int, list[int], list[tuple[int, float, float, float]]]] = []  # robot, session, epochs of
+    # its writers, and by what it is known again: places and where they are
+    node_of: list[tuple[LevelName, int, int]] = []  # level, region, node
+    next_nodes: list[tuple[LevelName, int]] = []
 
 
 class KeepNumbers(Message, frozen=True, kw_only=True):
@@ -126,13 +146,16 @@ def _follow(state: State, delta: Delta) -> Iterator[Message]:
 def _tick(state: State, cfg: Config) -> Iterator[Message]:
     members = state.members()
     state.ticks += 1
-    if not any(one.changed or one.to_fit for one in members):
+    yield from _aim(state, members)
+    aimed = state.in_force is not state.memory.levels.prior
+    if not (aimed or any(one.changed or one.to_fit for one in members)):
         return
     relate(state, cfg)
     related = [one for one in members if one.relation is not None and one.graph.places]
     if not related:
         return
-    state.merged, changes = merged_of(state.robot, related, state.memory)
+    found, changes = merged_of(state.robot, related, state.memory)
+    state.merged = levelled(found, state.memory, state.in_force)
     for name, change in changes:
         if (name, change.number) not in state.noted:
             state.noted.add((name, change.number))
@@ -140,12 +163,36 @@ def _tick(state: State, cfg: Config) -> Iterator[Message]:
     for one in members:
         one.changed = False
     events, state.events = state.events, []
-    moved, count = _note_frames(state.memory, related), sum(state.memory.ids.following.values())
+    moved, count = _note_frames(state.memory, related), _given_out(state.memory)
     if cfg.memory and (moved or count != state.kept_ids):
         state.kept_ids = count
+        _remember(state.memory, members)
         yield KeepNumbers(robot=state.robot, content=_numbers(state.memory))
     tolerances = cfg.min_change_m, cfg.posterior_change
     yield from state.teller.tell(state.merged, "; ".join(events), *tolerances)
+
+
+def _aim(state: State, members: list[Member]) -> Iterator[PriorRequest]:
+    """Follow the prior of the first map that has levels by name; ask for it once, and later where nobody knew it."""
+    named = (one.graph for one in members if one.relation is not None and names_levels([*one.graph.nodes.values()]))
+    wanted = next((graph.alignment.prior_digest for graph in named), "")
+    fresh, state.wanted = wanted != state.wanted, wanted
+    if wanted and state.in_force is None and (fresh or state.ticks >= state.asked_tick + ASK_TICKS):
+        state.asked_tick = state.ticks
+        yield PriorRequest(digest=wanted)
+
+
+def _remember(memory: Memory, members: list[Member]) -> None:
+    """By what each session is known again."""
+    for one in members:
+        spots_m = {number: place.position_m for number, place in one.graph.places.items()}
+        if spots_m:
+            memory.sessions.remember(one.name, spots_m)
+
+
+def _given_out(memory: Memory) -> int:
+    """How many numbers there are."""
+    return sum(memory.ids.following.values()) + memory.next_region + sum(memory.levels.map.next_ids.values())
 
 
 def _numbers(memory: Memory) -> bytes:
@@ -155,9 +202,21 @@ def _numbers(memory: Memory) -> bytes:
         for (name, number), fleet in known.items()
     ]
     frames = [(*name, epoch, pose.ravel().tolist()) for (name, epoch), pose in memory.frames.items()]
-    regions = sorted(memory.region_of.items())
+    sessions = [
+        (*name, sorted(one.epochs), [(place, *spot_m) for place, spot_m in one.spots_m.items()])
+        for name, one in memory.sessions.known.items()
+    ]
+    levels = memory.levels
     return msgspec.msgpack.encode(
-        Numbers(given=given, region_of=regions, next_region=memory.next_region, frames=frames)
+        Numbers(
+            given=given,
+            region_of=sorted(memory.region_of.items()),
+            next_region=memory.next_region,
+            frames=frames,
+            sessions=sessions,
+            node_of=[(level, *pair) for level, held in levels.node_of.items() for pair in sorted(held.items())],
+            next_nodes=list(levels.map.next_ids.items()),
+        )
     )
 
 

@@ -8,10 +8,12 @@ import pytest
 
 from prior_sg.deploy.benches import main, merge
 from prior_sg.deploy.evaluation.errors import EvaluationError
+from prior_sg.deploy.evaluation.levels import TASKS
 from prior_sg.deploy.evaluation.partial_walks import PartialMap, drifting, moved
+from prior_sg.deploy.evaluation.priors import library_prior
 from prior_sg.deploy.fleet.core.finding.frames import level
 from prior_sg.deploy.fleet.core.finding.matching import map_of
-from prior_sg.deploy.truth import GroundTruth, TrueRegion
+from prior_sg.deploy.truth import GroundTruth, TrueNode, TrueRegion
 from prior_sg.schemas.places import VoxelMap
 from prior_sg.services.geometry import inverse
 from tests.help import houses
@@ -77,11 +79,16 @@ class Walks:
         voxels = VoxelMap(robot="r1", voxel_m=0.2, free=free, occupied=free[:0])
         return PartialMap(msgspec.structs.replace(scene, regions=regions), np.eye(4), voxels)
 
+    def prior(self, seed):
+        return library_prior("residential home", TASKS["house"], houses.LABELS)
+
     def truth(self, seed):
         corners = [((x0, y0), (x1, y0), (x1, y1), (x0, y1)) for _, x0, y0, x1, y1 in houses.ROOMS]
         rooms = zip(houses.ROOMS, corners, strict=True)
         regions = [TrueRegion(n, room[0], np.array(polygon), 0.0, 2.0) for n, (room, polygon) in enumerate(rooms)]
-        return GroundTruth(tuple(regions))
+        floor = TrueNode("floor", "floor 0", tuple(range(len(regions))))
+        living = tuple(n for n, room in enumerate(houses.ROOMS) if room[0] in ("kitchen", "living room"))
+        return GroundTruth(tuple(regions), (TrueNode("zone", "living quarters", living), floor))
 
 
 def test_a_merged_map_is_judged_beside_whole_walks_and_where_each_part_was(house):
@@ -90,9 +97,12 @@ def test_a_merged_map_is_judged_beside_whole_walks_and_where_each_part_was(house
     assert scores["f1_s_full"] == pytest.approx(0.8, abs=0.03) and scores["f1_s_full_drifting"] < 0.7
     assert scores["f1_s_where_a_part_was_part"] == pytest.approx(1.0, abs=0.02)
     assert 0.7 < scores["f1_s_where_a_part_was_full"] < 0.95
+    assert scores["f1_s_floor_merged"] == pytest.approx(1.0, abs=0.02) and scores["f1_s_floor_full"] == 0.0
+    assert scores["f1_s_zone_merged"] > 0.9 and scores["f1_g_zone_merged"] >= scores["f1_s_zone_merged"]
     worse = {name: value - 0.1 if name == "f1_s_merged" else value for name, value in scores.items()}
     found = merge.means([scores, worse])
     assert found["gain_on_full"] == pytest.approx(scores["f1_s_merged"] - scores["f1_s_full"] - 0.05)
+    assert found["gain_floor_on_full"] == pytest.approx(scores["f1_s_floor_merged"])
     assert found["gain_on_full_sem"] == pytest.approx(0.05) and found["gain_on_part_sem"] == pytest.approx(0.0)
 
 

@@ -6,19 +6,24 @@ import pytest
 
 from prior_sg.deploy.cli.fleet import transforms_of
 from prior_sg.deploy.errors import UserError
+from prior_sg.deploy.evaluation.priors import library_prior
 from prior_sg.deploy.fleet.bridge import KEEP_NUMBERS, SERVICE
 from prior_sg.deploy.fleet.core.finding.frames import level
-from prior_sg.deploy.fleet.core.update import Config, NumbersKept
+from prior_sg.deploy.fleet.core.ids import Name
+from prior_sg.deploy.fleet.core.update import ASK_TICKS, Config, NumbersKept
 from prior_sg.deploy.fleet.keeping import keep
+from prior_sg.schemas.levels import LevelNode
 from prior_sg.schemas.members import MapMember
 from prior_sg.schemas.places import PlaceDelta, SnapshotRequest
-from prior_sg.schemas.queries import ById, ByLabel, SceneQuery
+from prior_sg.schemas.priors import PriorList
+from prior_sg.schemas.queries import ById, ByLabel, NodesOf, SceneQuery
 from prior_sg.schemas.regions import RegionDelta
 from prior_sg.schemas.scene import SceneRequest
 from prior_sg.schemas.status import Tick
 from prior_sg.schemas.topics import (
     OBJECT_SNAPSHOT,
     PLACE_SNAPSHOT,
+    PRIORS,
     REGION_SNAPSHOT,
     SCENE,
     SCENE_QUERY,
@@ -247,6 +252,159 @@ def test_the_frame_lives_on_in_that_file_for_maps_that_go_on(tmp_path):
 
     assert gaps_m(epoch=1).max() < 0.1  # r2 alone, in the frame that r1 gave
     assert gaps_m(epoch=2).min() > 1.0  # another writer may map from another place
+
+
+def sessions_named(scene):
+    """Of the members of all regions."""
+    return {(one.robot, one.session) for region in scene.regions for one in region.members}
+
+
+def started(cfg, *told):
+    """A bridge that begins, hears scenes and the epochs of their writers, and keeps its numbers."""
+    fleet = Fleet(cfg, epoch=9)
+    for scene, epoch in told:
+        fleet.tell(scene, epoch)
+        fleet.tick()
+    if fleet.kept:
+        keep(cfg.memory, fleet.kept[-1])
+    return fleet
+
+
+def test_a_session_keeps_its_number_when_the_bridge_starts_again(tmp_path):
+    cfg = Config(robots=("r1",), memory=str(tmp_path / "home.msgpack"))
+    next_day = houses.scene("r1", MOVED, rooms=houses.ROOMS[1:])
+    before = started(cfg, (houses.scene(), 1), (next_day, 2))
+    assert sessions_named(before.scene()) == {("r1", 0), ("r1", 1)}
+    elsewhere = houses.scene("r1", level(0.2, np.array((1.0, 0.5, 0.0))) @ MOVED, rooms=houses.ROOMS[1:])
+    again = started(cfg, (elsewhere, 2))  # its writer has closed a loop since
+    assert sessions_named(again.scene()) == {("r1", 1)}
+    assert np.isin(again.scene().place_ids, before.bridge.state.memory.ids.of("place", Name("r1", 1), range(999))).all()
+    third = started(cfg, (houses.scene("r1", level(0.4, np.array((50.0, 3.0, 0.0)))), 3))
+    assert sessions_named(third.scene()) == {("r1", 2)}  # none of the former ones: its ids mean other places
+    assert not np.isin(third.scene().place_ids, before.scene().place_ids).any()
+
+
+def test_a_map_whose_writer_began_anew_while_nobody_followed_goes_on(tmp_path):
+    """Its places are where they were, under their ids."""
+    cfg = Config(robots=("r1",), memory=str(tmp_path / "home.msgpack"))
+    before = started(cfg, (houses.scene(), 1))
+    again = started(cfg, (houses.scene(), 2))
+    assert sessions_named(again.scene()) == {("r1", 0)}
+    assert again.scene().place_ids.tolist() == before.scene().place_ids.tolist()
+    assert [r.id for r in again.scene().regions] == [r.id for r in before.scene().regions]
+
+
+def test_stored_sessions_keep_their_numbers_whatever_is_stored_beside_them(tmp_path):
+    paths = []
+    for day, scene in enumerate((houses.scene(), houses.scene("r1", MOVED))):
+        paths.append(f"r1={tmp_path / f'{day}.sqlite'}")
+        with Runner(BY_NAME["scene_store"], StoreConfig(path=paths[-1][3:]), Identity("*", "store", 1)) as store:
+            store.feed(*houses.deltas(scene))
+    cfg = Config(robots=("r1",), memory=str(tmp_path / "home.msgpack"), stored=(paths[1],))
+    now = houses.scene("r1", level(0.7, np.array((3.0, 30.0, 0.0))))
+
+    def numbers(fleet):
+        return [one.name.session for one in fleet.bridge.state.members()]
+
+    assert numbers(started(cfg, (now, 7))) == [1, 0]
+    both = msgspec.structs.replace(cfg, stored=(paths[0], paths[1]))
+    assert numbers(started(both, (now, 7))) == [1, 0, 2]  # the present one, then the newest of those that are stored
+    # A stored map under which the robot goes on is followed once: what is told live is then another session.
+    assert numbers(started(cfg, (houses.scene("r1", MOVED), 8))) == [3, 0]
+
+
+def test_files_from_before_sessions_and_levels_were_kept_are_read(tmp_path):
+    path = str(tmp_path / "home.msgpack")
+    cfg = msgspec.structs.replace(CFG, memory=path)
+    fleet = merged_and_kept(cfg)
+    told = msgspec.msgpack.decode(fleet.kept[-1])
+    assert {"sessions", "node_of", "next_nodes"} <= told.keys()
+    keep(path, msgspec.msgpack.encode({name: told[name] for name in ("given", "region_of", "next_region", "frames")}))
+    again = Fleet(cfg, epoch=6)
+    again.tell(first())
+    again.tell(second(), epoch=2)  # of this writer, such a file knows nothing
+    again.tick()
+    assert sessions_named(again.scene()) == {("r1", 0), ("r2", 1)}
+    assert np.isin(fleet.scene().place_ids[:10], again.scene().place_ids).all()
+
+
+def tall_house():
+    """Two robots in one house of two storeys whose frames are known, and the prior that they follow."""
+    prior = library_prior("residential home", "which part of the home are the rooms in?", houses.LABELS)
+    zone = LevelNode(level="zone", id=0, label="living quarters", probability=0.9, member_ids=[0])
+    hallway = houses.ROOMS[2:3]
+    robots = houses.tall(above=hallway), houses.tall("r2", below=hallway)
+    return [msgspec.structs.replace(one, prior_digest=prior.digest(), nodes=[zone]) for one in robots], prior
+
+
+def in_one_frame(tmp_path):
+    return msgspec.structs.replace(
+        CFG, transforms=dict.fromkeys(("r1", "r2"), (0.0,) * 4), memory=str(tmp_path / "home.msgpack")
+    )
+
+
+def test_levels_of_the_merged_map_are_told_and_asked_for(tmp_path):
+    robots, prior = tall_house()
+    fleet = Fleet(in_one_frame(tmp_path))
+    for scene in robots:
+        fleet.tell(scene)
+    told = [message for _ in range(3) for message in fleet.tick()]
+    assert [ask.request.digest for ask in fleet.bridge.asks if ask.query is PRIORS] == [prior.digest()]
+    nodes = [(node.level, node.label) for node in fleet.scene().nodes]
+    assert nodes == [("floor", "floor 0"), ("floor", "floor 1"), ("building", "building")]  # nobody has answered yet
+    assert [node for m in told if isinstance(m, RegionDelta) for node in m.nodes] == fleet.scene().nodes
+    fleet.bridge.feed(PriorList(priors=[]))  # a gateway that does not know it, either
+    assert fleet.tick() == []
+    fleet.bridge.feed(PriorList(priors=[prior]))
+    fleet.tick()
+    scene = fleet.scene()
+    zones = [node for node in scene.nodes if node.level == "zone"]
+    assert {"living quarters", "sleeping quarters"} <= {node.label for node in zones}
+    assert {region.parent for region in scene.regions} == {node.label for node in zones}
+    questions = [NodesOf(level="floor"), NodesOf(region=next(r.id for r in scene.regions if r.label == "kitchen"))]
+    floors, above = fleet.store.answer(SCENE_QUERY, SceneQuery(robot="home", questions=questions)).answers
+    assert [(one.node.label, len(one.regions)) for one in floors.nodes] == [("floor 0", 5), ("floor 1", 5)]
+    assert [one.node.label for one in above.nodes] == ["living quarters", "floor 0", "building"]
+    assert fleet.bridge.answer(REGION_SNAPSHOT, SnapshotRequest(robot="home")).nodes == scene.nodes
+    assert fleet.tick() == []
+
+
+def test_a_prior_that_nobody_knew_is_asked_for_again(tmp_path):
+    robots, prior = tall_house()
+    asked = []
+
+    def gateway(request):
+        asked.append(request.digest)
+        return PriorList(priors=[] if len(asked) < 2 else [prior])
+
+    fleet = Fleet(in_one_frame(tmp_path))
+    fleet.bridge.answers[PRIORS] = gateway
+    fleet.tell(robots[0])
+    for _ in range(ASK_TICKS + 5):
+        fleet.tick()
+    assert asked == [prior.digest()] * 2
+    assert any(node.level == "zone" for node in fleet.scene().nodes)
+
+
+def test_ids_of_levels_live_on_in_the_file(tmp_path):
+    robots, prior = tall_house()
+    cfg = in_one_frame(tmp_path)
+
+    def nodes(*told):
+        fleet = Fleet(cfg)
+        fleet.bridge.answers[PRIORS] = lambda request: PriorList(priors=[prior])
+        for scenes in told:
+            for scene in scenes:
+                fleet.tell(scene)
+            for _ in range(3):
+                fleet.tick()
+        keep(cfg.memory, fleet.kept[-1])
+        return [(node.level, node.label, node.id, node.member_ids) for node in fleet.scene().nodes]
+
+    before = nodes(robots[1:], robots)  # most of what is above was there first
+    assert nodes(robots) == before
+    (tmp_path / "home.msgpack").unlink()
+    assert nodes(robots) != before
 
 
 @pytest.mark.parametrize(

@@ -16,6 +16,8 @@ from prior_sg.services.segmenter.core.layers.alignment import AlignmentConfig, M
 from prior_sg.services.segmenter.core.layers.storeys import StoreyConfig
 from prior_sg.services.segmenter.core.regions.components import numbered
 
+BUILDING = "building"  # the label of buildings where the prior names no such level
+
 
 class LayersConfig(msgspec.Struct, frozen=True, kw_only=True):
     """How the levels above regions are found."""
@@ -97,7 +99,7 @@ def _buildings(now: Standing, level: LevelInForce | None, cfg: AlignmentConfig) 
     shares = np.zeros((count, now.members.beliefs.shape[1]))
     np.add.at(shares, groups, now.members.areas_m2[:, None] * now.members.beliefs)
     beliefs = shares / np.maximum(shares.sum(axis=1, keepdims=True), np.finfo(float).tiny)
-    layer = Layer("building", groups[now.at], ["building"] * count, np.ones(count))
+    layer = Layer("building", groups[now.at], [BUILDING] * count, np.ones(count))
     return Standing(grouped(now.members, groups, beliefs), groups[now.at]), layer
 
 
