@@ -16,6 +16,7 @@ ONE_M, ALIKE_M = 0.45, 0.3  # places are one within that distance, when their ra
 BESIDE_M = 0.9  # a place of another map that near tells of the same spot
 JOINED = 2  # edges that lead from a place to places of other maps, at most
 LEAST_LENS_M = 0.25  # radius of the circle in which the balls at both ends of such an edge meet
+FLOOR_M = 1.0  # balls whose lowest points differ by more stand on two floors: they meet in the slab, or over a table
 CLOSED_M = 0.3  # behind an opening, free space of another map closes it
 
 
@@ -141,7 +142,8 @@ def _inner_edges(maps: Sequence[Placed], node_of: list[np.ndarray]) -> tuple[np.
 
 
 def _outer_edges(centers_m: np.ndarray, radii_m: np.ndarray, owner: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Edges between nearby nodes of different maps whose balls meet in a circle wide enough to pass."""
+    """Edges between nearby nodes of different maps whose balls meet in a circle wide enough to pass, on one floor."""
+    bottoms_m = centers_m[:, 2] - radii_m
     edges, lenses = [], []
     for here in range(int(owner.max(initial=0)) + 1):
         mine, others = np.flatnonzero(owner == here), np.flatnonzero(owner < here)
@@ -152,7 +154,7 @@ def _outer_edges(centers_m: np.ndarray, radii_m: np.ndarray, owner: np.ndarray) 
         distances_m, rows = distances_m.reshape(-1, count), rows.reshape(-1, count)
         pairs = np.column_stack((np.repeat(mine, count), others[rows.ravel()]))
         lens = lens_m(distances_m.ravel(), radii_m[pairs[:, 0]], radii_m[pairs[:, 1]])
-        wide = lens > LEAST_LENS_M
+        wide = (lens > LEAST_LENS_M) & (np.ptp(bottoms_m[pairs], axis=1) < FLOOR_M)
         edges.append(pairs[wide])
         lenses.append(lens[wide])
     if not edges:

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from prior_sg.deploy.fleet.core.finding.frames import level
-from prior_sg.deploy.fleet.core.fusing import lens_m
+from prior_sg.deploy.fleet.core.fusing import Placed, fused, lens_m
 from prior_sg.deploy.fleet.core.ids import Ids, Name
 from prior_sg.deploy.fleet.core.merging import Memory, Source, merged
 from prior_sg.deploy.fleet.core.sessions import Present, remembered, said
@@ -211,3 +211,25 @@ def test_what_is_not_seen_again_is_remembered():
     kept, changes = remembered(former, np.eye(4), [Present(now, np.eye(4))])
     assert not changes and len(kept.objects) == len(former.objects)
     assert np.isin(former.place_ids[former.place_regions >= 2], kept.place_ids).all()
+
+
+def test_balls_that_meet_in_a_slab_are_not_joined():
+    none = np.zeros((0, 2), np.int64)
+
+    def joined(rise_m, away_m):
+        """Whether a place of each of two maps, so far apart, are joined."""
+        maps = []
+        for number, center_m in enumerate(((0.0, 0.0, 1.2), (away_m, 0.0, 1.2 + rise_m))):
+            scene = msgspec.structs.replace(
+                houses.scene(),
+                place_ids=np.array([number]),
+                positions_m=np.array([center_m], np.float32),
+                radii_m=np.ones(1, np.float32),
+                edges=none,
+                clearances_m=np.zeros(0, np.float32),
+            )
+            maps.append(Placed(Name(f"r{number}", 0), scene, np.eye(4), scene.place_ids))
+        return len(fused(maps).edges) == 1
+
+    assert joined(0.1, 1.5) and joined(0.9, 1.2)  # side by side, and up some steps
+    assert not joined(1.7, 0.0)
