@@ -7,7 +7,9 @@ from looks alone; then counting by belief and naming each region anew by looks, 
 
 How much a statement of the prior is worth, in observed regions, is told by how well it foretold what was seen: of
 STRENGTHS the one under which a region's counts are likeliest (beta-binomial). A row that is right stays firm, one that
-is wrong gives way at once. No robot counts for more than a share of what all have seen.
+is wrong gives way at once. What looks are worth is told in the same way: an encoder that errs about whole regions is as
+sure of those, so of WORTHS the one counts under which looks alone foretell best what regions are by all that is known
+(scaling after Guo et al., 2017). No robot counts for more than a share of what all have seen.
 """
 
 from collections import defaultdict
@@ -27,12 +29,14 @@ MIXED = 0.1  # P(what is stated of a region is that of another)
 DOUBT = 1.5  # standard deviation of the logarithm of such a factor
 SAME = 0.1  # P(touching) of two regions of one name that were not taken for one
 LEAST_SHARE = 1e-4
+WORTHS = np.geomspace(1 / 8, 1.0, 19)  # of what looks weigh at their face value
+LOOKS_DOUBT = 0.5  # standard deviation of the logarithm of what they are worth, about 1
 
 
 class EstimationConfig(msgspec.Struct, frozen=True, kw_only=True):
     """How the regions of maps are named anew."""
 
-    looks: float = 2.0  # weight of what the average place of a region looks like, half of the visual expert's
+    looks: float = 2.0  # face value of what the average place of a region looks like, half of the visual expert's
     contents: float = 1.0  # of what it holds
     neighbours: float = 0.5  # of which regions it touches
     rounds: int = 12  # of naming and counting
@@ -94,6 +98,7 @@ class Estimate:
     totals: Totals
     maps: list[SeenMap]
     beliefs: list[np.ndarray]  # of each map (piece, region): what its regions most likely are
+    looks: float  # what looks are worth, of WORTHS
 
 
 def estimated(prior: Prior, evidence: Sequence[PriorEvidence], strength: float, cfg: EstimationConfig) -> Estimate:
@@ -108,11 +113,28 @@ def estimated(prior: Prior, evidence: Sequence[PriorEvidence], strength: float, 
     worth = [weights[seen.robot] for seen in maps]
     beliefs = [_shares(cfg.looks * seen.looks) for seen in maps]
     totals = fixed + counted(prior, maps, beliefs, worth)
+    looks = 1.0
     for _ in range(cfg.rounds if maps else 0):
         says = revised_statements(prior, totals, strength)
-        beliefs = [named(seen, belief, says, cfg) for seen, belief in zip(maps, beliefs, strict=True)]
+        heard = msgspec.structs.replace(cfg, looks=cfg.looks * looks)
+        beliefs = [named(seen, belief, says, heard) for seen, belief in zip(maps, beliefs, strict=True)]
         totals = fixed + counted(prior, maps, beliefs, worth)
-    return Estimate(totals, maps, beliefs)
+        looks = worth_of_looks(maps, beliefs, worth, says.existence, cfg.looks)
+    return Estimate(totals, maps, beliefs, looks)
+
+
+def worth_of_looks(
+    maps: Sequence[SeenMap], beliefs: Sequence[np.ndarray], weights: Sequence[float], existence: np.ndarray, face: float
+) -> float:
+    """Of WORTHS the one of highest posterior: looks times `face` and it, beside `existence` (region,), foretell the
+    `beliefs` (piece, region) of each map. Where nobody looked for objects, looks are most of what beliefs rest on."""
+    scores = -0.5 * (np.log(WORTHS) / LOOKS_DOUBT) ** 2
+    for seen, belief, weight in zip(maps, beliefs, weights, strict=True):
+        if seen.sought.any():
+            foretold = WORTHS[:, None, None] * face * seen.looks + np.log(existence)
+            foretold -= scipy.special.logsumexp(foretold, axis=2, keepdims=True)
+            scores += weight * (belief * foretold).sum(axis=(1, 2))
+    return float(WORTHS[scores.argmax()])
 
 
 def robot_weights(evidence: Sequence[PriorEvidence], share: float) -> dict[str, float]:

@@ -60,6 +60,16 @@ def votes(state: State, rows: np.ndarray, cfg: Config) -> dict[str, Vote]:
     return {name: (np.maximum(log_probabilities, floor), sure) for name, (log_probabilities, sure) in answers.items()}
 
 
+def weights(state: State, answers: dict[str, Vote], cfg: Config) -> dict[str, np.ndarray]:
+    """Weight (place,) of each expert's vote: its confidence times its reliability; of looks only as far as robots have
+    found them worth it, where what a region holds has a say beside them."""
+    found = {name: sure * cfg.experts[name] for name, (_, sure) in answers.items()}
+    tested = state.aim.aligned.prior.tested
+    if tested is not None and "visual" in found and "contents" in found:
+        found["visual"] = found["visual"] * np.where(answers["contents"][1] > 0, tested.looks, 1.0)
+    return found
+
+
 def context_of(state: State, rows: np.ndarray, cfg: Config) -> Context:
     """What experts may look at to judge the places in `rows`."""
     aligned = state.aim.aligned
@@ -245,8 +255,8 @@ def evaluate_experts(state: State, idle: bool, cfg: Config) -> None:
     places, rows = state.map.places, np.flatnonzero(state.map.places.doubtful)
     answers = votes(state, rows, cfg)
     unary = np.zeros((len(rows), places.unary.shape[1]))
-    for name, (log_probabilities, confidence) in answers.items():
-        unary -= (confidence * cfg.experts[name])[:, None] * log_probabilities
+    for name, weight in weights(state, answers, cfg).items():
+        unary -= weight[:, None] * answers[name][0]
     changed = rows[(unary != places.unary[rows]).any(axis=1)]
     places.unary[rows] = unary
     places.sight[rows] = answers["visual"][1] if "visual" in answers else 0.0
