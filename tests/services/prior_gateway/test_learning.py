@@ -101,8 +101,7 @@ def test_looks_that_are_as_sure_of_the_wrong_room_are_worth_less(mistaken, most)
     looks = [looking_like(*((1, 0, 2) if i < mistaken else (0, 1, 2)), by=2.0) for i in range(10)]
     maps = [a_map(prior, f"r{i}", 1, one, HOME) for i, one in enumerate(looks)]
     seen = learning.estimate(prior, maps, LearningConfig())
-    assert [belief.argmax(axis=1).tolist() for belief in seen.beliefs] == [[0, 1, 2]] * 10
-    assert seen.looks == pytest.approx(1.0) if not mistaken else seen.looks <= most
+    assert seen.looks == 1.0 if not mistaken else seen.looks <= most
     after = learning.revised(prior, seen.totals, 4.0, prior.provenance, seen.looks)
     assert decode(Prior, encode(after)).tested.looks == seen.looks
 
