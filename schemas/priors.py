@@ -112,12 +112,12 @@ class Counts(Message, frozen=True, kw_only=True, omit_defaults=True):
     """What a prior's containment was counted in, and what looks turned out to be worth beside it."""
 
     regions: Annotated[np.ndarray, Shape("float32", "region")]  # observed ones of each name, as far as they are that
-    looks: float = 1.0  # what a region looks like weighs so much of its face value where its contents have a say
+    looks: float | None = None  # share of its face value that a look is worth beside contents; None = nobody knows
 
     def check(self) -> None:
         if self.regions.min(initial=0) < 0:
             raise ValueError("a count is negative")
-        if not 0 < self.looks <= 1:
+        if self.looks is not None and not 0 < self.looks <= 1:
             raise ValueError("what looks are worth must lie between 0 and 1")
 
 

@@ -32,7 +32,7 @@ class PriorFile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     provenance: Provenance
     spread: dict[str, Any] | None = None
     tested: list[float] | None = None
-    tested_looks: float = 1.0
+    tested_looks: float | None = None
 
 
 def write(prior: Prior, path: Path) -> None:
@@ -52,7 +52,7 @@ def write(prior: Prior, path: Path) -> None:
         provenance=prior.provenance,
         spread=spread,
         tested=None if prior.tested is None else prior.tested.regions.tolist(),
-        tested_looks=1.0 if prior.tested is None else prior.tested.looks,
+        tested_looks=None if prior.tested is None else prior.tested.looks,
     )
     try:
         path.write_bytes(msgspec.json.format(msgspec.json.encode(file), indent=1) + b"\n")

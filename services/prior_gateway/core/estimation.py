@@ -100,7 +100,7 @@ class Estimate:
     totals: Totals
     maps: list[SeenMap]
     beliefs: list[np.ndarray]  # of each map (piece, region): what its regions most likely are
-    looks: float  # what looks are worth, of WORTHS
+    looks: float | None  # what looks are worth, of WORTHS; None where contents do not tell
 
 
 def estimated(prior: Prior, evidence: Sequence[PriorEvidence], strength: float, cfg: EstimationConfig) -> Estimate:
@@ -138,11 +138,11 @@ def foretold(seen: SeenMap, says: Statements, cfg: EstimationConfig) -> np.ndarr
     return np.asarray(scipy.special.logsumexp(scores + _held(seen, says), axis=2).sum(axis=1))
 
 
-def worth_of_looks(scores: np.ndarray) -> float:
-    """Of WORTHS the one of highest posterior, by `scores` as in `foretold`; 1 where naming regions by looks foretells
+def worth_of_looks(scores: np.ndarray) -> float | None:
+    """Of WORTHS the one of highest posterior, by `scores` as in `foretold`; None where naming regions by looks tells
     little of what they hold: then either may be at fault."""
     likely = scores[:-1] - 0.5 * (np.log(WORTHS) / LOOKS_DOUBT) ** 2
-    return float(WORTHS[likely.argmax()]) if likely.max() - scores[-1] > TELLING else 1.0
+    return float(WORTHS[likely.argmax()]) if likely.max() - scores[-1] > TELLING else None
 
 
 def robot_weights(evidence: Sequence[PriorEvidence], share: float) -> dict[str, float]:

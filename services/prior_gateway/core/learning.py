@@ -56,7 +56,7 @@ def estimate(prior: Prior, evidence: Iterable[PriorEvidence], cfg: LearningConfi
     return estimated(prior, list(evidence), cfg.strength, cfg.estimation)
 
 
-def revised(prior: Prior, seen: Totals, strength: float, made: Provenance, looks: float = 1.0) -> Prior:
+def revised(prior: Prior, seen: Totals, strength: float, made: Provenance, looks: float | None = None) -> Prior:
     """The posterior mean, and what `looks` are worth. A region that no map has shown keeps its rows; its share falls as
     in any Dirichlet."""
     says = revised_statements(prior, seen, strength)

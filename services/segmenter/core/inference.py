@@ -65,7 +65,7 @@ def weights(state: State, answers: dict[str, Vote], cfg: Config) -> dict[str, np
     found them worth it, where what a region holds has a say beside them."""
     found = {name: sure * cfg.experts[name] for name, (_, sure) in answers.items()}
     tested = state.aim.aligned.prior.tested
-    if tested is not None and "visual" in found and "contents" in found:
+    if tested is not None and tested.looks is not None and "visual" in found and "contents" in found:
         found["visual"] = found["visual"] * np.where(answers["contents"][1] > 0, tested.looks, 1.0)
     return found
 

@@ -132,7 +132,7 @@ def rooms_under(
     ticks: int = 6,
     *,
     prior_last: bool = False,
-    looks: float = 1.0,
+    looks: float | None = None,
     likeness: float = 0.95,
 ) -> list[str]:
     """Labels of three rooms, the first of which holds an oven and looks by `likeness` like a bedroom, under a prior in
