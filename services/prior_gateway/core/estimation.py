@@ -122,9 +122,10 @@ def estimated(prior: Prior, evidence: Sequence[PriorEvidence], strength: float, 
     scores = np.zeros(len(WORTHS) + 1)
     for fold in range(min(FOLDS, len(maps)) if len(maps) > 1 else 0):
         rest = [number for number in range(len(maps)) if number % FOLDS != fold]
-        known = counted(prior, *([each[number] for number in rest] for each in (maps, beliefs, worth)))
+        known = counted(prior, [maps[i] for i in rest], [beliefs[i] for i in rest], [worth[i] for i in rest])
         says = revised_statements(prior, fixed + known, strength)
-        scores += sum(worth[number] * foretold(maps[number], says, cfg) for number in range(fold, len(maps), FOLDS))
+        for number in range(fold, len(maps), FOLDS):
+            scores += worth[number] * foretold(maps[number], says, cfg)
     return Estimate(totals, maps, beliefs, worth_of_looks(scores))
 
 
