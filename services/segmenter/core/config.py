@@ -48,7 +48,7 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
     evidence_mb: float = 512.0  # pyramids kept of each space, for places that are new or move; of the view that most
     # frames have, the oldest goes first
     experts: dict[str, float] = msgspec.field(  # names, with their reliabilities lambda (paper)
-        default_factory=lambda: {"visual": 4.0, "geometric": 1.0, "object": 1.0, "environment": 0.1, "contents": 4.0}
+        default_factory=lambda: {"visual": 4.0, "geometric": 1.0, "object": 1.0, "environment": 0.1, "contents": 2.5}
     )
     geometry: GeometryConfig = msgspec.field(default_factory=GeometryConfig)
     objects: ObjectSettings = msgspec.field(default_factory=ObjectSettings)
