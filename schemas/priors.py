@@ -108,14 +108,17 @@ class Spread(Message, frozen=True, kw_only=True):
             raise ValueError("spread is negative")
 
 
-class Counts(Message, frozen=True, kw_only=True):
-    """What a prior's containment was counted in."""
+class Counts(Message, frozen=True, kw_only=True, omit_defaults=True):
+    """What a prior's containment was counted in, and what looks turned out to be worth beside it."""
 
     regions: Annotated[np.ndarray, Shape("float32", "region")]  # observed ones of each name, as far as they are that
+    looks: float | None = None  # share of its face value that a look is worth beside contents; None = nobody knows
 
     def check(self) -> None:
         if self.regions.min(initial=0) < 0:
             raise ValueError("a count is negative")
+        if self.looks is not None and not 0 < self.looks <= 1:
+            raise ValueError("what looks are worth must lie between 0 and 1")
 
 
 class Prior(Message, frozen=True, kw_only=True, omit_defaults=True):

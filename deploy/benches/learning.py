@@ -111,7 +111,8 @@ class World:
             told = prior_evidence.evidence(state, CFG)
             seen += [] if told is None else [msgspec.structs.replace(told, robot=f"{ROBOT}{number}")]
             shown = learning.estimate(self.prior, seen, LEARNING)
-            priors.append(learning.revised(self.prior, shown.totals, LEARNING.strength, self.prior.provenance))
+            strength, made = LEARNING.strength, self.prior.provenance
+            priors.append(learning.revised(self.prior, shown.totals, strength, made, shown.looks))
         return priors
 
     def errors(self, prior: Prior) -> dict[str, float]:

@@ -132,7 +132,7 @@ def learnt(explored: Sequence[SeenWorld], prior: Prior, say: Say) -> list[Prior]
         told = segmented(world, priors[-1])[1]
         seen += [told] if told is not None else []
         shown = learning.estimate(prior, seen, LEARNING)
-        priors.append(learning.revised(prior, shown.totals, LEARNING.strength, prior.provenance))
+        priors.append(learning.revised(prior, shown.totals, LEARNING.strength, prior.provenance, shown.looks))
     return priors
 
 

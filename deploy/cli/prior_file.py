@@ -32,6 +32,7 @@ class PriorFile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     provenance: Provenance
     spread: dict[str, Any] | None = None
     tested: list[float] | None = None
+    tested_looks: float | None = None
 
 
 def write(prior: Prior, path: Path) -> None:
@@ -51,6 +52,7 @@ def write(prior: Prior, path: Path) -> None:
         provenance=prior.provenance,
         spread=spread,
         tested=None if prior.tested is None else prior.tested.regions.tolist(),
+        tested_looks=None if prior.tested is None else prior.tested.looks,
     )
     try:
         path.write_bytes(msgspec.json.format(msgspec.json.encode(file), indent=1) + b"\n")
@@ -78,7 +80,9 @@ def read(path: Path) -> Prior:
             adjacency=_matrix(file.adjacency, regions, regions),
             provenance=file.provenance,
             spread=spread,
-            tested=None if file.tested is None else Counts(regions=np.array(file.tested, np.float32)),
+            tested=None
+            if file.tested is None
+            else Counts(regions=np.array(file.tested, np.float32), looks=file.tested_looks),
         )
     except (OSError, msgspec.MsgspecError, ValueError, TypeError, OverflowError, RecursionError) as error:
         raise PriorError(f"{path} is no usable prior: {error}") from error

@@ -127,7 +127,7 @@ PRIOR = priors.Prior(
         support=f4(1.0, 0.5),
     ),
     levels=[LEVEL_PRIOR],
-    tested=priors.Counts(regions=f4(2.0, 0.5)),
+    tested=priors.Counts(regions=f4(2.0, 0.5), looks=0.5),
 )
 EVIDENCE = priors.PriorEvidence(
     robot="r",

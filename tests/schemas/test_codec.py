@@ -112,7 +112,7 @@ GOLDEN: list[Message] = [
                 adjacency=np.array([[1.0]], np.float32),
             )
         ],
-        tested=priors.Counts(regions=np.array([2.0], np.float32)),
+        tested=priors.Counts(regions=np.array([2.0], np.float32), looks=0.5),
     ),
     regions.RegionDelta(
         robot="r",

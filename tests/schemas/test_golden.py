@@ -124,6 +124,15 @@ def test_what_was_written_before_there_were_levels_has_none(name):
     assert decode(type(message), msgpack.packb(fields)) == msgspec.structs.replace(message, **{f: [] for f in added})
 
 
+def test_what_was_counted_before_looks_were_weighed_leaves_them_at_their_face_value():
+    message = next(example for example in EXAMPLES if by_name(example) == "Counts")
+    fields = msgpack.unpackb(encode(message), ext_hook=msgpack.ExtType)
+    del fields["looks"]
+    bare = msgspec.structs.replace(message, looks=None)
+    assert decode(type(message), msgpack.packb(fields)) == bare
+    assert b"looks" not in encode(bare), "digests stay"
+
+
 @pytest.mark.parametrize(("name", "lists"), [("RegionDelta", ["regions"]), ("Scene", ["regions", "objects"])])
 def test_what_was_written_before_merged_maps_named_their_members_names_none(name, lists):
     message = next(example for example in EXAMPLES if by_name(example) == name)

@@ -7,7 +7,9 @@ from looks alone; then counting by belief and naming each region anew by looks, 
 
 How much a statement of the prior is worth, in observed regions, is told by how well it foretold what was seen: of
 STRENGTHS the one under which a region's counts are likeliest (beta-binomial). A row that is right stays firm, one that
-is wrong gives way at once. No robot counts for more than a share of what all have seen.
+is wrong gives way at once. An encoder is as sure of whole regions that it is wrong about as of others; what its looks
+are worth is told likewise: of WORTHS the one under which regions, named by their looks, most likely hold what they do,
+by what the other maps say of those names. No robot counts for more than a share of what all have seen.
 """
 
 from collections import defaultdict
@@ -27,12 +29,16 @@ MIXED = 0.1  # P(what is stated of a region is that of another)
 DOUBT = 1.5  # standard deviation of the logarithm of such a factor
 SAME = 0.1  # P(touching) of two regions of one name that were not taken for one
 LEAST_SHARE = 1e-4
+WORTHS = np.geomspace(1 / 8, 1.0, 19)  # of what looks weigh at their face value
+LOOKS_DOUBT = 0.5  # standard deviation of the logarithm of what they are worth, about 1
+FOLDS = 10  # of the maps, each judged by the others
+TELLING = 5.0  # log odds of looks against names at random from which on contents know what looks are worth
 
 
 class EstimationConfig(msgspec.Struct, frozen=True, kw_only=True):
     """How the regions of maps are named anew."""
 
-    looks: float = 2.0  # weight of what the average place of a region looks like, half of the visual expert's
+    looks: float = 2.0  # face value of what the average place of a region looks like, half of the visual expert's
     contents: float = 1.0  # of what it holds
     neighbours: float = 0.5  # of which regions it touches
     rounds: int = 12  # of naming and counting
@@ -94,6 +100,7 @@ class Estimate:
     totals: Totals
     maps: list[SeenMap]
     beliefs: list[np.ndarray]  # of each map (piece, region): what its regions most likely are
+    looks: float | None  # what looks are worth, of WORTHS; None where contents do not tell
 
 
 def estimated(prior: Prior, evidence: Sequence[PriorEvidence], strength: float, cfg: EstimationConfig) -> Estimate:
@@ -112,7 +119,31 @@ def estimated(prior: Prior, evidence: Sequence[PriorEvidence], strength: float, 
         says = revised_statements(prior, totals, strength)
         beliefs = [named(seen, belief, says, cfg) for seen, belief in zip(maps, beliefs, strict=True)]
         totals = fixed + counted(prior, maps, beliefs, worth)
-    return Estimate(totals, maps, beliefs)
+    scores = np.zeros(len(WORTHS) + 1)
+    for fold in range(min(FOLDS, len(maps)) if len(maps) > 1 else 0):
+        rest = [number for number in range(len(maps)) if number % FOLDS != fold]
+        known = counted(prior, [maps[i] for i in rest], [beliefs[i] for i in rest], [worth[i] for i in rest])
+        says = revised_statements(prior, fixed + known, strength)
+        for number in range(fold, len(maps), FOLDS):
+            scores += worth[number] * foretold(maps[number], says, cfg)
+    return Estimate(totals, maps, beliefs, worth_of_looks(scores))
+
+
+def foretold(seen: SeenMap, says: Statements, cfg: EstimationConfig) -> np.ndarray:
+    """Log P (worth,) of what the regions of a map hold, where looks that are worth each of WORTHS, and last looks that
+    are worth nothing, name them; `says` should know nothing of this map. Zeros where nobody looked for objects."""
+    if not seen.sought.any():
+        return np.zeros(len(WORTHS) + 1)
+    scores = np.append(WORTHS, 0.0)[:, None, None] * cfg.looks * seen.looks + np.log(says.existence)
+    scores -= scipy.special.logsumexp(scores, axis=2, keepdims=True)
+    return np.asarray(scipy.special.logsumexp(scores + _held(seen, says), axis=2).sum(axis=1))
+
+
+def worth_of_looks(scores: np.ndarray) -> float | None:
+    """Of WORTHS the one of highest posterior, by `scores` as in `foretold`; None where naming regions by looks tells
+    little of what they hold: then either may be at fault."""
+    likely = scores[:-1] - 0.5 * (np.log(WORTHS) / LOOKS_DOUBT) ** 2
+    return float(WORTHS[likely.argmax()]) if likely.max() - scores[-1] > TELLING else None
 
 
 def robot_weights(evidence: Sequence[PriorEvidence], share: float) -> dict[str, float]:
@@ -214,9 +245,14 @@ def named(seen: SeenMap, belief: np.ndarray, says: Statements, cfg: EstimationCo
     rates = says.adjacency.copy()
     np.fill_diagonal(rates, SAME)
     beside = seen.touching @ belief @ np.log(rates / (says.existence @ rates)[:, None])
-    held = seen.contents @ np.log(says.containment).T + (seen.sought - seen.contents) @ np.log(1 - says.containment).T
-    scores = cfg.looks * seen.looks + np.log(says.existence) + cfg.contents * held + cfg.neighbours * beside
-    return _shares(scores)
+    held = cfg.contents * _held(seen, says)
+    return _shares(cfg.looks * seen.looks + np.log(says.existence) + held + cfg.neighbours * beside)
+
+
+def _held(seen: SeenMap, says: Statements) -> np.ndarray:
+    """Log P (piece, region) of what each region of a map holds, were it each of the prior's."""
+    missing = seen.sought - seen.contents
+    return np.asarray(seen.contents @ np.log(says.containment).T + missing @ np.log(1 - says.containment).T)
 
 
 def revised_statements(prior: Prior, seen: Totals, strength: float) -> Statements:

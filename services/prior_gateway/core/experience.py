@@ -35,8 +35,8 @@ def learn(state: State, seen: PriorEvidence, cfg: Config) -> Iterator[Told]:
         return
     current = state.priors[digest]
     root, limits = state.roots.get(asked, current), cfg.learning
-    seen_so_far = learning.estimate(root, known.values(), limits).totals
-    after = learning.revised(root, seen_so_far, limits.strength, current.provenance)
+    seen_so_far = learning.estimate(root, known.values(), limits)
+    after = learning.revised(root, seen_so_far.totals, limits.strength, current.provenance, seen_so_far.looks)
     if learning.largest_change(current, after) >= limits.least_change:
         environment, task, regions = asked
         by_model = limits.by_model and cfg.provider != "library" and not too_dear(state, environment, cfg)
@@ -81,7 +81,7 @@ def revise(state: State, making: Making, cfg: Config) -> Iterator[Told]:
         detail=before.detail,
         **_parents(state, making, root, current),
     )
-    yield to_keep(making, learning.revised(root, seen.totals, cfg.learning.strength, made), state)
+    yield to_keep(making, learning.revised(root, seen.totals, cfg.learning.strength, made, seen.looks), state)
 
 
 def _ask_about(
@@ -124,7 +124,7 @@ def conclude_revision(state: State, making: Making, found: revising.Revision, cf
     asked = asked_for(making.task)
     state.roots[asked] = root
     seen = learning.estimate(stated, state.evidence.get(asked, {}).values(), cfg.learning)
-    yield to_keep(making, learning.revised(stated, seen.totals, cfg.learning.strength, made), state)
+    yield to_keep(making, learning.revised(stated, seen.totals, cfg.learning.strength, made, seen.looks), state)
 
 
 def _parents(state: State, making: Making, root: Prior, current: Prior) -> dict[str, Any]:

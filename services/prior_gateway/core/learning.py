@@ -56,10 +56,11 @@ def estimate(prior: Prior, evidence: Iterable[PriorEvidence], cfg: LearningConfi
     return estimated(prior, list(evidence), cfg.strength, cfg.estimation)
 
 
-def revised(prior: Prior, seen: Totals, strength: float, made: Provenance) -> Prior:
-    """The posterior mean. A region that no map has shown keeps its rows; its share falls as in any Dirichlet."""
+def revised(prior: Prior, seen: Totals, strength: float, made: Provenance, looks: float | None = None) -> Prior:
+    """The posterior mean, and what `looks` are worth. A region that no map has shown keeps its rows; its share falls as
+    in any Dirichlet."""
     says = revised_statements(prior, seen, strength)
-    tested = Counts(regions=seen.instances.max(axis=1, initial=0).astype(np.float32))
+    tested = Counts(regions=seen.instances.max(axis=1, initial=0).astype(np.float32), looks=looks)
     return msgspec.structs.replace(_with(prior, says.existence, says.containment, says.adjacency, made), tested=tested)
 
 

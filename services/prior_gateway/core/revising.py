@@ -14,7 +14,7 @@ import numpy as np
 
 from prior_sg.schemas.levels import LevelPrior
 from prior_sg.schemas.names import normal
-from prior_sg.schemas.priors import MOST_OBJECTS, MOST_REGIONS, Counts, ObjectPrior, Prior, Provenance, RegionPrior
+from prior_sg.schemas.priors import MOST_OBJECTS, MOST_REGIONS, ObjectPrior, Prior, Provenance, RegionPrior
 from prior_sg.services.prior_gateway.core.answers import parse
 from prior_sg.services.prior_gateway.core.faults import Described, faults_of_keys, faults_of_names, faults_of_spans
 from prior_sg.services.prior_gateway.core.learning import corrected
@@ -227,7 +227,8 @@ def extended(prior: Prior, new: Addition, with_name: Callable[[str], list[str]])
         adjacency=touching.astype(np.float32),
         spread=None,  # nobody has said how far generations would differ about the new region
         levels=_with_child(prior.levels, origin),
-        tested=prior.tested and Counts(regions=np.append(prior.tested.regions, np.float32(0.0))),
+        tested=prior.tested
+        and msgspec.structs.replace(prior.tested, regions=np.append(prior.tested.regions, np.float32(0.0))),
     )
 
 

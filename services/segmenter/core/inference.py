@@ -29,6 +29,7 @@ from prior_sg.services.segmenter.core.state import State
 BIAS_SAMPLE = 4096  # places that stand for all when the map's bias is computed
 LEAST_SURE = 10.0  # times the configured temperature at most, however little crops tell
 TOLD_TOLERANCE = 0.1  # smaller relative changes of what crops tell are not worth finding all beliefs again
+PROVEN = 1.6  # times what contents weigh once they were found to tell what looks are worth
 CORRECTION_TOLERANCE = 0.01  # smaller changes, in spreads of similarity, are not worth asking the experts again
 
 
@@ -58,6 +59,17 @@ def votes(state: State, rows: np.ndarray, cfg: Config) -> dict[str, Vote]:
     floor = np.log(cfg.probability_floor)
     answers = {name: REGISTRY[name](context) for name in cfg.experts}
     return {name: (np.maximum(log_probabilities, floor), sure) for name, (log_probabilities, sure) in answers.items()}
+
+
+def weights(state: State, answers: dict[str, Vote], cfg: Config) -> dict[str, np.ndarray]:
+    """Weight (place,) of each expert's vote: its confidence times its reliability. Where robots have found what looks
+    are worth beside what regions hold, looks weigh no more than that there, and contents more."""
+    found = {name: sure * cfg.experts[name] for name, (_, sure) in answers.items()}
+    tested = state.aim.aligned.prior.tested
+    if tested is not None and tested.looks is not None and "visual" in found and "contents" in found:
+        found["visual"] = found["visual"] * np.where(answers["contents"][1] > 0, tested.looks, 1.0)
+        found["contents"] = found["contents"] * PROVEN
+    return found
 
 
 def context_of(state: State, rows: np.ndarray, cfg: Config) -> Context:
@@ -245,8 +257,8 @@ def evaluate_experts(state: State, idle: bool, cfg: Config) -> None:
     places, rows = state.map.places, np.flatnonzero(state.map.places.doubtful)
     answers = votes(state, rows, cfg)
     unary = np.zeros((len(rows), places.unary.shape[1]))
-    for name, (log_probabilities, confidence) in answers.items():
-        unary -= (confidence * cfg.experts[name])[:, None] * log_probabilities
+    for name, weight in weights(state, answers, cfg).items():
+        unary -= weight[:, None] * answers[name][0]
     changed = rows[(unary != places.unary[rows]).any(axis=1)]
     places.unary[rows] = unary
     places.sight[rows] = answers["visual"][1] if "visual" in answers else 0.0

@@ -21,7 +21,7 @@ from prior_sg.services.segmenter.core.energy import posteriors
 from prior_sg.services.segmenter.core.energy.mrf import energy
 from prior_sg.services.segmenter.core.foresight.openings import openings_of
 from prior_sg.services.segmenter.core.foresight.telling import differs, foresight
-from prior_sg.services.segmenter.core.inference import field_of, temperature, votes
+from prior_sg.services.segmenter.core.inference import field_of, temperature, votes, weights
 from prior_sg.services.segmenter.core.map.table import UNLABELLED
 from prior_sg.services.segmenter.core.regions import components, ledger
 from prior_sg.services.segmenter.core.state import State
@@ -175,7 +175,8 @@ def explain(state: State, request: PosteriorRequest, cfg: Config) -> PosteriorRe
     places, names, near = state.map.places, state.aim.in_force.labels, state.map.ties
     rows, slot = np.array([row]), int(places.slots[row])
     answers = votes(state, rows, cfg)
-    unary = sum(-cfg.experts[name] * sure[0] * log[0] for name, (log, sure) in answers.items())
+    heard = {name: float(weight[0]) for name, weight in weights(state, answers, cfg).items()}
+    unary = sum(-heard[name] * log[0] for name, (log, _) in answers.items())
     costs = posteriors.conditional_costs(field_of(state), near, places.labels, rows)
     arcs = range(near.starts[row], near.starts[row + 1])
     return PosteriorReply(
@@ -190,7 +191,7 @@ def explain(state: State, request: PosteriorRequest, cfg: Config) -> PosteriorRe
             ExpertVote(
                 expert=name,
                 confidence=float(sure[0]),
-                weight=float(sure[0] * cfg.experts[name]),
+                weight=heard[name],
                 log_probabilities=log[0].tolist(),
             )
             for name, (log, sure) in answers.items()

@@ -1,5 +1,7 @@
 """Merged scenes: numbers that last, places and objects that are one, beliefs that settle conflicts."""
 
+from types import SimpleNamespace
+
 import msgspec
 import numpy as np
 import pytest
@@ -220,13 +222,13 @@ def test_balls_that_meet_in_a_slab_are_not_joined():
         """Whether a place of each of two maps, so far apart, are joined."""
         maps = []
         for number, center_m in enumerate(((0.0, 0.0, 1.2), (away_m, 0.0, 1.2 + rise_m))):
-            scene = msgspec.structs.replace(
-                houses.scene(),
+            scene = SimpleNamespace(
                 place_ids=np.array([number]),
-                positions_m=np.array([center_m], np.float32),
-                radii_m=np.ones(1, np.float32),
+                positions_m=np.array([center_m]),
+                radii_m=np.ones(1),
+                basis_points=np.full(1, 2),
                 edges=none,
-                clearances_m=np.zeros(0, np.float32),
+                clearances_m=np.zeros(0),
             )
             maps.append(Placed(Name(f"r{number}", 0), scene, np.eye(4), scene.place_ids))
         return len(fused(maps).edges) == 1

@@ -94,6 +94,26 @@ def test_a_region_that_looks_like_another_is_named_by_what_all_maps_say_it_holds
     assert seen.beliefs[-1].argmax(axis=1).tolist() == [0, 1, 2], "a stove makes it a kitchen"
 
 
+@pytest.mark.parametrize(("mistaken", "most"), [(0, 1.0), (3, 0.7)])
+def test_looks_that_are_as_sure_of_the_wrong_room_are_worth_less(mistaken, most):
+    """In so many of ten maps the kitchen looks like a bathroom and the other way round, as firmly as in the rest."""
+    prior = stated(TRUE)
+    looks = [looking_like(*((1, 0, 2) if i < mistaken else (0, 1, 2)), by=2.0) for i in range(10)]
+    maps = [a_map(prior, f"r{i}", 1, one, HOME) for i, one in enumerate(looks)]
+    seen = learning.estimate(prior, maps, LearningConfig())
+    assert seen.looks is not None and seen.looks <= most and (mistaken or seen.looks == 1.0)
+    after = learning.revised(prior, seen.totals, 4.0, prior.provenance, seen.looks)
+    assert decode(Prior, encode(after)).tested.looks == seen.looks
+
+
+def test_without_objects_nobody_knows_what_looks_are_worth():
+    prior = stated(TRUE)
+    maps = [a_map(prior, f"r{i}", 1, looking_like(1, 0, 2, by=0.1), HOME) for i in range(10)]
+    none = np.zeros((3, 0), np.float32)
+    bare = [msgspec.structs.replace(seen, objects=[], holding=none, contents=none) for seen in maps]
+    assert learning.estimate(prior, bare, LearningConfig()).looks is None
+
+
 def test_a_prior_that_is_right_stays_right():
     right = stated(TRUE)
     maps = [a_map(right, f"r{i}", 1, looking_like(0, 1, 2), HOME) for i in range(10)]

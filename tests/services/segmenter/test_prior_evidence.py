@@ -20,9 +20,6 @@ ROOMS = ["kitchen", "hall", "bedroom"]
 TICK = Tick(stamp_ns=10**18)
 
 
-ALIKE = np.array([[1.0, 0.0, 0.95], [0.0, 1.0, 0.0], [0.95, 0.0, 1.0]])  # kitchens look nearly like bedrooms
-
-
 def segmenter(cfg: Config, concepts=np.eye(3)) -> Runner:
     """A segmenter whose text requests are answered with these rows over the rooms' basis vectors."""
 
@@ -129,14 +126,24 @@ def test_each_region_is_told_of_apart_from_its_label():
     np.testing.assert_allclose(seen.contents[np.argsort(rooms)], [[0.9, 0.1], [0, 0], [0, 0]], rtol=1e-6)
 
 
-def rooms_under(counted: float, stove_in: str, ticks: int = 6, *, prior_last: bool = False) -> list[str]:
-    """Labels of three rooms, the first of which holds an oven, under a prior in whose regions `counted` were tested and
-    which comes before anything is seen or, with `prior_last`, after all is."""
+def rooms_under(
+    counted: float,
+    stove_in: str,
+    ticks: int = 6,
+    *,
+    prior_last: bool = False,
+    looks: float | None = None,
+    likeness: float = 0.95,
+) -> list[str]:
+    """Labels of three rooms, the first of which holds an oven and looks by `likeness` like a bedroom, under a prior in
+    whose regions `counted` were tested, beside which looks are worth so much, and which comes before anything is seen
+    or, with `prior_last`, after all is."""
     positions, edges = place_grid(3)
     held = np.full((3, 2), 0.02, np.float32)
     held[ROOMS.index(stove_in), 0] = 0.98
-    tested = Counts(regions=np.full(3, counted, np.float32)) if counted else None
-    runner = segmenter(Config(evidence_ticks=0), ALIKE)
+    tested = Counts(regions=np.full(3, counted, np.float32), looks=looks) if counted else None
+    concepts = np.array([[1.0, 0.0, likeness], [0.0, 1.0, 0.0], [likeness, 0.0, 1.0]])
+    runner = segmenter(Config(evidence_ticks=0), concepts)
     aim = (task(), prior(ROOMS, containment=held, tested=tested))
     runner.feed(place_delta(positions, edges), *(() if prior_last else aim), *walk(3), TICK)
     view = ObjectView(np.array([1]), np.array([[2.0, 2.0, 0.5]]), np.array([[1.0, 0.0]]))
@@ -152,6 +159,12 @@ def test_what_a_whole_region_holds_has_a_say_once_the_prior_was_tested():
     assert rooms_under(0, "bedroom") == ROOMS
     assert rooms_under(50, "bedroom") == ["bedroom", "hall", "bedroom"]
     assert rooms_under(50, "kitchen") == ROOMS
+
+
+def test_looks_give_way_to_contents_as_far_as_they_are_worth():
+    assert rooms_under(50, "bedroom", likeness=0.6) == ROOMS
+    assert rooms_under(50, "bedroom", likeness=0.6, looks=0.3) == ["bedroom", "hall", "bedroom"]
+    assert rooms_under(50, "kitchen", likeness=0.6, looks=0.3) == ROOMS
 
 
 def test_it_has_a_say_where_the_prior_comes_to_a_map_that_has_no_regions_yet():
