@@ -29,6 +29,7 @@ from prior_sg.services.place_graph.core import openings as frontiers
 from prior_sg.services.place_graph.core import state as core
 from prior_sg.services.place_graph.core.config import PRESETS, Config, preset
 from prior_sg.services.place_graph.core.skeleton import distance, links
+from prior_sg.services.place_graph.core.skeleton import places as extraction
 from prior_sg.services.place_graph.core.volume import coarse
 from prior_sg.services.place_graph.core.volume.grid import (
     BLOCK,
@@ -425,6 +426,23 @@ def test_places_of_a_room_are_connected_and_know_the_distance_to_its_walls(room)
     assert places.radii_m.min() >= CFG.min_node_distance_m
     assert (places.basis_points >= 2).all()
     assert parts(places) == 1
+
+
+@pytest.mark.parametrize("policy", ["basis_points", "middle"])
+def test_a_sphere_ends_at_an_obstacle_behind_a_hole_in_the_depth(policy):
+    label = np.full((48, 48, 48), UNOBSERVED, np.uint8)
+    label[6:42, 6:42, 6:30] = FREE
+    label[6:42, 6:42, 32] = OCCUPIED  # a ceiling behind two voxels that nobody saw
+    label[[6, 41], 6:42, 6:30] = label[6:42, [6, 41], 6:30] = label[6:42, 6:42, 6] = OCCUPIED
+    grid = grid_of(label)
+    box = distance.refresh(grid, observed(grid), CFG.field_rules)
+    rules = extraction.ExtractionRules(cell=10, min_radius=4.0, merge=5.0, policy=policy)
+    found = extraction.extract(grid, extraction.whole_cells(box, 10), rules)
+    centers = found.voxels + found.shifts / extraction.SHIFT_UNITS
+    gap2 = ((centers[:, None] - np.argwhere(label == OCCUPIED)) ** 2).sum(axis=2).min(axis=1)
+    np.testing.assert_allclose(found.free_d2, np.minimum(gap2, found.d2))
+    assert (found.free_d2 < found.d2 - 20).any()
+    assert (found.free_d2 == found.d2).any()
 
 
 def parts(places: PlaceDelta) -> int:
