@@ -30,7 +30,7 @@ from prior_sg.services.place_graph.core import state as core
 from prior_sg.services.place_graph.core.config import PRESETS, Config, preset
 from prior_sg.services.place_graph.core.skeleton import distance, links
 from prior_sg.services.place_graph.core.skeleton import places as extraction
-from prior_sg.services.place_graph.core.volume import coarse
+from prior_sg.services.place_graph.core.volume import coarse, tsdf
 from prior_sg.services.place_graph.core.volume.grid import (
     BLOCK,
     DERIVED,
@@ -378,6 +378,32 @@ def test_a_mask_grows_by_one_voxel_in_all_directions(shape):
     before = mask.copy()
     np.testing.assert_array_equal(dilated(mask), ndimage.maximum_filter(mask, size=3))
     np.testing.assert_array_equal(mask, before)
+
+
+@pytest.mark.parametrize("cfg", [CFG, preset("outdoor", max_range_m=60.0)], ids=["indoor", "far"])
+def test_blocks_that_are_left_out_are_those_of_which_a_view_says_nothing(cfg, monkeypatch):
+    frames = TWO_ROOMS_WALK[::4]
+    alone, together = start(cfg), start(cfg)
+    for frame in frames:
+        fusing.fuse(alone, frame, images.depth_of(frame, 0.5), cfg)
+    looked_at = []
+    monkeypatch.setattr(tsdf, "seen_blocks", lambda keys, *_: looked_at.extend(keys) or keys)
+    for frame in frames:
+        fusing.fuse(together, frame, images.depth_of(frame, 0.5), cfg)
+    assert list(alone.grid.blocks) == list(together.grid.blocks)
+    for key, block in alone.grid.blocks.items():
+        for name in MEASURED:
+            np.testing.assert_array_equal(getattr(block, name), getattr(together.grid.blocks[key], name))
+    monkeypatch.undo()
+    left = [
+        tsdf.seen_blocks(
+            tsdf.visible_blocks(CAMERA, frame.world_from_camera, cfg.voxel_m, cfg.max_range_m),
+            tsdf.View(images.depth_of(frame, 0.5), CAMERA, frame.world_from_camera),
+            cfg.fusion,
+        )
+        for frame in frames
+    ]
+    assert sum(map(len, left)) < (0.8 if cfg is CFG else 0.1) * len(looked_at)
 
 
 def test_one_ray_frees_voxels_before_the_surface_and_leaves_those_behind_unobserved():

@@ -68,7 +68,8 @@ def extract(grid: VoxelGrid, box: Box, rules: ExtractionRules) -> Extraction:
     d2 = grid.gather("d2", box, UNKNOWN_D2)
     members = _member_voxels(basis, d2, rules.min_radius**2)
     labels = np.full(basis.shape, -1, np.int32)
-    groups = _grow_groups(members, labels, box.low, rules.cell)
+    cells = [np.floor_divide(low + np.arange(size), rules.cell) for low, size in zip(box.low, box.shape, strict=True)]
+    groups = _grow_groups(members, labels, *cells)
     sizes = np.bincount(labels[tuple(members.T)], minlength=groups)
     if rules.policy == "middle":
         chosen, shifts = _middles(members, labels, sizes)
@@ -112,8 +113,11 @@ def _unique_pairs(pairs: np.ndarray, count: int) -> np.ndarray:
 
 
 @compiled()
-def _grow_groups(members, labels, low, cell_voxels):  # noqa: ANN001, ANN202
-    """Label each 26-connected set of members inside one cell (-2: not reached yet); return the number of sets."""
+def _grow_groups(members, labels, cells_x, cells_y, cells_z):  # noqa: ANN001, ANN202
+    """Label each 26-connected set of members inside one cell (-2: not reached yet); return the number of sets.
+
+    The cells are those of the window's voxels along each axis.
+    """
     for n in range(len(members)):
         labels[members[n, 0], members[n, 1], members[n, 2]] = -2
     stack = np.empty((len(members), 3), np.int64)
@@ -131,12 +135,9 @@ def _grow_groups(members, labels, low, cell_voxels):  # noqa: ANN001, ANN202
                 a, b, c = i + STEPS[s, 0], j + STEPS[s, 1], k + STEPS[s, 2]
                 if a < 0 or b < 0 or c < 0 or a >= labels.shape[0] or b >= labels.shape[1] or c >= labels.shape[2]:
                     continue
-                same_cell = (
-                    (a + low[0]) // cell_voxels == (i + low[0]) // cell_voxels
-                    and (b + low[1]) // cell_voxels == (j + low[1]) // cell_voxels
-                    and (c + low[2]) // cell_voxels == (k + low[2]) // cell_voxels
-                )
-                if same_cell and labels[a, b, c] == -2:
+                if labels[a, b, c] != -2:
+                    continue
+                if cells_x[a] == cells_x[i] and cells_y[b] == cells_y[j] and cells_z[c] == cells_z[k]:
                     labels[a, b, c] = groups
                     stack[depth, 0], stack[depth, 1], stack[depth, 2] = a, b, c
                     depth += 1
