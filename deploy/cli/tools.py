@@ -3,7 +3,7 @@
 import argparse
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -331,12 +331,19 @@ def cmd_bench(arguments: argparse.Namespace) -> int:
         if arguments.json:
             print(json.dumps(found))
         else:
-            columns, rows = bench.table(found)
-            table = Table(*columns, title=f"{name} ({found['machine']['cores']} cores)")
-            for row in rows:
-                table.add_row(*row)
-            console.print(table)
+            _print_figures(*bench.table(found), title=f"{name} ({found['machine']['cores']} cores)")
     return 0
+
+
+def _print_figures(columns: Sequence[str], rows: list[list[str]], title: str) -> None:
+    """As a table; as Markdown where that would be too wide for a terminal."""
+    if len(columns) > 2:
+        print(title, *(f"| {' | '.join(row)} |" for row in (columns, ["---"] * len(columns), *rows)), sep="\n")
+        return
+    table = Table(*columns, title=title)
+    for row in rows:
+        table.add_row(*row)
+    console.print(table)
 
 
 def _tell(update: Callable[[str], None], name: str, text: str) -> None:
