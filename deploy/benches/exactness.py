@@ -1,4 +1,5 @@
-"""How exact and how steady places are, against the raw depth they were made from: `prior-sg bench places --on PATH…`.
+"""How exact and how steady places are, against the raw depth they were made from: `prior-sg bench places --on PATH…`
+prints a table, a row for each recording or world and each preset.
 
 **Too wide** is a place whose sphere holds a measured surface more than WRONG_M inside; surfaces are all points of the
 depth images within the map's range (`too_wide`), or those that other keyframes agree with (`too_wide_agreed`): noise
@@ -11,7 +12,7 @@ keyframes in another order, from another walk (of a recording the keyframes betw
 
 import itertools
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -38,6 +39,18 @@ EVERY_PX = 6  # of the depth images in each direction
 POINT_M = 0.05  # of the points in a cube of this side one is asked whether keyframes agree with it
 HIT_M, THROUGH_M, NOISE_PER_M = 0.05, 0.15, 0.01  # depth z agrees to HIT_M + NOISE_PER_M z^2, and sees through beyond
 WORLD = "world:"
+PRESETS = ("indoor", "habitat", "mixed")  # voxels of 0.1 m, of 0.2 m, and a map of 0.1 m with a field of 0.2 m
+COLUMNS = (
+    "scene, preset",
+    "keyframes",
+    "places",
+    "ms p50/p99",
+    "map MB",
+    "too wide %",
+    "of agreed %",
+    "too narrow %",
+    "found: grid, order, walk %",
+)
 
 
 class Places(NamedTuple):
@@ -56,15 +69,44 @@ class Walk(NamedTuple):
     other: list[Keyframe]
 
 
-def exactness_bench(paths: Sequence[Path], presets: Sequence[str]) -> tuple[dict[str, float], dict[str, Any]]:
-    """The table of the given recordings and worlds, a row for each and each preset of the place graph."""
+def exactness_bench(
+    paths: Sequence[Path], presets: Sequence[str], report: Callable[[str], None]
+) -> tuple[dict[str, float], dict[str, Any]]:
+    """Figures of the given recordings and worlds, each with each preset of the place graph; `report` hears which.
+
+    Raises SourceError or EvaluationError.
+    """
     metrics: dict[str, float] = {}
     for path in paths:
         walk, name = walk_of(path), str(path) if str(path).startswith(WORLD) else path.name
         for preset in presets:
+            report(f"{name}, {preset}")
             cfg = resolve(BY_NAME["place_graph"].config, "place_graph", {"place_graph": {"preset": preset}})
             metrics |= {f"{name} {preset} {key}": value for key, value in measured(walk, cfg).items()}
     return metrics, {"offsets_m": OFFSETS_M, "wrong_m": WRONG_M, "found_m": FOUND_M, "clock": "processor time"}
+
+
+def table(metrics: Mapping[str, float]) -> list[list[str]]:
+    """What `exactness_bench` found, as rows of COLUMNS; shares that depend on the grid as mean (least to greatest)."""
+    scenes: dict[str, dict[str, float]] = {}
+    for name, value in metrics.items():
+        scene, key = name.rsplit(" ", 1)
+        scenes.setdefault(scene, {})[key] = value
+    return [[scene, *_cells(found)] for scene, found in scenes.items()]
+
+
+def _cells(of: Mapping[str, float]) -> list[str]:
+    def ranged(key: str) -> str:
+        return f"{100 * of[key]:.1f} ({100 * of[f'{key}_least']:.1f}-{100 * of[f'{key}_worst']:.1f})"
+
+    return [
+        f"{of['keyframes']:.0f}",
+        f"{of['places']:.0f}",
+        f"{of['ms_p50']:.1f}/{of['ms_p99']:.1f}",
+        f"{of['map_mb']:.1f}",
+        *(ranged(key) for key in ("too_wide", "too_wide_agreed", "too_narrow")),
+        ", ".join(f"{100 * of[f'found_{how}']:.0f}" for how in ("grid", "order", "walk")),
+    ]
 
 
 def measured(walk: Walk, cfg: Config) -> dict[str, float]:
@@ -74,10 +116,10 @@ def measured(walk: Walk, cfg: Config) -> dict[str, float]:
     places_of(walk.keyframes[:3], cfg)  # loads the compiled kernels
     maps = [places_of(walk.keyframes, cfg, offset_m) for offset_m in OFFSETS_M]
     spent_ms = np.concatenate([each.spent_ms for each in maps])
-    wide, wide_agreed, narrow = (
-        np.array([np.mean(side * (each.radii_m - tree.query(each.positions_m)[0]) > WRONG_M) for each in maps])
-        for side, tree in ((1, raw), (1, agreed), (-1, agreed))
-    )
+    shares = {
+        key: [np.mean(side * (each.radii_m - tree.query(each.positions_m)[0]) > WRONG_M) for each in maps]
+        for key, side, tree in (("too_wide", 1, raw), ("too_wide_agreed", 1, agreed), ("too_narrow", -1, agreed))
+    }
     order = np.random.default_rng(7).permutation(len(walk.keyframes))
     fearless = msgspec.structs.replace(cfg, max_speed_m_s=0.0)  # in another order every pose jumps
     reordered = places_of([walk.keyframes[row] for row in order], fearless)
@@ -90,11 +132,9 @@ def measured(walk: Walk, cfg: Config) -> dict[str, float]:
         "ms_p99": float(np.percentile(spent_ms, 99)),
         "map_mb": maps[0].map_mb,
         "radius_m": float(np.mean(np.concatenate([each.radii_m for each in maps]))),
-        "too_wide": float(wide.mean()),
-        "too_wide_worst": float(wide.max()),
-        "too_wide_agreed": float(wide_agreed.mean()),
-        "too_narrow": float(narrow.mean()),
-        "too_narrow_worst": float(narrow.max()),
+        **{key: float(np.mean(each)) for key, each in shares.items()},
+        **{f"{key}_least": float(min(each)) for key, each in shares.items()},
+        **{f"{key}_worst": float(max(each)) for key, each in shares.items()},
         "found_grid": float(np.mean([found(*pair) for pair in itertools.permutations(maps, 2)])),
         "found_order": found(reordered, maps[0]),
         "found_walk": found(other, one),
@@ -102,13 +142,16 @@ def measured(walk: Walk, cfg: Config) -> dict[str, float]:
 
 
 def places_of(keyframes: Sequence[Keyframe], cfg: Config, offset_m: float = 0.0) -> Places:
-    """The places of a map whose grid is moved by `offset_m` against the scene along all axes."""
+    """The places of a map whose grid is moved by `offset_m` against the scene along all axes.
+
+    Keyframes are counted from 0 on: a map that begins with another one waits for the archive.
+    """
     runner = Runner(BY_NAME["place_graph"], cfg, Identity("bench", "b", 1))
     spent_ms = []
-    for keyframe in keyframes:
+    for number, keyframe in enumerate(keyframes):
         pose = np.array(keyframe.world_from_camera)
         pose[:3, 3] += offset_m
-        shifted = msgspec.structs.replace(keyframe, robot="bench", world_from_camera=pose)
+        shifted = msgspec.structs.replace(keyframe, robot="bench", frame_id=number, world_from_camera=pose)
         started_s = time.process_time()
         runner.feed(shifted)
         spent_ms.append(1e3 * (time.process_time() - started_s))

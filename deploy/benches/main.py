@@ -4,16 +4,15 @@ import os
 import platform
 import statistics
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from prior_sg.deploy.benches import exactness, segmenter
 from prior_sg.deploy.benches import features as bench_features
-from prior_sg.deploy.benches import segmenter
 from prior_sg.deploy.benches.bus import bus_bench
 from prior_sg.deploy.benches.crashes import crashes
 from prior_sg.deploy.benches.encoder_swap import encoder_swap
-from prior_sg.deploy.benches.exactness import exactness_bench
 from prior_sg.deploy.benches.footprint import memory_bench, start_bench
 from prior_sg.deploy.benches.kernel import kernel
 from prior_sg.deploy.benches.learning import learning_bench
@@ -41,7 +40,7 @@ class Asked(NamedTuple):
 
     seconds: float = 300.0  # how long the pool is attacked
     paths: Sequence[Path] = ()  # recordings and worlds to measure on: of places, foresight and merge
-    presets: Sequence[str] = ("indoor",)  # of the place graph, with `paths`
+    presets: Sequence[str] = exactness.PRESETS  # of the place graph, with `paths`
     worlds: str = ""  # the kind of generated worlds in which learning takes place
     seeds: int = 0  # worlds of each kind that an explorer foresees, 0 = all
     report: Callable[[str], None] = _silent  # hears how far it is
@@ -244,10 +243,26 @@ def learning_in_worlds(asked: Asked) -> tuple[dict, dict]:
     return learning_worlds_bench(asked.worlds, asked.report)
 
 
+def table(found: dict[str, Any]) -> tuple[Sequence[str], list[list[str]]]:
+    """One measurement as the columns and rows that are printed."""
+    if "offsets_m" in found["settings"]:
+        return exactness.COLUMNS, exactness.table(found["metrics"])
+    return ("metric", "value"), [[metric, f"{value:.4g}"] for metric, value in _flat(found["metrics"])]
+
+
+def _flat(metrics: dict, before: str = "") -> Iterator[tuple[str, float]]:
+    """Every figure with the names it stands under."""
+    for name, value in metrics.items():
+        if isinstance(value, dict):
+            yield from _flat(value, f"{before}{name}.")
+        else:
+            yield before + name, value
+
+
 def run(name: str, asked: Asked) -> dict[str, Any]:
     """One measurement as the object that `--json` prints."""
     if name == "places" and asked.paths:
-        metrics, settings = exactness_bench(asked.paths, asked.presets)
+        metrics, settings = exactness.exactness_bench(asked.paths, asked.presets, asked.report)
     elif name == "learning" and asked.worlds:
         metrics, settings = learning_in_worlds(asked)
     else:

@@ -3,7 +3,7 @@
 import argparse
 import json
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -138,7 +138,9 @@ def _add_measuring(commands: Commands) -> None:
         help="measure places, merge or markers on these instead, or map these for foresight, such as world:home:80-91",
     )
     bench.add_argument("--seeds", type=int, default=0, help="of each kind of world, for foresight (default: all four)")
-    bench.add_argument("--presets", nargs="+", default=["indoor"], help="of the place graph, with --on")
+    bench.add_argument(
+        "--presets", nargs="+", help="of the place graph, for places with --on (default: indoor habitat mixed)"
+    )
     bench.add_argument(
         "--worlds", default="", metavar="KIND", help="measure learning in generated worlds, such as home"
     )
@@ -320,7 +322,7 @@ def cmd_bench(arguments: argparse.Namespace) -> int:
             asked = bench.Asked(
                 seconds=arguments.seconds,
                 paths=arguments.on,
-                presets=arguments.presets,
+                presets=arguments.presets or bench.exactness.PRESETS,
                 worlds=arguments.worlds,
                 seeds=arguments.seeds,
                 report=partial(_tell, status.update, name),
@@ -329,24 +331,23 @@ def cmd_bench(arguments: argparse.Namespace) -> int:
         if arguments.json:
             print(json.dumps(found))
         else:
-            table = Table("metric", "value", title=f"{name} ({found['machine']['cores']} cores)")
-            for metric, value in _flat(found["metrics"]):
-                table.add_row(metric, f"{value:.4g}")
-            console.print(table)
+            _print_figures(*bench.table(found), title=f"{name} ({found['machine']['cores']} cores)")
     return 0
+
+
+def _print_figures(columns: Sequence[str], rows: list[list[str]], title: str) -> None:
+    """As a table; as Markdown where that would be too wide for a terminal."""
+    if len(columns) > 2:
+        print(title, *(f"| {' | '.join(row)} |" for row in (columns, ["---"] * len(columns), *rows)), sep="\n")
+        return
+    table = Table(*columns, title=title)
+    for row in rows:
+        table.add_row(*row)
+    console.print(table)
 
 
 def _tell(update: Callable[[str], None], name: str, text: str) -> None:
     update(f"measuring {name}: {text}")
-
-
-def _flat(metrics: dict, before: str = "") -> Iterator[tuple[str, float]]:
-    """Every figure with the names it stands under."""
-    for name, value in metrics.items():
-        if isinstance(value, dict):
-            yield from _flat(value, f"{before}{name}.")
-        else:
-            yield before + name, value
 
 
 def cmd_eval(arguments: argparse.Namespace) -> int:

@@ -104,7 +104,8 @@ class GroundGraph(PlaceGraph):
             place_id = id_of.get(index)
             if place_id is None:
                 place_id, self._next_id = self._next_id, self._next_id + 1
-            place = Place(piece.middle, max(1, round(float(np.prod(piece.half_axes)))), 0)
+            d2 = max(1, round(float(np.prod(piece.half_axes))))
+            place = Place(piece.middle, d2, d2, 0)
             known = self.pieces.get(place_id)
             if self.places.get(place_id) != place or known is None or not np.array_equal(known.hull, piece.hull):
                 changes.touched.add(place_id)

@@ -104,7 +104,7 @@ def _differs(known: Place | None, place: Place, voxel_m: float, min_change_m: fl
     if known is None or known.basis != place.basis:
         return True
     moved = max(abs(a - b) for a, b in zip(known.center, place.center, strict=True)) * voxel_m
-    return moved > min_change_m or abs(known.d2**0.5 - place.d2**0.5) * voxel_m > min_change_m
+    return moved > min_change_m or abs(known.free_d2**0.5 - place.free_d2**0.5) * voxel_m > min_change_m
 
 
 def _place_columns(places: list[tuple[int, Place]], voxel_m: float) -> PlaceColumns:
@@ -112,7 +112,7 @@ def _place_columns(places: list[tuple[int, Place]], voxel_m: float) -> PlaceColu
     return PlaceColumns(
         place_ids=np.array([i for i, _ in places], np.int64),
         positions_m=(centers * voxel_m).astype(np.float32),
-        radii_m=(np.sqrt([float(p.d2) for _, p in places]) * voxel_m).astype(np.float32),
+        radii_m=(np.sqrt([float(p.free_d2) for _, p in places]) * voxel_m).astype(np.float32),
         basis_points=np.array([p.basis for _, p in places], np.int16),
     )
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from prior_sg.deploy.benches import foresight as bench
-from prior_sg.deploy.cli.tools import _flat
+from prior_sg.deploy.benches.main import table
 from prior_sg.deploy.evaluation.datasets import WorldName
 from prior_sg.deploy.evaluation.foresight.trials import SAME, Moment
 from prior_sg.services.segmenter.core.foresight.beyond import Views
@@ -41,4 +41,5 @@ def test_maps_are_judged_together_and_by_kind(maps, tmp_path):
 
 
 def test_figures_stand_under_all_their_names():
-    assert dict(_flat({"ours": {"nll": 1.0}, "within_ece": 0.1})) == {"ours.nll": 1.0, "within_ece": 0.1}
+    nested = {"metrics": {"ours": {"nll": 1.0}, "within_ece": 0.1}, "settings": {}}
+    assert table(nested) == (("metric", "value"), [["ours.nll", "1"], ["within_ece", "0.1"]])

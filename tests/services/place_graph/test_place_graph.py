@@ -29,7 +29,8 @@ from prior_sg.services.place_graph.core import openings as frontiers
 from prior_sg.services.place_graph.core import state as core
 from prior_sg.services.place_graph.core.config import PRESETS, Config, preset
 from prior_sg.services.place_graph.core.skeleton import distance, links
-from prior_sg.services.place_graph.core.volume import coarse
+from prior_sg.services.place_graph.core.skeleton import places as extraction
+from prior_sg.services.place_graph.core.volume import coarse, tsdf
 from prior_sg.services.place_graph.core.volume.grid import (
     BLOCK,
     DERIVED,
@@ -379,6 +380,32 @@ def test_a_mask_grows_by_one_voxel_in_all_directions(shape):
     np.testing.assert_array_equal(mask, before)
 
 
+@pytest.mark.parametrize("cfg", [CFG, preset("outdoor", max_range_m=60.0)], ids=["indoor", "far"])
+def test_blocks_that_are_left_out_are_those_of_which_a_view_says_nothing(cfg, monkeypatch):
+    frames = TWO_ROOMS_WALK[::4]
+    alone, together = start(cfg), start(cfg)
+    for frame in frames:
+        fusing.fuse(alone, frame, images.depth_of(frame, 0.5), cfg)
+    looked_at = []
+    monkeypatch.setattr(tsdf, "seen_blocks", lambda keys, *_: looked_at.extend(keys) or keys)
+    for frame in frames:
+        fusing.fuse(together, frame, images.depth_of(frame, 0.5), cfg)
+    assert list(alone.grid.blocks) == list(together.grid.blocks)
+    for key, block in alone.grid.blocks.items():
+        for name in MEASURED:
+            np.testing.assert_array_equal(getattr(block, name), getattr(together.grid.blocks[key], name))
+    monkeypatch.undo()
+    left = [
+        tsdf.seen_blocks(
+            tsdf.visible_blocks(CAMERA, frame.world_from_camera, cfg.voxel_m, cfg.max_range_m),
+            tsdf.View(images.depth_of(frame, 0.5), CAMERA, frame.world_from_camera),
+            cfg.fusion,
+        )
+        for frame in frames
+    ]
+    assert sum(map(len, left)) < (0.8 if cfg is CFG else 0.1) * len(looked_at)
+
+
 def test_one_ray_frees_voxels_before_the_surface_and_leaves_those_behind_unobserved():
     camera = Intrinsics(1, 1, 10.0, 10.0, 0.0, 0.0)
     pose = pose_from_quaternion(np.array((0.0, 0.05, 0.05)), np.array(FORWARD))
@@ -425,6 +452,23 @@ def test_places_of_a_room_are_connected_and_know_the_distance_to_its_walls(room)
     assert places.radii_m.min() >= CFG.min_node_distance_m
     assert (places.basis_points >= 2).all()
     assert parts(places) == 1
+
+
+@pytest.mark.parametrize("policy", ["basis_points", "middle"])
+def test_a_sphere_ends_at_an_obstacle_behind_a_hole_in_the_depth(policy):
+    label = np.full((48, 48, 48), UNOBSERVED, np.uint8)
+    label[6:42, 6:42, 6:30] = FREE
+    label[6:42, 6:42, 32] = OCCUPIED  # a ceiling behind two voxels that nobody saw
+    label[[6, 41], 6:42, 6:30] = label[6:42, [6, 41], 6:30] = label[6:42, 6:42, 6] = OCCUPIED
+    grid = grid_of(label)
+    box = distance.refresh(grid, observed(grid), CFG.field_rules)
+    rules = extraction.ExtractionRules(cell=10, min_radius=4.0, merge=5.0, policy=policy)
+    found = extraction.extract(grid, extraction.whole_cells(box, 10), rules)
+    centers = found.voxels + found.shifts / extraction.SHIFT_UNITS
+    gap2 = ((centers[:, None] - np.argwhere(label == OCCUPIED)) ** 2).sum(axis=2).min(axis=1)
+    np.testing.assert_allclose(found.free_d2, np.minimum(gap2, found.d2))
+    assert (found.free_d2 < found.d2 - 20).any()
+    assert (found.free_d2 == found.d2).any()
 
 
 def parts(places: PlaceDelta) -> int:

@@ -22,10 +22,11 @@ Voxel = tuple[int, int, int]
 
 
 class Place(NamedTuple):
-    """One place: the voxel at its centre, squared distance (voxels) to the nearest obstacle, basis points."""
+    """One place: the voxel at its centre, squared distances (voxels) to the nearest obstacle, basis points."""
 
     voxel: Voxel
-    d2: float
+    d2: float  # to the nearest that observed space leads to ...
+    free_d2: float  # ... or that is known behind what was not observed: no more than d2
     basis: int
     shift: Voxel = (0, 0, 0)  # from the voxel's centre to the place's, SHIFT_UNITS to a voxel
 
@@ -157,7 +158,8 @@ class PlaceGraph:
                 id_of[index], self._next_id = self._next_id, self._next_id + 1
             x, y, z = extraction.voxels[index].tolist()
             i, j, k = extraction.shifts[index].tolist()
-            place = Place((x, y, z), float(extraction.d2[index]), int(extraction.basis[index]), (i, j, k))
+            d2, free_d2 = float(extraction.d2[index]), float(extraction.free_d2[index])
+            place = Place((x, y, z), d2, free_d2, int(extraction.basis[index]), (i, j, k))
             if self.places.get(id_of[index]) != place:
                 changes.touched.add(id_of[index])
                 self._put(id_of[index], place)

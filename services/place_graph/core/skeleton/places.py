@@ -2,6 +2,9 @@
 
 Hydra's representative is the voxel with most basis points, a count that changes with every shift of the grid. The
 middle of the group stays: a group that wins or loses a voxel at its edge has nearly the same middle.
+
+Waves stop at what was not observed, so an obstacle behind a hole in the depth is none to them. A place's sphere ends
+there all the same: obstacles are looked for in a straight line as well, as far as two cells.
 """
 
 from dataclasses import dataclass
@@ -11,9 +14,10 @@ import numpy as np
 
 from prior_sg.services.compiled import compiled
 from prior_sg.services.place_graph.core.skeleton.distance import STEPS
-from prior_sg.services.place_graph.core.volume.grid import FAR_D2, UNKNOWN_D2, Box, VoxelGrid
+from prior_sg.services.place_graph.core.volume.grid import FAR_D2, OCCUPIED, UNKNOWN_D2, Box, VoxelGrid
 
 SHIFT_UNITS = 16
+LOOK_CELLS = 2  # how far obstacles behind unobserved space are looked for: no farther than a change renews places
 Policy = Literal["middle", "basis_points", "distance"]
 
 
@@ -23,7 +27,8 @@ class Extraction:
 
     voxels: np.ndarray  # (place, 3) int64, world voxel index of the representative
     shifts: np.ndarray  # (place, 3) int64, from the centre of that voxel to the place, SHIFT_UNITS to a voxel
-    d2: np.ndarray  # (place,) float64, squared voxels to the nearest obstacle, exact
+    d2: np.ndarray  # (place,) float64, squared voxels to the nearest obstacle that observed space leads to, exact
+    free_d2: np.ndarray  # (place,) float64, the same to any known obstacle at most LOOK_CELLS away, else d2
     basis: np.ndarray  # (place,) int64
     touching: np.ndarray  # (pair, 2) int64, places whose voxels touch, smaller first, sorted
     members: np.ndarray  # window of int32: place index of a member voxel, -1 elsewhere
@@ -63,7 +68,8 @@ def extract(grid: VoxelGrid, box: Box, rules: ExtractionRules) -> Extraction:
     d2 = grid.gather("d2", box, UNKNOWN_D2)
     members = _member_voxels(basis, d2, rules.min_radius**2)
     labels = np.full(basis.shape, -1, np.int32)
-    groups = _grow_groups(members, labels, box.low, rules.cell)
+    cells = [np.floor_divide(low + np.arange(size), rules.cell) for low, size in zip(box.low, box.shape, strict=True)]
+    groups = _grow_groups(members, labels, *cells)
     sizes = np.bincount(labels[tuple(members.T)], minlength=groups)
     if rules.policy == "middle":
         chosen, shifts = _middles(members, labels, sizes)
@@ -87,7 +93,9 @@ def extract(grid: VoxelGrid, box: Box, rules: ExtractionRules) -> Extraction:
     local, shifts, clear_d2 = local[kept], shifts[kept], group_d2[kept].astype(np.float64)
     if shifts.any():
         _between_voxels(d2, grid.gather("offset", box), local, shifts, clear_d2, rules.min_radius**2)
-    return Extraction(local + box.low, shifts, clear_d2, group_basis[kept], touching, labels, box)
+    free_d2 = clear_d2.copy()
+    _look_around(grid.gather("label", box), local, shifts, free_d2, LOOK_CELLS * rules.cell)
+    return Extraction(local + box.low, shifts, clear_d2, free_d2, group_basis[kept], touching, labels, box)
 
 
 def _member_voxels(basis: np.ndarray, d2: np.ndarray, min_d2: float) -> np.ndarray:
@@ -105,8 +113,11 @@ def _unique_pairs(pairs: np.ndarray, count: int) -> np.ndarray:
 
 
 @compiled()
-def _grow_groups(members, labels, low, cell_voxels):  # noqa: ANN001, ANN202
-    """Label each 26-connected set of members inside one cell (-2: not reached yet); return the number of sets."""
+def _grow_groups(members, labels, cells_x, cells_y, cells_z):  # noqa: ANN001, ANN202
+    """Label each 26-connected set of members inside one cell (-2: not reached yet); return the number of sets.
+
+    The cells are those of the window's voxels along each axis.
+    """
     for n in range(len(members)):
         labels[members[n, 0], members[n, 1], members[n, 2]] = -2
     stack = np.empty((len(members), 3), np.int64)
@@ -124,12 +135,9 @@ def _grow_groups(members, labels, low, cell_voxels):  # noqa: ANN001, ANN202
                 a, b, c = i + STEPS[s, 0], j + STEPS[s, 1], k + STEPS[s, 2]
                 if a < 0 or b < 0 or c < 0 or a >= labels.shape[0] or b >= labels.shape[1] or c >= labels.shape[2]:
                     continue
-                same_cell = (
-                    (a + low[0]) // cell_voxels == (i + low[0]) // cell_voxels
-                    and (b + low[1]) // cell_voxels == (j + low[1]) // cell_voxels
-                    and (c + low[2]) // cell_voxels == (k + low[2]) // cell_voxels
-                )
-                if same_cell and labels[a, b, c] == -2:
+                if labels[a, b, c] != -2:
+                    continue
+                if cells_x[a] == cells_x[i] and cells_y[b] == cells_y[j] and cells_z[c] == cells_z[k]:
                     labels[a, b, c] = groups
                     stack[depth, 0], stack[depth, 1], stack[depth, 2] = a, b, c
                     depth += 1
@@ -184,6 +192,27 @@ def _between_voxels(d2, offset, voxels, shifts, clear_d2, least_d2):  # noqa: AN
             clear_d2[n] = best / SHIFT_UNITS**2
         else:
             shifts[n] = 0
+
+
+@compiled()
+def _look_around(label, voxels, shifts, free_d2, farthest):  # noqa: ANN001, ANN202
+    """Lower `free_d2` (place,) to the squared distance of the nearest obstacle within it and within `farthest`."""
+    for n in range(len(voxels)):
+        best = min(free_d2[n], float(farthest * farthest)) * SHIFT_UNITS**2
+        reach = int(np.sqrt(best)) // SHIFT_UNITS + 1
+        nearest = best
+        for i in range(max(voxels[n, 0] - reach, 0), min(voxels[n, 0] + reach + 1, label.shape[0])):
+            x = (i - voxels[n, 0]) * SHIFT_UNITS - shifts[n, 0]
+            for j in range(max(voxels[n, 1] - reach, 0), min(voxels[n, 1] + reach + 1, label.shape[1])):
+                y = (j - voxels[n, 1]) * SHIFT_UNITS - shifts[n, 1]
+                if x * x + y * y >= nearest:
+                    continue
+                for k in range(max(voxels[n, 2] - reach, 0), min(voxels[n, 2] + reach + 1, label.shape[2])):
+                    if label[i, j, k] == OCCUPIED:
+                        z = (k - voxels[n, 2]) * SHIFT_UNITS - shifts[n, 2]
+                        nearest = min(nearest, x * x + y * y + z * z)
+        if nearest < best:
+            free_d2[n] = nearest / SHIFT_UNITS**2
 
 
 @compiled()

@@ -31,6 +31,8 @@ HALF_DIAGONAL = float(np.sqrt(3.0) / 2.0)
 FINENESS = 256  # integer weight of a measurement at the maximal range
 LARGEST = 2**30  # integer weight at which evidence fades for lack of bits
 ADD, REMOVE = 1, -1
+CORNERS = np.array(list(np.ndindex(2, 2, 2)), np.float64)
+TILE_PX = 8  # of the depth image, of which one knows the greatest depth
 SHARE_KNOWN = 0.2  # of a depth image that must lie in the known map to be judged by it
 
 
@@ -75,7 +77,8 @@ def integrate(grid: VoxelGrid, view: View, fusion: Fusion, sign: int = ADD) -> n
     changed: list[np.ndarray] = []
     found = np.empty((BLOCK**3, 3), np.int64)
     spare = grid.blank()
-    for key in visible_blocks(camera, view.world_from_camera, fusion.voxel_m, fusion.max_range_m):
+    keys = visible_blocks(camera, view.world_from_camera, fusion.voxel_m, fusion.max_range_m)
+    for key in seen_blocks(keys, view, fusion):
         known = grid.block(key)
         if known is None and sign == REMOVE:
             continue
@@ -114,6 +117,53 @@ def visible_blocks(
             distance = side * (centers[:, axis] - slope * centers[:, 2]) / np.hypot(1.0, slope)
             inside &= distance > -radius_m
     return [(int(x), int(y), int(z)) for x, y, z in keys[inside]]
+
+
+def seen_blocks(keys: list[BlockKey], view: View, fusion: Fusion) -> list[BlockKey]:
+    """Those of the blocks that the depth image may say something of: not the ones behind all that it shows there."""
+    if not keys:
+        return []
+    camera, block_m = view.camera, BLOCK * fusion.voxel_m
+    points = (np.array(keys, np.float64)[:, None] + CORNERS) * block_m
+    x, y, z = np.moveaxis(transform(inverse(view.world_from_camera), points.reshape(-1, 3)), -1, 0).reshape(3, -1, 8)
+    before = z.min(axis=1) > fusion.min_range_m  # the others are looked at voxel by voxel
+    z = np.where(before[:, None], z, 1.0)
+    u, v = camera.fx_px * x / z + camera.cx_px, camera.fy_px * y / z + camera.cy_px
+    ends = np.stack((u.min(axis=1), u.max(axis=1) + 1.0, v.min(axis=1), v.max(axis=1) + 1.0), axis=1)
+    size = np.array((camera.width_px, camera.width_px, camera.height_px, camera.height_px)) - 1
+    tiles = np.clip(np.floor(ends), 0, size).astype(np.int64) // TILE_PX
+    seen = ~before | _any_beyond(_farthest(view.depth_m, TILE_PX), tiles, z.min(axis=1) - fusion.truncation_m)
+    return [key for key, there in zip(keys, seen.tolist(), strict=True) if there]
+
+
+@compiled()
+def _farthest(depth_m, side):  # noqa: ANN001, ANN202
+    """The greatest depth in each tile of `side` pixels."""
+    rows, columns = depth_m.shape
+    found = np.zeros((-(-rows // side), -(-columns // side)), depth_m.dtype)
+    for v in range(rows):
+        line = found[v // side]
+        for tile in range(len(line)):
+            best = line[tile]
+            for u in range(tile * side, min((tile + 1) * side, columns)):
+                best = max(best, depth_m[v, u])
+            line[tile] = best
+    return found
+
+
+@compiled()
+def _any_beyond(farthest_m, tiles, nearest_m):  # noqa: ANN001, ANN202
+    """Whether any tile of each range (n, 4) of columns and rows holds a depth of at least `nearest_m` (n,)."""
+    found = np.zeros(len(tiles), np.bool_)
+    for n in range(len(tiles)):
+        for row in range(tiles[n, 2], tiles[n, 3] + 1):
+            for column in range(tiles[n, 0], tiles[n, 1] + 1):
+                if farthest_m[row, column] >= nearest_m[n] and farthest_m[row, column] > 0:
+                    found[n] = True
+                    break
+            if found[n]:
+                break
+    return found
 
 
 @compiled()
