@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import viser
 
+from prior_sg.deploy.parts import floors_of, storey_of
 from prior_sg.deploy.showing.prior import graph_svg
 from prior_sg.deploy.viewing import search, ways, words
 from prior_sg.deploy.viewing.drawing import DARK, LIGHT, Painter
@@ -54,6 +55,7 @@ class Wanted:
     goal: Spot | None = None  # the way there is shown
     start: Spot = FROM_THE_ROBOT
     cut_m: float = CUT_M
+    floor: int | None = None  # id of the one that is shown; None = all
     playing: bool = False
     told: dict[str, str] = field(default_factory=dict)  # notes by part of the panel
 
@@ -66,7 +68,8 @@ class Page:
         self._painter = Painter(DARK if options.dark else LIGHT)
         self._wanted = Wanted()
         self._wake, self._closed = threading.Event(), threading.Event()
-        self._index: Index | None = None  # of the scene that is shown
+        self._index: Index | None = None  # of the scene that is shown, all of it
+        self._drawn: tuple[Scene, int | None, Scene] | None = None  # a scene, the floor wanted, and what of it is drawn
         self._hits: list[search.Hit] = []
         self._meant: dict[tuple[str, str], Likeness] = {}  # by text and prior
         self._asking = threading.Lock()
@@ -109,6 +112,7 @@ class Page:
             play=self._start_playing,
             layer=self.stage.switch,
             cut=lambda height: self._want(cut_m=height),
+            floor=lambda floor: self._want(floor=floor),
             frame=self.stage.frame,
             answer=self._go_to_answer,
             picked=self._go_to_picked,
@@ -185,19 +189,29 @@ class Page:
         until_ns = scene.stamp_ns if wanted.moment is not None else np.inf
         found = search.find(index, wanted.text, self._meant.get((wanted.text, scene.prior_digest), NOTHING_KNOWN))
         picked = NO_REGION if wanted.picked is None else wanted.picked.region
-        picture = self._painter.draw(scene, replace(found.lit, picked=picked))
-        ground_m = floor_m(scene, np.arange(len(scene.place_ids)))
+        drawn = self._on_floor(scene)
+        picture = self._painter.draw(drawn, replace(found.lit, picked=picked))
+        ground_m = floor_m(drawn, np.arange(len(drawn.place_ids)))
         way = None if wanted.goal is None else ways.way(index, Trip(wanted.goal, wanted.start))
         if way is not None:
             picture |= ways.picture(way, self._painter.theme.way, self._painter.theme.ink)
         picture |= self._source.cloud.picture(ground_m + wanted.cut_m, until_ns)
         sent = self.stage.show(picture).nbytes
         self.stage.look(self._source.camera(until_ns))
-        self._frame(scene, ground_m)
-        self._write(scene, found, len(stamps))
+        self._frame(drawn, ground_m)
+        self._write(drawn, found, len(stamps))
+        self.panel.offer_floors(floors_of(scene))
         self._tell_way(way)
         self.sent_bytes += sent
         return sent
+
+    def _on_floor(self, scene: Scene) -> Scene:
+        """What of a scene is drawn: all, or the floor wanted, as long as it is there."""
+        wanted = self._wanted.floor
+        if self._drawn is None or self._drawn[0] is not scene or self._drawn[1] != wanted:
+            there = wanted in {node.id for node in floors_of(scene)}
+            self._drawn = scene, wanted, storey_of(scene, wanted) if wanted is not None and there else scene
+        return self._drawn[2]
 
     def _frame(self, scene: Scene, ground_m: float) -> None:
         if len(scene.place_ids):
@@ -242,7 +256,7 @@ class Page:
     def _clicked(self, event: viser.SceneClickEvent) -> None:
         if self._index is None:
             return
-        scene = self._index.scene
+        scene = self._on_floor(self._index.scene)
         origin, direction = np.array(event.ray_origin), np.array(event.ray_direction)
         picked = pick(scene, self._painter.ground(scene), origin, direction, self.stage.is_on("places"))
         self._wanted.told.pop("why", None)

@@ -10,6 +10,7 @@ import viser
 from prior_sg.deploy.viewing.search import MOST_ANSWERS
 from prior_sg.deploy.viewing.stage import LAYERS
 from prior_sg.deploy.viewing.words import note
+from prior_sg.schemas.levels import LevelNode
 
 LOWEST_CUT_M, HIGHEST_CUT_M, CUT_M = 0.4, 6.0, 1.6  # of map points over the floor: by default, ceilings are off
 
@@ -25,6 +26,7 @@ class Asked:
     play: Callable[[], None]
     layer: Callable[[str, bool], None]
     cut: Callable[[float], None]
+    floor: Callable[[int | None], None]  # its id; None = all
     frame: Callable[[viser.ClientHandle], None]
     answer: Callable[[int], None]  # the way to one of the answers, by its row
     picked: Callable[[], None]  # the way to what was clicked
@@ -37,6 +39,7 @@ class Asked:
 WAY_THERE, START_HERE, CLOSE = "Way there", "Start here", "Close"
 FROM_ROBOT, CLOSE_WAY = "From the robot", "Close way"
 WAY_TO = "Way to"
+ALL_FLOORS = "all"
 
 
 @dataclass
@@ -49,6 +52,7 @@ class Panel:
     _html: dict[str, Any] = field(default_factory=dict)
     _buttons: dict[str, tuple[Any, tuple[str, ...]]] = field(default_factory=dict)  # below a text, and all there may be
     _moment_count: int = 0
+    _floors: dict[str, int] = field(default_factory=dict)  # ids by what the choice says
     _setting: bool = False  # values that the page itself sets ask for nothing
 
     def build(self) -> None:
@@ -91,6 +95,8 @@ class Panel:
                 self._give = gui.add_button("Divide the map anew", icon=viser.Icon.SPARKLES)
             self._give.on_click(lambda _: form.submit())
             form.on_submit(lambda _: self.asked.task(self._task.value, self._environment.value))
+        self._floor = gui.add_dropdown("Floor", (ALL_FLOORS,), visible=False, hint="one storey instead of all")
+        self._floor.on_update(self._storey_chosen)
         self._html["told"] = gui.add_html("", visible=False)
         self._html["legend"] = gui.add_html("")
         self._html["moment"] = gui.add_html("")
@@ -98,6 +104,10 @@ class Panel:
         self._slider.on_update(self._moved)
         self._play = gui.add_button_group("", ("Play", "Follow" if self.live else "End"))
         self._play.on_click(lambda _: self.asked.play() if self._play.value == "Play" else self.asked.follow())
+
+    def _storey_chosen(self, event: viser.GuiEvent) -> None:
+        if event.client is not None:
+            self.asked.floor(self._floors.get(self._floor.value))
 
     def _moved(self, event: viser.GuiEvent) -> None:
         if event.client is not None and not self._setting:
@@ -154,6 +164,19 @@ class Panel:
         if self._slider.value != moment and count > 1:
             self._slider.value = moment  # type: ignore[misc]  # its setter lies in a base class
         self._setting = False
+
+    def offer_floors(self, floors: list[LevelNode]) -> None:
+        """Which floors can be shown alone, from below; there is no choice where there are not several."""
+        told = {f"{node.label}, {node.area_m2:.0f} m²": node.id for node in floors} if len(floors) > 1 else {}
+        if told == self._floors:
+            return
+        chosen = self._floors.get(self._floor.value)
+        self._floors = told
+        self._floor.options = ALL_FLOORS, *told
+        self._floor.visible = bool(told)
+        self._floor.value = next(  # type: ignore[misc]  # its setter lies in a base class
+            (text for text, number in told.items() if number == chosen), ALL_FLOORS
+        )
 
     def busy(self, on: bool) -> None:
         """Whether a task is being worked on."""

@@ -4,7 +4,9 @@ import cv2
 import msgspec
 import numpy as np
 
+from prior_sg.schemas.foresight import Foresight, Opening
 from prior_sg.schemas.frames import Intrinsics, Keyframe
+from prior_sg.schemas.levels import LevelName, LevelNode
 from prior_sg.schemas.objects import SceneObject
 from prior_sg.schemas.regions import Region
 from prior_sg.schemas.scene import Scene
@@ -92,4 +94,59 @@ def keyframe() -> Keyframe:
         color=cv2.imencode(".png", color)[1].tobytes(),
         depth=cv2.imencode(".png", np.full((48, 64), 2000, np.uint16))[1].tobytes(),
         depth_scale_m=0.001,
+    )
+
+
+UP_M = 3.0
+
+
+def _node(level: LevelName, number: int, members: list[int], of: str = "region", height_m: float = 0.0) -> LevelNode:
+    return LevelNode(
+        level=level,
+        id=number,
+        label=f"{level} {number}",
+        probability=1.0,
+        member_ids=members,
+        members=of,
+        area_m2=9.0,
+        position_m=(0.0, 0.0, height_m),
+    )
+
+
+def two_floors() -> Scene:
+    """The home once more above itself, with a bed upstairs, a table downstairs and an opening on either floor."""
+    below = joined_home()
+    ids, regions = [region.id for region in below.regions], below.regions
+    most = max(*ids, int(below.place_ids.max())) + 1
+    up = [msgspec.structs.replace(one, id=one.id + most) for one in regions]
+    raised = below.positions_m + np.array((0, 0, UP_M), np.float32)
+    openings = [
+        Opening(
+            place_id=place, position_m=(0.0, 0.0, 0.0), beyond_m=(1.0, 0.0, 0.0), width_m=1.0, region=ids[0], same=1.0
+        )
+        for place in (int(below.place_ids[0]), int(below.place_ids[0]) + most)
+    ]
+    table, bed = thing(1, "table", (1.0, 1.0)), thing(2, "bed", (6.0, 1.0))
+    bed = msgspec.structs.replace(bed, position_m=(6.0, 1.0, 0.5 + UP_M))
+    return msgspec.structs.replace(
+        below,
+        regions=[*regions, *up],
+        place_ids=np.concatenate((below.place_ids, below.place_ids + most)),
+        positions_m=np.concatenate((below.positions_m, raised)),
+        radii_m=np.tile(below.radii_m, 2),
+        basis_points=np.tile(below.basis_points, 2),
+        place_regions=np.concatenate((below.place_regions, below.place_regions + most)),
+        posteriors=np.tile(below.posteriors, (2, 1)),
+        unknown=np.tile(below.unknown, 2),
+        edges=np.concatenate((below.edges, below.edges + most)),
+        clearances_m=np.tile(below.clearances_m, 2),
+        objects=[table, bed],
+        trajectory=np.array([(1, 1, 1), (1, 1, 1 + UP_M), (2, 1, 1 + UP_M)], np.float32),
+        foresight=Foresight(openings=openings),
+        nodes=[
+            _node("zone", 5, [up[0].id]),
+            _node("floor", 1, [one.id for one in up], height_m=UP_M),
+            _node("floor", 4, ids),
+            _node("building", 0, [1, 4], of="floor"),
+        ],
     )

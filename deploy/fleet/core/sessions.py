@@ -3,13 +3,13 @@
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import msgspec
 import numpy as np
 
 from prior_sg.deploy.fleet.core.finding.shape import Shape
 from prior_sg.deploy.fleet.core.finding.verify import CLEAR_M, SEEN_M
 from prior_sg.deploy.fleet.core.fusing import ALIKE_M, ONE_M
 from prior_sg.deploy.fleet.core.things import SAME_M
+from prior_sg.deploy.parts import part_of
 from prior_sg.schemas.objects import SceneObject
 from prior_sg.schemas.scene import Scene
 from prior_sg.services.geometry import transform
@@ -56,7 +56,7 @@ def remembered(former: Scene, fleet_from_own: np.ndarray, present: Sequence[Pres
     lost = [item for item in former.objects if _is_gone(item, fleet_from_own, present)]
     numbers = {item.id for item in lost}
     stays = [item for item in former.objects if item.id not in numbers]
-    return _without(former, kept, stays), _changes(lost, stays, fleet_from_own, present)
+    return part_of(former, kept, stays), _changes(lost, stays, fleet_from_own, present)
 
 
 def _is_gone(item: SceneObject, fleet_from_own: np.ndarray, present: Sequence[Present]) -> bool:
@@ -120,32 +120,3 @@ def _region_at(spot_m: np.ndarray, scene: Scene) -> str:
 def spots_of(objects: Sequence[SceneObject]) -> np.ndarray:
     """Positions (object, 3) of objects, in their own frame."""
     return np.array([item.position_m for item in objects], float).reshape(-1, 3)
-
-
-def _without(scene: Scene, kept: np.ndarray, objects: list[SceneObject]) -> Scene:
-    """Only some places of a scene, by mask, with what lies between them."""
-    ids = scene.place_ids[kept]
-    edges = np.isin(scene.edges, ids).all(axis=1)
-    frontiers, surfaces = np.isin(scene.frontier_ids, ids), np.isin(scene.surface_ids, ids)
-    corners = np.repeat(surfaces, scene.hull_counts)
-    return msgspec.structs.replace(
-        scene,
-        place_ids=ids,
-        positions_m=scene.positions_m[kept],
-        radii_m=scene.radii_m[kept],
-        basis_points=scene.basis_points[kept],
-        place_regions=scene.place_regions[kept],
-        posteriors=scene.posteriors[kept],
-        unknown=scene.unknown[kept],
-        edges=scene.edges[edges],
-        clearances_m=scene.clearances_m[edges],
-        predicted_ids=scene.predicted_ids[np.isin(scene.predicted_ids, ids)],
-        objects=objects,
-        frontier_ids=scene.frontier_ids[frontiers],
-        frontier_directions=scene.frontier_directions[frontiers],
-        frontier_areas_m2=scene.frontier_areas_m2[frontiers],
-        surface_ids=scene.surface_ids[surfaces],
-        ellipses=scene.ellipses[surfaces],
-        hull_counts=scene.hull_counts[surfaces],
-        hulls_m=scene.hulls_m[corners],
-    )

@@ -13,7 +13,7 @@ from prior_sg.deploy.viewing.held import Held
 from prior_sg.deploy.viewing.page import Options, Page
 from prior_sg.deploy.viewing.picking import Picked
 from prior_sg.deploy.viewing.stage import pose_for
-from tests.help.homes import home, joined_home
+from tests.help.homes import home, joined_home, two_floors
 
 CHROMIUM = shutil.which("chromium") or ""
 SOFTWARE = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-background-networking")
@@ -81,6 +81,24 @@ def test_ways_to_and_from_what_was_clicked(shown: tuple[Held, Page]) -> None:
     until(lambda: "where the robot is" in page.panel.text("way") and "/way/line" in page.stage.picture)
     asked.arrive()
     until(lambda: page.panel.text("way") == "")
+
+
+def test_one_floor_is_shown_instead_of_all(shown: tuple[Held, Page]) -> None:
+    source, page = shown
+    until(lambda: "kitchen" in page.panel.text("legend"))
+    assert not page.panel._floor.visible  # of a home on one floor
+    source.put(two_floors())
+    until(lambda: page.panel._floor.options == ("all", "floor 4, 9 m²", "floor 1, 9 m²"))  # from below
+    assert page.panel._floor.visible and "4 regions, 20 places" in page.panel.text("headline")
+    everything = set(page.stage.picture)
+    page.panel.asked.floor(1)
+    until(lambda: "2 regions, 10 places, 1 object" in page.panel.text("headline"))
+    assert set(page.stage.picture) < everything
+    source.put(home())  # that floor is gone
+    until(lambda: "2 regions, 10 places" in page.panel.text("headline") and not page.panel._floor.visible)
+    page.panel.asked.floor(None)
+    source.put(two_floors())
+    until(lambda: "4 regions, 20 places" in page.panel.text("headline"))
 
 
 def colors(page: Page) -> dict[str, tuple[int, int, int]]:
