@@ -179,6 +179,19 @@ def test_only_frames_that_may_become_keyframes_are_drawn_together(tmp_path, plug
     assert not any(frame.color or frame.depth for frame in frames if frame.pose_only)
 
 
+def test_what_ends_while_it_is_looked_at_gives_all_of_its_frames(tmp_path, plugged, monkeypatch):
+    plugged(Fake([capture(number) for number in range(15)]))
+    take = feed.CameraFeed.take
+
+    def take_at_the_end(one, timeout_s):
+        one._thread.join()
+        return take(one, timeout_s)
+
+    monkeypatch.setattr(feed.CameraFeed, "take", take_at_the_end)
+    frames = list(open_source("oak:", options=ReadOptions(pose_source=rows(tmp_path / "p.txt"))))
+    assert [frame.index for frame in frames] == list(range(15))
+
+
 def test_frames_without_a_pose_are_counted(tmp_path, plugged):
     plugged(Fake([capture(number) for number in range(10)]))
     path = rows(tmp_path / "p.txt", count=5)

@@ -73,8 +73,8 @@ class Rig:
         self.ended = ended
 
     def give_back(self, posed: list[Posed]) -> None:
-        """Frames that come once more."""
-        self._back = posed
+        """Frames that come once more, also where nothing else does any more."""
+        self._back, self.ended = posed, False
 
     def close(self) -> None:
         """Let go of both."""
