@@ -9,6 +9,7 @@ import hashlib
 import logging
 import marshal
 import os
+import threading
 from collections.abc import Callable, Iterator
 from importlib.util import find_spec
 from pathlib import Path
@@ -100,10 +101,50 @@ def _kept(function: Callable, options: dict[str, Any]) -> Callable:
     """Compiled code as it is on the disk, unless it was made of something else. numba looks at the function's own file
     alone: code made with another module's loops and constants would outlast a change of these, as in an upgrade.
     """
-    kept: Callable = _numba().njit(cache=True, nogil=True, **options)(function)
-    index = cast(Any, kept)._cache._cache_file
+    kept: Any = _numba().njit(cache=True, nogil=True, **options)(function)
+    index = kept._cache._cache_file
     index._source_stamp = (index._source_stamp, made_of(function))
-    return kept
+    kept._cache = _Kept(kept._cache)
+    kept._compiler.compile = _compiling.during(kept._compiler.compile)
+    return cast(Callable, kept)
+
+
+class _Compiling(threading.local):
+    """How many functions this thread is compiling, each for the one before."""
+
+    depth = 0
+
+    def during(self, compiles: Callable) -> Callable:
+        """The same function, counted while it runs."""
+
+        @functools.wraps(compiles)
+        def counted(*arguments: Any) -> Any:
+            self.depth += 1
+            try:
+                return compiles(*arguments)
+            finally:
+                self.depth -= 1
+
+        return counted
+
+
+_compiling = _Compiling()
+
+
+class _Kept:
+    """What numba keeps of one function on the disk. It gives nothing to a function that is being compiled: machine code
+    cannot be inlined, and loops that only call each other take up to half as long again.
+    """
+
+    def __init__(self, cache: Any) -> None:
+        self._cache = cache
+
+    def load_overload(self, *arguments: Any) -> Any:
+        """Machine code, or None where it is to be compiled."""
+        return None if _compiling.depth else self._cache.load_overload(*arguments)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._cache, name)
 
 
 def made_of(function: Callable) -> str:
