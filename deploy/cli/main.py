@@ -82,6 +82,7 @@ def main(argv: list[str] | None = None) -> int:
 
 def _told(argv: list[str] | None) -> int:
     from prior_sg.deploy.cli.faults import sentence_of
+    from prior_sg.deploy.interrupts import insist
     from prior_sg.deploy.terminal import complain
     from prior_sg.services.errors import PriorSgError
 
@@ -90,6 +91,7 @@ def _told(argv: list[str] | None) -> int:
     except (BrokenPipeError, KeyboardInterrupt):
         raise
     except Exception as error:
+        insist()  # Python wraps an interrupt that comes while a class is being made
         if (sentence := sentence_of(error)) is None:
             raise
         complain(sentence)

@@ -215,3 +215,15 @@ def test_a_prepared_service_waits_until_it_is_started_and_ends_with_whom_it_wait
     finally:
         supervisor.stop()
         stop_router()
+
+
+def test_an_interrupt_that_python_has_wrapped_is_told_as_one(monkeypatch, capsys):
+    def wrapped(argv):
+        try:
+            interrupts.interrupt(signal.SIGINT, None)
+        except KeyboardInterrupt as error:
+            raise RuntimeError("Error calling __set_name__ on 'field' instance 'graph' in 'PlaceMap'") from error
+
+    monkeypatch.setattr("prior_sg.deploy.cli.main._run", wrapped)
+    assert main(["check"]) == interrupts.EXIT_INTERRUPTED
+    assert capsys.readouterr().err == "prior-sg: interrupted\n"
