@@ -1,10 +1,12 @@
 """Parts of a scene (pure)."""
 
+from collections.abc import Sequence
+
 import msgspec
 import numpy as np
 from scipy.spatial import cKDTree
 
-from prior_sg.schemas.levels import LevelNode, regions_in
+from prior_sg.schemas.levels import LevelNode, nodes_above
 from prior_sg.schemas.objects import SceneObject
 from prior_sg.schemas.scene import Scene
 
@@ -49,30 +51,25 @@ def storey_of(scene: Scene, floor: int) -> Scene:
     """What is on one floor, by the id of its node: its regions with their places, and the objects, the openings and the
     keyframes nearest to these. All levels stay that hold any of the regions. A floor that is not there holds nothing.
     """
-    floor_of = regions_in(scene.nodes, "floor")
-    regions = [region for region in scene.regions if floor_of.get(region.id) == floor]
-    ids = [region.id for region in regions]
-    kept = np.isin(scene.place_regions, ids)
-    objects = [item for item, on in zip(scene.objects, _nearest(scene, kept, _spots_m(scene)), strict=True) if on]
-    part = part_of(scene, kept, objects)
+    above = nodes_above(scene.nodes)
+    on_it = {number for number, nodes in above.items() if ("floor", floor) in {(one.level, one.id) for one in nodes}}
+    holding = {(node.level, node.id) for number in on_it for node in above[number]}
+    kept = np.isin(scene.place_regions, sorted(on_it))
+    nearest = _nearest(scene, kept, spots_of(scene.objects))
+    part = part_of(scene, kept, [item for item, on in zip(scene.objects, nearest, strict=True) if on])
     openings = [one for one in scene.foresight.openings if one.place_id in part.place_ids]
     return msgspec.structs.replace(
         part,
-        regions=regions,
-        nodes=[node for node in scene.nodes if any(number in ids for number in _regions_of(scene, node))],
+        regions=[region for region in scene.regions if region.id in on_it],
+        nodes=[node for node in scene.nodes if (node.level, node.id) in holding],
         trajectory=scene.trajectory[_nearest(scene, kept, scene.trajectory)],
         foresight=msgspec.structs.replace(scene.foresight, openings=openings),
     )
 
 
-def _spots_m(scene: Scene) -> np.ndarray:
-    """Positions (object, 3) of the objects."""
-    return np.array([item.position_m for item in scene.objects], float).reshape(-1, 3)
-
-
-def _regions_of(scene: Scene, node: LevelNode) -> list[int]:
-    """The regions in a node."""
-    return [region for region, number in regions_in(scene.nodes, node.level).items() if number == node.id]
+def spots_of(objects: Sequence[SceneObject]) -> np.ndarray:
+    """Positions (object, 3) of objects, in their own frame."""
+    return np.array([item.position_m for item in objects], float).reshape(-1, 3)
 
 
 def _nearest(scene: Scene, kept: np.ndarray, spots_m: np.ndarray) -> np.ndarray:

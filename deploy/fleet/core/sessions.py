@@ -9,7 +9,7 @@ from prior_sg.deploy.fleet.core.finding.shape import Shape
 from prior_sg.deploy.fleet.core.finding.verify import CLEAR_M, SEEN_M
 from prior_sg.deploy.fleet.core.fusing import ALIKE_M, ONE_M
 from prior_sg.deploy.fleet.core.things import SAME_M
-from prior_sg.deploy.parts import part_of
+from prior_sg.deploy.parts import part_of, spots_of
 from prior_sg.schemas.objects import SceneObject
 from prior_sg.schemas.scene import Scene
 from prior_sg.services.geometry import transform
@@ -115,8 +115,3 @@ def _region_at(spot_m: np.ndarray, scene: Scene) -> str:
         return "nowhere known"
     nearest = int(np.argmin(np.linalg.norm(scene.positions_m - spot_m, axis=1)))
     return labels.get(int(scene.place_regions[nearest]), "") or "an unnamed region"
-
-
-def spots_of(objects: Sequence[SceneObject]) -> np.ndarray:
-    """Positions (object, 3) of objects, in their own frame."""
-    return np.array([item.position_m for item in objects], float).reshape(-1, 3)
