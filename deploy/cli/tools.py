@@ -135,9 +135,15 @@ def _add_measuring(commands: Commands) -> None:
         type=Path,
         default=[],
         metavar="PATH",
-        help="measure places, merge or markers on these instead, or map these for foresight, such as world:home:80-91",
+        help="measure places, levels, merge or markers on these instead, or map these for foresight, such as "
+        "world:home:80-91",
     )
-    bench.add_argument("--seeds", type=int, default=0, help="of each kind of world, for foresight (default: all four)")
+    bench.add_argument(
+        "--seeds",
+        default="",
+        help="of each kind of world for foresight, or of --worlds for learning, of which the first ten are explored, "
+        "such as 76-79",
+    )
     bench.add_argument(
         "--presets", nargs="+", help="of the place graph, for places with --on (default: indoor habitat mixed)"
     )
@@ -309,6 +315,7 @@ def _topic_line(count: "TopicCount") -> list[Part]:
 def cmd_bench(arguments: argparse.Namespace) -> int:
     """Measure."""
     from prior_sg.deploy.benches import main as bench
+    from prior_sg.deploy.evaluation.datasets import seeds_of
 
     if arguments.name not in (*bench.BENCHES, *bench.LONG, "all"):
         raise UserError(
@@ -317,6 +324,9 @@ def cmd_bench(arguments: argparse.Namespace) -> int:
     for option, takers in bench.TAKERS.items():
         if getattr(arguments, option) and arguments.name not in takers:
             raise UserError(f"--{option} is of the measurements {', '.join(takers)}, not of {arguments.name}")
+    seeds = seeds_of(arguments.seeds)
+    if arguments.seeds and not seeds:
+        raise UserError(f"--seeds {arguments.seeds} names no seeds: write 3, 0-9 or 1,4,7")
     for name in bench.BENCHES if arguments.name == "all" else [arguments.name]:
         with console.status(f"measuring {name}") as status:
             asked = bench.Asked(
@@ -324,7 +334,7 @@ def cmd_bench(arguments: argparse.Namespace) -> int:
                 paths=arguments.on,
                 presets=arguments.presets or bench.exactness.PRESETS,
                 worlds=arguments.worlds,
-                seeds=arguments.seeds,
+                seeds=seeds,
                 report=partial(_tell, status.update, name),
             )
             found = bench.run(name, asked)
