@@ -141,6 +141,11 @@ def tell_logs() -> None:
     root.setLevel(logging.WARNING)
 
 
+def hush_logs() -> None:
+    """What services of a measurement in this process warn of is no news: it tells its own figures and errors."""
+    logging.getLogger("prior_sg").addHandler(logging.NullHandler())
+
+
 @contextlib.contextmanager
 def writing(path: Path) -> Iterator[None]:
     """A file is written within. Raises UserError where it cannot be."""

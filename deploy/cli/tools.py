@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from rich.table import Table
 
-from prior_sg.deploy.cli.shared import Commands, add_bus, add_log_mb, console, open_client
+from prior_sg.deploy.cli.shared import Commands, add_bus, add_log_mb, console, hush_logs, open_client
 from prior_sg.deploy.errors import UserError
 from prior_sg.deploy.evaluation import command as evaluation
 from prior_sg.deploy.evaluation import tune_command as tuning
@@ -324,6 +324,7 @@ def cmd_bench(arguments: argparse.Namespace) -> int:
     for option, takers in bench.TAKERS.items():
         if getattr(arguments, option) and arguments.name not in takers:
             raise UserError(f"--{option} is of the measurements {', '.join(takers)}, not of {arguments.name}")
+    hush_logs()
     seeds = seeds_of(arguments.seeds)
     if arguments.seeds and not seeds:
         raise UserError(f"--seeds {arguments.seeds} names no seeds: write 3, 0-9 or 1,4,7")
@@ -362,9 +363,11 @@ def _tell(update: Callable[[str], None], name: str, text: str) -> None:
 
 def cmd_eval(arguments: argparse.Namespace) -> int:
     """Compare methods on datasets with ground truth."""
+    hush_logs()
     return evaluation.run(arguments, console)
 
 
 def cmd_tune(arguments: argparse.Namespace) -> int:
     """Choose settings on some datasets and score the choice on those left out."""
+    hush_logs()
     return tuning.run(arguments, console)

@@ -234,7 +234,7 @@ def _read(key: str) -> Entity | None:
     try:
         return wire.read_token(key)
     except WireError as error:
-        log.info("token not read", extra={"reason": str(error)})
+        log.info("token not read", extra={"why": str(error)})
         return None
 
 
