@@ -165,9 +165,7 @@ class RosSession:
 
     def close(self) -> None:
         """Leave, within a bound; who is no longer there is told first, so that nothing comes for nobody."""
-        for entity in reversed(self._entities):
-            quietly(entity.undeclare)
-        close_within(self._session, CLOSE_TIMEOUT_S)
+        close_within(self._session, CLOSE_TIMEOUT_S, reversed(self._entities))
 
     def __enter__(self) -> "RosSession":
         return self
