@@ -17,21 +17,13 @@ from prior_sg.deploy.api.errors import NotInSceneError, PosesError, TaskError
 from prior_sg.deploy.api.kept import kept
 from prior_sg.deploy.api.scene import Scene
 from prior_sg.deploy.settings import DEFAULT_CONNECT, DEFAULT_ROBOT, ROUTER_WAIT_S
+from prior_sg.schemas.answers import Answer, Difference
 from prior_sg.schemas.codec import DecodeError, Message
 from prior_sg.schemas.features import TextEmbeddings, TextRequest
 from prior_sg.schemas.frames import PoseUpdate
 from prior_sg.schemas.objects import ObjectDelta
 from prior_sg.schemas.priors import Prior, PriorList, PriorRequest, Task
-from prior_sg.schemas.queries import (
-    Answer,
-    ChangedSince,
-    Difference,
-    Question,
-    SceneAnswer,
-    SceneQuery,
-    WordsInUse,
-    checked,
-)
+from prior_sg.schemas.queries import ChangedSince, Question, SceneAnswer, SceneQuery, WordsInUse, checked
 from prior_sg.schemas.regions import PosteriorReply, PosteriorRequest, RegionDelta
 from prior_sg.schemas.scene import HistoryRequest, RevisionList, SceneRequest, StoredRevision
 from prior_sg.schemas.scene import Scene as SceneMessage

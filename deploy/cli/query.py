@@ -16,11 +16,10 @@ from prior_sg.schemas.members import said
 
 if TYPE_CHECKING:
     from prior_sg.deploy.api.asking import Asking
-    from prior_sg.schemas.foresight import MissingLabel
-    from prior_sg.schemas.members import MapMember
-    from prior_sg.schemas.queries import (
+    from prior_sg.schemas.answers import (
         Details,
         Difference,
+        MarkerInRegion,
         Neighbour,
         NodeWithRegions,
         Outlook,
@@ -28,6 +27,8 @@ if TYPE_CHECKING:
         Route,
         Thing,
     )
+    from prior_sg.schemas.foresight import MissingLabel
+    from prior_sg.schemas.members import MapMember
 
 FORMS = """\
 what to ask:
@@ -39,8 +40,9 @@ what to ask:
   objects [LABEL] [in REGION]      objects of a label in regions of a label
   level LEVEL [LABEL]              zones, floors, buildings, districts, with their regions
   region ID, place ID, object ID   one of them in full: beliefs, neighbours, what it holds
+  marker [NUMBER]                  where printed markers are, and what is doubtful about them
   route FROM TO                    the shortest way; each a label, here (where the camera was last), place:ID,
-                                   region:ID, object:ID or X,Y,Z
+                                   region:ID, object:ID, marker:NUMBER or X,Y,Z
   unseen LABEL                     where a region that was not seen may be, and the way there from here (--start SPOT)
   missing                          what is probably still to be found behind the map's openings
   changed REVISION                 what is different since a revision (running store only)
@@ -161,6 +163,10 @@ def _levels(scene: "Asking", arguments: argparse.Namespace, words: Sequence[str]
     return scene.levels(level, " ".join(label) or arguments.label, limit=arguments.limit)
 
 
+def _markers(scene: "Asking", arguments: argparse.Namespace, words: Sequence[str]) -> "list[MarkerInRegion]":
+    return scene.markers(_id(words) if words else None, limit=arguments.limit)
+
+
 def _route(scene: "Asking", arguments: argparse.Namespace, words: Sequence[str]) -> "Route":
     if len(words) != 2:
         raise UserError("a route needs two ends: prior-sg query route kitchen bedroom (quote names of several words)")
@@ -250,6 +256,17 @@ def _show_one(found: "dict[str, Any]") -> None:
         console.print(f"beside {one.thing.what} {one.thing.id} {one.thing.label}{length}{clearance}{doors}")
 
 
+def _show_markers(found: "list[MarkerInRegion]") -> None:
+    table = Table("marker", "dictionary", "position m", "in", "keyframes", "doubt")
+    for one in found:
+        marker, region = one.marker, one.region
+        where = "no region" if region is None else f"{region.label} (region {region.id})"
+        doubt = marker.doubt or "none"
+        told = (str(marker.id), marker.dictionary, _at(marker.position_m), where, str(marker.frames))
+        table.add_row(*told, doubt)
+    console.print(table)
+
+
 def _made_of(members: "Sequence[MapMember]") -> str:
     return f"; made of {', '.join(map(said, members))}" if members else ""
 
@@ -330,9 +347,10 @@ ASKED: dict[str, Asked] = {  # by first word; whatever else is a sentence
     "region": (_one, _show_one),
     "place": (_one, _show_one),
     "object": (_one, _show_one),
+    "marker": (_markers, _show_markers),
     "route": (_route, _show_route),
     "unseen": (_unseen, _show_outlook),
     "changed": (_changed, _show_difference),
 }
 FOUND: Asked = (_find, _show_things)
-ALONE: dict[str, Asked] = {"missing": (_missing, _show_missing)}
+ALONE: dict[str, Asked] = {"missing": (_missing, _show_missing), "marker": (_markers, _show_markers)}

@@ -19,6 +19,7 @@ from prior_sg.schemas.names import shown
 from prior_sg.schemas.objects import SceneObject
 from prior_sg.schemas.regions import NO_REGION, Region
 from prior_sg.schemas.scene import Scene
+from prior_sg.services.geometry import pose_from_quaternion, rows_before
 
 MOST_TOKENS, LEAST_TOKENS = 100_000, 200
 USUAL_TOKENS = 2000
@@ -54,7 +55,7 @@ def scene_text(scene: Scene, budget_tokens: int = USUAL_TOKENS) -> str:
         raise ValueError(f"a budget lies between {LEAST_TOKENS} and {MOST_TOKENS} tokens, not at {budget_tokens}")
     head = "".join(_head(scene))
     budget = Budget(budget_tokens - tokens_of(head) - FOR_OMISSIONS)
-    parts = (_camera, _regions, _elsewhere, _expected, _frontiers)
+    parts = (_camera, _regions, _elsewhere, _markers, _expected, _frontiers)
     body = [line for part in parts for line in part(scene, budget)]
     return head + "".join(body) + _omissions(budget.omitted)
 
@@ -177,6 +178,21 @@ def _elsewhere(scene: Scene, budget: Budget) -> Iterator[str]:
     bare = int((scene.place_regions == NO_REGION).sum())
     if bare and budget.take(line := f"{bare} places belong to no region yet.\n", "other lines"):
         yield line
+
+
+def _markers(scene: Scene, budget: Budget) -> Iterator[str]:
+    """Printed markers: where each hangs, and what is doubtful about it."""
+    names = {region.id: _name(region) for region in scene.regions}
+    for marker in scene.markers:
+        pose = pose_from_quaternion(np.array(marker.position_m), np.array(marker.quaternion_xyzw))
+        rows = rows_before(pose, scene.positions_m)
+        gaps_m = np.linalg.norm(scene.positions_m[rows] - pose[:3, 3], axis=1)
+        holder = names.get(int(scene.place_regions[rows[gaps_m.argmin()]]), "") if len(rows) else ""
+        where = f"{_point(marker.position_m)}{f' in {holder}' if holder else ''}"
+        doubt = f", in doubt: {_short(marker.doubt, LONGEST_TASK)}" if marker.doubt else ""
+        line = f"Printed marker {marker.id} ({_short(marker.dictionary)}) at {where}{doubt}\n"
+        if budget.take(line, "markers"):
+            yield line
 
 
 def _expected(scene: Scene, budget: Budget) -> Iterator[str]:

@@ -12,10 +12,11 @@ from prior_sg.deploy.showing.colors import Color
 from prior_sg.deploy.viewing.drawing import edges_left_out, level_title
 from prior_sg.deploy.viewing.search import Hit
 from prior_sg.deploy.viewing.ways import Stop, Way
+from prior_sg.schemas.answers import MarkerInRegion, Thing
 from prior_sg.schemas.levels import nodes_above
 from prior_sg.schemas.members import said
 from prior_sg.schemas.names import shown
-from prior_sg.schemas.queries import Thing
+from prior_sg.schemas.queries import Spot
 from prior_sg.schemas.regions import NO_REGION, PosteriorReply, Region
 from prior_sg.schemas.scene import Scene
 from prior_sg.schemas.status import ServiceStatus
@@ -115,6 +116,20 @@ def region_story(scene: Scene, region: Region) -> str:
         lines.insert(0, "a prediction from its surroundings: barely seen itself")
     bars = _bars(candidates(scene, region), AGREES)
     return f'{_title(region.label, f"region {region.id}")}<div style="{_BOX}">{"<br>".join(lines)}{bars}</div>'
+
+
+def marker_story(found: MarkerInRegion) -> str:
+    """A printed marker in words: where it is, from how many keyframes, and what is doubtful about it."""
+    marker, region = found.marker, found.region
+    x, y, z = marker.position_m
+    where = "in no region yet" if region is None else f"in {text_of(region.label)} (region {region.id})"
+    lines = [
+        f"{where}, at x {x:.2f}, y {y:.2f}, z {z:.2f} m",
+        f"{100 * marker.size_m:.1f} cm wide, seen in {_counted(marker.frames, 'keyframe')}",
+        f"in doubt: {text_of(marker.doubt)}; nothing is concluded from it" if marker.doubt else "no doubt about it",
+    ]
+    title = _title(f"marker {marker.id}", marker.dictionary)
+    return f'{title}<div style="{_BOX}">{"<br>".join(lines)}</div>'
 
 
 def place_story(scene: Scene, place: int) -> str:
@@ -227,8 +242,13 @@ def way_story(way: Way) -> str:
     """A way in words: where to, how long and how wide, what it passes, and what of it nobody has checked."""
     route, goal = way.route, way.route.goal
     found = "Way" if route.found else "No way"
-    title = _title(f"{found} to {goal.label or 'there'}", f"{goal.what} {goal.id}") if goal else _title(found, "")
-    start = "where the robot is" if way.from_robot else _told_thing(route.start)
+    there = _marker_of(way.trip.goal)
+    if goal:
+        title = _title(f"{found} to {goal.label or 'there'}", f"{goal.what} {goal.id}")
+    else:
+        title = _title(f"{found} to {there}" if there else found, "")
+    begin = way.trip.start
+    start = "where the robot is" if begin.here else _marker_of(begin) or _told_thing(route.start)
     if not route.found:
         return title + note(route.reason)
     lines = [
@@ -248,6 +268,11 @@ def _passed(stops: Sequence[Stop]) -> str:
     """What a way leads through, with the numbers that stand on the map."""
     first, *then = (text_of(stop.label) for stop in stops)
     return f"{first} → " + " → ".join(f"{n} {label}" for n, label in enumerate(then, 1)) if then else f"within {first}"
+
+
+def _marker_of(spot: Spot) -> str:
+    """The marker that an end of a way is; empty where it is none."""
+    return f"marker {spot.id}" if spot.what == "marker" else ""
 
 
 def _told_thing(thing: Thing | None) -> str:

@@ -4,8 +4,9 @@ import difflib
 
 import numpy as np
 
+from prior_sg.schemas.answers import Things, What
 from prior_sg.schemas.names import same
-from prior_sg.schemas.queries import ByLabel, ObjectsInRegions, Things, What
+from prior_sg.schemas.queries import ByLabel, ObjectsInRegions
 from prior_sg.services.scene_store.core.queries.index import Index
 from prior_sg.services.scene_store.core.queries.things import thing, things
 

@@ -2,9 +2,10 @@
 
 import numpy as np
 
+from prior_sg.schemas.answers import Missing, Outlook, Prospect
 from prior_sg.schemas.foresight import Foresight, Opening
 from prior_sg.schemas.names import same
-from prior_sg.schemas.queries import Missing, Outlook, Prospect, RouteBetween, Spot, WhatIsMissing, WhereToLook
+from prior_sg.schemas.queries import RouteBetween, Spot, WhatIsMissing, WhereToLook
 from prior_sg.services.exploring import chances_per_metre, expected_metres
 from prior_sg.services.scene_store.core.queries.index import Index
 from prior_sg.services.scene_store.core.queries.labels import AFTER_A_TASK, nearest_labels
