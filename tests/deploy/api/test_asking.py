@@ -25,6 +25,7 @@ from prior_sg.services.scene_store.core.queries.index import Index
 from prior_sg.services.scene_store.core.queries.ranking import calibrated
 from tests.deploy.api.test_scene import message
 from tests.help.foreseen import foresight
+from tests.help.homes import marked_home
 from tests.help.world import prior
 
 ROBOT = "ada"
@@ -237,6 +238,28 @@ def test_the_command_says_what_is_made_of_what(capsys, tmp_path):
     assert "; made of r1 #3, r2 (session 1) #8" in asked(capsys, path, "region", "4")[1]
     assert "; made of r2 (session 1) #8" in " ".join(asked(capsys, path, "object", "9")[1].split())
     assert "made of" not in asked(capsys, path, "region", "7")[1]
+
+
+def test_the_command_tells_where_markers_are(capsys, tmp_path):
+    path = tmp_path / "scene.json"
+    Scene(marked_home()).save(path)
+
+    def ask(*words):
+        status = main(["query", *words, "--scene", str(path)])
+        out, err = capsys.readouterr()
+        return status, " ".join((out or err).split())
+
+    status, out = ask("marker", "7", "--json")
+    (found,) = json.loads(out)["answer"]
+    assert status == 0 and found["marker"]["position_m"] == [4.45, 1.0, 1.5] and found["region"]["label"] == "kitchen"
+    assert "kitchen (region 3)" in ask("marker", "7")[1] and "bedroom" not in ask("marker", "7")[1]
+    assert "2 spots" in ask("marker")[1] and "kitchen (region 3)" in ask("marker")[1]
+    status, out = ask("marker", "8")
+    assert status == 1 and "there is no marker 8; the scene has marker 7 (apriltag_36h11)" in out
+    assert "name one number" in ask("marker", "seven")[1]
+    assert "through kitchen 3" in ask("route", "place:10", "marker:7")[1]
+    scene = prior_sg.Scene.read(path)
+    assert scene.route("place:10", scene.markers(7)[0].marker).found
 
 
 def test_the_command_tells_what_was_not_seen(capsys, tmp_path):

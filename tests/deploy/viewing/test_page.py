@@ -11,9 +11,10 @@ import pytest
 from prior_sg.deploy.cli.main import main
 from prior_sg.deploy.viewing.held import Held
 from prior_sg.deploy.viewing.page import Options, Page
-from prior_sg.deploy.viewing.picking import Picked
+from prior_sg.deploy.viewing.picking import Picked, PickedMarker
 from prior_sg.deploy.viewing.stage import pose_for
-from tests.help.homes import home, joined_home, two_floors
+from prior_sg.schemas.markers import MarkerKey
+from tests.help.homes import home, joined_home, marked_home, two_floors
 
 CHROMIUM = shutil.which("chromium") or ""
 SOFTWARE = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-background-networking")
@@ -81,6 +82,53 @@ def test_ways_to_and_from_what_was_clicked(shown: tuple[Held, Page]) -> None:
     until(lambda: "where the robot is" in page.panel.text("way") and "/way/line" in page.stage.picture)
     asked.arrive()
     until(lambda: page.panel.text("way") == "")
+
+
+def test_what_is_known_of_a_marker_is_told_when_it_is_clicked(shown: tuple[Held, Page]) -> None:
+    source, page = shown
+    source.put(marked_home())
+    until(lambda: "/markers/7/in_apriltag_36h11/name" in page.stage.picture)
+    assert page.stage.is_on("markers")
+    page._want(picked=PickedMarker(MarkerKey("apriltag_36h11", 9)))
+    until(lambda: "marker 9" in page.panel.text("selected"))
+    told = page.panel.text("selected")
+    for part in (
+        "apriltag_36h11",
+        "in bedroom (region 7)",
+        "x 8.00, y 1.00",
+        "16.0 cm",
+        "5 keyframes",
+        "in doubt: it has",
+    ):
+        assert part in told
+    page._want(picked=PickedMarker(MarkerKey("apriltag_36h11", 7)))
+    page.panel.asked.picked()
+    until(lambda: "Way to marker 7" in page.panel.text("way"))
+    assert "no doubt" in page.panel.text("selected")
+    source.put(joined_home())
+    until(lambda: "not there at this time" in page.panel.text("selected"))
+
+
+@pytest.mark.skipif(not CHROMIUM, reason="Chromium is not installed")
+def test_a_click_in_the_browser_on_a_marker_tells_of_it(shown: tuple[Held, Page]) -> None:
+    sync_api = pytest.importorskip("playwright.sync_api")
+    source, page = shown
+    source.put(marked_home())
+    with sync_api.sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=CHROMIUM, args=list(SOFTWARE))
+        tab = browser.new_page(viewport={"width": 900, "height": 500})
+        tab.set_default_timeout(30_000)
+        tab.goto(page.address)
+        name = tab.get_by_text("marker 7", exact=True)
+        name.wait_for()
+        box = name.bounding_box()
+        tab.mouse.click(box["x"] + box["width"] / 2, box["y"] + box["height"] + 3)
+        tab.get_by_text("seen in 5 keyframes", exact=False).wait_for()
+        tab.get_by_role("tab", name="Layers").click()
+        tab.get_by_label("Printed markers").uncheck()
+        until(lambda: not page.stage.is_on("markers"))
+        name.wait_for(state="hidden")
+        browser.close()
 
 
 def test_one_floor_is_shown_instead_of_all(shown: tuple[Held, Page]) -> None:
