@@ -257,14 +257,11 @@ def _show_one(found: "dict[str, Any]") -> None:
 
 
 def _show_markers(found: "list[MarkerInRegion]") -> None:
-    table = Table("marker", "dictionary", "position m", "in", "keyframes", "doubt")
     for one in found:
         marker, region = one.marker, one.region
-        where = "no region" if region is None else f"{region.label} (region {region.id})"
-        doubt = marker.doubt or "none"
-        told = (str(marker.id), marker.dictionary, _at(marker.position_m), where, str(marker.frames))
-        table.add_row(*told, doubt)
-    console.print(table)
+        where = "in no region" if region is None else f"in {region.label} (region {region.id})"
+        doubt = f"; in doubt: {marker.doubt}" if marker.doubt else ""
+        console.print(f"{marker.key} at {_at(marker.position_m)} {where}, from {marker.frames} keyframes{doubt}")
 
 
 def _made_of(members: "Sequence[MapMember]") -> str:

@@ -31,6 +31,7 @@ from prior_sg.schemas.scene import Scene
 from prior_sg.schemas.status import Tick
 from prior_sg.services.losses import Losses
 from prior_sg.services.scene_store.core import graph as scenes
+from prior_sg.services.scene_store.core import telling
 
 GROWN = 1.1  # times as many places as when it was looked at last: a map is looked at again
 REST_TICKS = 5  # from one fitting of a relation to the next, of a map that changes and hardly grows
@@ -344,4 +345,4 @@ def _correct(state: State, one: Member, members: list[Member], cfg: Config) -> N
 
 def scene_of(state: State) -> Scene:
     """The merged scene as last made; empty before."""
-    return scenes.scene(scenes.Graph(state.robot)) if state.merged is None else state.merged.scene
+    return telling.scene(scenes.Graph(state.robot)) if state.merged is None else state.merged.scene

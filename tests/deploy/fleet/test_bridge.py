@@ -32,7 +32,7 @@ from prior_sg.schemas.topics import (
 from prior_sg.services.registry import BY_NAME
 from prior_sg.services.runtime.runner import Pipeline, Runner
 from prior_sg.services.runtime.service import Identity, ServiceError
-from prior_sg.services.scene_store.core.graph import Config as StoreConfig
+from prior_sg.services.scene_store.core.config import Config as StoreConfig
 from tests.help import houses
 
 MOVED = level(2.3, np.array((12.0, -7.0, 0.4)))

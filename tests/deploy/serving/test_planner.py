@@ -262,4 +262,4 @@ def test_over_standard_input_and_output(endpoint):
             return len((await client.list_tools()).tools), *await called(client, "changes", since=0)
 
     count, text, refused = asyncio.run(asked())
-    assert count == 15 and refused and "is the service running" in text
+    assert count == 16 and refused and "is the service running" in text

@@ -194,7 +194,7 @@ def test_printed_markers_are_sheets_with_a_name_and_those_in_doubt_are_outlines(
 
 
 @pytest.mark.parametrize(
-    ("off_m", "markers", "number"), [(0.0, True, 7), (0.1, True, 7), (0.3, True, None), (0.0, False, None)]
+    ("off_m", "markers", "number"), [(0.0, True, 7), (0.07, True, 7), (0.3, True, None), (0.0, False, None)]
 )
 def test_a_click_on_a_marker_means_it_while_it_is_shown(off_m: float, markers: bool, number: int | None) -> None:
     scene = marked_home()
