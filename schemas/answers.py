@@ -137,6 +137,7 @@ class Words(Part, frozen=True, kw_only=True, tag="words"):
     labels: list[str]  # that regions can have
     regions: dict[str, int]
     objects: dict[str, int]
+    merged_of: list[str] = []  # as in Scene
 
 
 class Ranking(Part, frozen=True, kw_only=True, tag="ranking"):

@@ -56,6 +56,7 @@ def spark_dsg_graph(scene: Scene) -> spark_dsg.DynamicSceneGraph:
     about |= {"prior_digest": scene.prior_digest, "embedding_space": scene.space}
     about |= {"stamp_ns": scene.stamp_ns, "trajectory_m": scene.trajectory.tolist()}
     about |= {"levels": msgspec.to_builtins(scene.nodes)}  # zones, floors, districts and markers have no layer
+    about |= {"merged_of": scene.merged_of}
     about |= {"markers": msgspec.to_builtins(scene.markers)}
     about |= {"foresight": msgspec.to_builtins(scene.foresight)}
     graph.metadata.set(about | {"origin_m": list(scene.origin_m)})

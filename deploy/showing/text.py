@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from prior_sg.schemas.foresight import Opening
-from prior_sg.schemas.members import said
+from prior_sg.schemas.members import headline, said
 from prior_sg.schemas.names import shown
 from prior_sg.schemas.objects import SceneObject
 from prior_sg.schemas.regions import NO_REGION, Region
@@ -74,9 +74,14 @@ def _cost(piece: str) -> int:
 def _head(scene: Scene) -> Iterator[str]:
     """What it is about; at most 130 tokens."""
     task, environment = _short(scene.task, LONGEST_TASK), _short(scene.environment, LONGEST_NAME)
-    yield f'Task: "{task}" in "{environment}".\n' if task else "No task yet.\n"
+    yield f'Task: "{task}" in "{environment}".\n' if task else f"{_no_task(scene)}.\n"
     yield f"{len(scene.regions)} regions, {len(scene.objects)} objects, {len(scene.place_ids)} places; "
     yield "positions (x, y, z) in metres, z up; # is an id, p a probability.\n"
+
+
+def _no_task(scene: Scene) -> str:
+    told = _short(headline("", scene.merged_of), LONGEST_TASK)
+    return told[0].upper() + told[1:]
 
 
 def _camera(scene: Scene, budget: Budget) -> Iterator[str]:

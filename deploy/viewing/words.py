@@ -12,6 +12,7 @@ from prior_sg.deploy.showing.colors import Color
 from prior_sg.deploy.viewing.drawing import edges_left_out, level_title
 from prior_sg.deploy.viewing.search import Hit
 from prior_sg.deploy.viewing.ways import Stop, Way
+from prior_sg.schemas import members
 from prior_sg.schemas.answers import MarkerInRegion, Thing
 from prior_sg.schemas.levels import nodes_above
 from prior_sg.schemas.members import said
@@ -36,7 +37,7 @@ def text_of(text: str) -> str:
 
 def headline(scene: Scene, title: str) -> str:
     """The task in force, where, and how much there is."""
-    task = text_of(scene.task) or "no task yet"
+    task = text_of(members.headline(scene.task, scene.merged_of))
     counts = ", ".join(
         _counted(count, name)
         for count, name in (
@@ -47,7 +48,8 @@ def headline(scene: Scene, title: str) -> str:
     )
     if (one_of := edges_left_out(scene)) > 1:
         counts += f"; one of {one_of} edges is drawn"
-    where = " · ".join(part for part in (text_of(scene.environment), text_of(scene.robot), text_of(title)) if part)
+    named = f"{scene.robot}, {members.merged_map(scene.merged_of)}" if scene.merged_of else scene.robot
+    where = " · ".join(part for part in (text_of(scene.environment), text_of(named), text_of(title)) if part)
     return (
         f'<div style="{_BOX};padding-bottom:8px"><div style="font-size:19px;font-weight:650;line-height:1.25">{task}'
         f'</div><div style="font-size:12px;{FAINT};margin-top:3px">{where}<br>{counts}</div></div>'
@@ -64,6 +66,8 @@ _BOX = "padding:2px 12px 6px;font-size:13px;line-height:1.4"
 def legend(scene: Scene, colors: Mapping[str, Color]) -> str:
     """Regions, largest first: colour, name, what else they may be, probability and area."""
     if not scene.regions:
+        if scene.merged_of:
+            return note(f"no regions yet: they come with a task of {' or '.join(scene.merged_of)}")
         return note("no regions yet: they come with the first images and a task")
     ordered = sorted(scene.regions, key=lambda region: -region.area_m2)
     rows = "".join(_legend_row(scene, region, colors[region.label]) for region in ordered[:MOST_ROWS])

@@ -1,6 +1,6 @@
 """One scene of several maps, with numbers that never change (pure)."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -74,14 +74,15 @@ def merged(robot: str, sources: Sequence[Source], memory: Memory) -> Merged:
     described = _described(found, beliefs, regions, objects, _parents(maps))
     nodes, directions, areas = openings(maps, found)
     frame_ids, cameras_m = _cameras(sources, memory)
-    newest = max((one.scene for one in maps), key=lambda scene: scene.stamp_ns)
+    newest = max((one.scene for one in maps), key=_age)
+    aimed = max((one.scene for one in maps if one.scene.prior_digest), key=_age, default=newest)
     scene = Scene(
         robot=robot,
         stamp_ns=newest.stamp_ns,
-        environment=newest.environment,
-        task=newest.task,
-        prior_digest=newest.prior_digest,
-        space=newest.space,
+        environment=_told_by(maps, lambda scene: scene.environment),
+        task=_told_by(maps, lambda scene: scene.task),
+        prior_digest=aimed.prior_digest,
+        space=aimed.space,
         labels=beliefs.names,
         regions=[msgspec.structs.replace(region, members=members[region.id]) for region in described],
         place_ids=found.ids,
@@ -101,8 +102,25 @@ def merged(robot: str, sources: Sequence[Source], memory: Memory) -> Merged:
         frontier_areas_m2=areas.astype(np.float32),
         origin_m=maps[0].scene.origin_m,
         markers=markers_of(maps),
+        merged_of=list(dict.fromkeys(one.name.robot for one in maps)),
     )
     return Merged(scene, frame_ids, ground)
+
+
+def _age(scene: Scene) -> int:
+    return scene.stamp_ns
+
+
+def _told_by(maps: Sequence[Placed], said: Callable[[Scene], str]) -> str:
+    """What the robots say of themselves, each by its newest map: once where they agree, else with the robots' names."""
+    newest = {one.name.robot: one.scene for one in sorted(maps, key=lambda one: _age(one.scene))}
+    saying: dict[str, list[str]] = {}
+    for robot in dict.fromkeys(one.name.robot for one in maps):
+        if told := said(newest[robot]):
+            saying.setdefault(told, []).append(robot)
+    if len(saying) < 2:
+        return next(iter(saying), "")
+    return "; ".join(f"{told} ({', '.join(robots)})" for told, robots in saying.items())
 
 
 def levelled(found: Merged, memory: Memory, prior: Prior | None) -> Merged:

@@ -43,7 +43,8 @@ class Teller:
         before, self.scene = self.scene, scene
         told = self.graph.follow(scene, min_change_m)
         fresh = self._cameras(merged.frame_ids, scene.trajectory)
-        if told is not None or len(fresh.past_frame_ids) or event:
+        joined = before is not None and before.merged_of != scene.merged_of
+        if told is not None or len(fresh.past_frame_ids) or event or joined:
             self.place_revision += 1
             columns = told if told is not None else ToldGraph().snapshot()
             yield place_delta(self._heading(event), *columns, fresh)
@@ -79,8 +80,11 @@ class Teller:
         return [marker for key, marker in sorted((now | gone).items()) if self.markers.get(key) != marker]
 
     def _heading(self, event: str) -> Heading:
-        stamp_ns, origin_m = (0, (0.0, 0.0, 0.0)) if self.scene is None else (self.scene.stamp_ns, self.scene.origin_m)
-        return Heading(self.robot, self.epoch, self.place_revision, stamp_ns, NO_FRAME, event=event, origin_m=origin_m)
+        bare = Heading(self.robot, self.epoch, self.place_revision, 0, NO_FRAME, event=event)
+        if self.scene is None:
+            return bare
+        scene = self.scene
+        return bare._replace(stamp_ns=scene.stamp_ns, origin_m=scene.origin_m, merged_of=tuple(scene.merged_of))
 
     def _cameras(self, frame_ids: np.ndarray, cameras_m: np.ndarray) -> CameraColumns:
         """Cameras that are new or have moved."""
@@ -94,7 +98,7 @@ class Teller:
         return _columns(news)
 
     def _regions(self, scene: Scene, before: Scene | None, posterior_change: float) -> RegionDelta | None:
-        everything = before is None or before.labels != scene.labels
+        everything = before is None or _aim(before) != _aim(scene)
         if before is not None and not everything:
             self.regions.forget(np.setdiff1d(before.place_ids, scene.place_ids))
         head = msgspec.structs.replace(
@@ -133,6 +137,10 @@ class Teller:
             objects=[],
             removed_ids=np.zeros(0, np.int64),
         )
+
+
+def _aim(scene: Scene) -> tuple[list[str], str, str, str]:
+    return scene.labels, scene.task, scene.environment, scene.prior_digest
 
 
 def _columns(cameras_m: dict[int, np.ndarray]) -> CameraColumns:

@@ -87,6 +87,7 @@ class Graph:
     foresight: Foresight = field(default_factory=Foresight)
     task: Task | None = None
     origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of the world, as the place graph says
+    merged_of: tuple[str, ...] = ()  # robots, as the place graph says
     place_cursor: Cursor = field(default_factory=Cursor)
     region_cursor: Cursor = field(default_factory=Cursor)
     object_cursor: Cursor = field(default_factory=Cursor)
@@ -131,7 +132,7 @@ def apply_places(graph: Graph, delta: PlaceDelta) -> Changes:
     for (a, b), clearance_m in zip(delta.edges.tolist(), delta.clearances_m.tolist(), strict=True):
         _put_edge(graph, a, b, clearance_m, changes)
     _put_details(graph, delta, changes)
-    graph.origin_m = delta.origin_m
+    graph.origin_m, graph.merged_of = delta.origin_m, tuple(delta.merged_of)
     graph.place_cursor = Cursor(delta.epoch, delta.revision, delta.stamp_ns)
     graph.revision += 1
     return changes

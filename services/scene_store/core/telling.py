@@ -50,6 +50,7 @@ def scene(graph: Graph) -> Scene:
         nodes=sorted(graph.nodes.values(), key=rank),
         foresight=graph.foresight,
         markers=[graph.markers[key] for key in sorted(graph.markers)],
+        merged_of=list(graph.merged_of),
         **_details(graph),
     )
 

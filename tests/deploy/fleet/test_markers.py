@@ -198,5 +198,6 @@ def test_a_marker_of_a_map_that_is_taken_out_is_doubted():
 
 
 def test_markers_are_in_the_file_of_a_scene():
-    scene = houses.scene(markers=[(7, HALL)])
-    assert scene_of_json(scene_json(scene)).markers == scene.markers
+    scene = msgspec.structs.replace(houses.scene(markers=[(7, HALL)]), merged_of=["r1", "r2"])
+    found = scene_of_json(scene_json(scene))
+    assert found.markers == scene.markers and found.merged_of == scene.merged_of

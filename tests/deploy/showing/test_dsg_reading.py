@@ -29,6 +29,7 @@ def with_opening():
         predicted_ids=np.array([16, 19]),
         foresight=foresight(flat(), 0, "hall"),
         markers=[MARKER],
+        merged_of=["r1", "r2"],
     )
 
 

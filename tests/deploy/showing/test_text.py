@@ -80,6 +80,11 @@ def test_what_is_expected_is_told_as_such():
     assert "Expected" not in scene_text(faint)
 
 
+def test_a_merged_map_without_a_task_says_whose_it_is():
+    bare = msgspec.structs.replace(EMPTY, merged_of=["r1", "r2"])
+    assert scene_text(bare).startswith("Merged map of r1, r2: give a task to a robot.\n")
+
+
 def test_without_task_and_regions():
     assert scene_text(EMPTY).startswith("No task yet.\n0 regions, 0 objects, 3 places")
 

@@ -11,7 +11,7 @@ from prior_sg.deploy.viewing.picking import PickedMarker, pick, typical_place
 from prior_sg.deploy.viewing.search import find
 from prior_sg.deploy.viewing.shapes import Mesh, difference
 from prior_sg.deploy.viewing.sources import Likeness
-from prior_sg.deploy.viewing.words import headline
+from prior_sg.deploy.viewing.words import headline, legend
 from prior_sg.services.scene_store.core.queries.index import Index
 from tests.help.foreseen import foresight
 from tests.help.homes import home, keyframe, marked_home, region
@@ -208,6 +208,15 @@ def test_the_name_of_a_marker_finds_it_and_what_is_doubtful_is_said() -> None:
     assert [(hit.what, hit.id) for hit in find(index, " Marker 7").hits] == [("marker", 7)]
     assert "in doubt" in find(index, "marker #9").said and "no marker 8" in find(index, "marker 8").said
     assert find(index, "marker 7 is beside the bed").hits[0].label == "bed", "a sentence is a sentence"
+
+
+def test_a_merged_map_without_a_task_says_whose_it_is_and_what_to_do() -> None:
+    bare = home(task="", regions=[], robot="home", merged_of=["robot1", "robot2"])
+    told = headline(bare, "live")
+    assert "merged map of robot1, robot2: give a task to a robot" in told and "no task yet" not in told
+    assert "a task of robot1 or robot2" in legend(bare, {})
+    assert "home, merged map of robot1, robot2" in headline(home(robot="home", merged_of=["robot1", "robot2"]), "live")
+    assert "no task yet" in headline(home(task=""), "live") and "merged" not in headline(home(), "live")
 
 
 def test_points_lie_where_the_depth_says_and_are_sent_once() -> None:

@@ -63,6 +63,7 @@ def words(index: Index) -> Words:
         labels=list(scene.labels),
         regions=dict(sorted(Counter(region.label for region in scene.regions).items())),
         objects=dict(sorted(Counter(item.label for item in scene.objects if item.label).items())),
+        merged_of=list(scene.merged_of),
     )
 
 
