@@ -18,14 +18,17 @@ def merged_map(robots: Sequence[str]) -> str:
     return f"merged map of {', '.join(robots)}" if robots else ""
 
 
-def headline(task: str, robots: Sequence[str]) -> str:
-    """The task of a map, merged of these robots' or of none; without one, what is to be done."""
-    return task or ("no task yet" if not robots else f"{merged_map(robots)}: give a task to a robot")
+def headline(task: str, robots: Sequence[str], plain: str = "") -> str:
+    """The task of a map, merged of these robots' or of none. Without one, what regions are: those of an environment
+    as it is (`plain`); without these, what is to be done."""
+    if task or plain:
+        return task or f"no task: {plain} as it is"
+    return f"{merged_map(robots)}: give a task to a robot" if robots else "no task yet"
 
 
 def follows_robots(name: str, robots: Sequence[str], what: str) -> str:
     """Why a merged map takes no task and the like, as a sentence."""
-    return f"{name} is the {merged_map(robots)} and follows theirs: give {what} to one of them (--robot {robots[0]})"
+    return f"{name} is the {merged_map(robots)} and follows what they do: give {what} to a robot (--robot {robots[0]})"
 
 
 def only_of_robots(name: str, robots: Sequence[str], what: str) -> str:

@@ -110,6 +110,11 @@ class Scene(Message, frozen=True, kw_only=True):
     markers: list[SceneMarker] = []  # by dictionary and id
     merged_of: list[str] = []  # robots whose maps it is merged of, as in PlaceDelta; empty = it is a robot's own
 
+    @property
+    def plain(self) -> str:
+        """The environment whose regions these are where no task has said which; empty where there are none."""
+        return self.environment if self.regions else ""
+
     def unnumbered(self) -> "Scene":
         """The same without its revision, which counts what a store has applied: of one and the same scene it is another
         where a writer's snapshot stood for several deltas, or for none yet."""

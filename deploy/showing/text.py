@@ -80,7 +80,7 @@ def _head(scene: Scene) -> Iterator[str]:
 
 
 def _no_task(scene: Scene) -> str:
-    told = _short(headline("", scene.merged_of), LONGEST_TASK)
+    told = _short(headline("", scene.merged_of, scene.plain), LONGEST_TASK)
     return told[0].upper() + told[1:]
 
 

@@ -250,8 +250,8 @@ class Page:
             return ""
         if isinstance(picked, PickedMarker):
             found = answer(index, MarkersOf(id=picked.key.id, dictionary=picked.key.dictionary))
-            there = found.markers if isinstance(found, Markers) else []
-            return words.marker_story(there[0]) if there else words.note("not there at this time")
+            printed = found.markers if isinstance(found, Markers) else []
+            return words.marker_story(printed[0]) if printed else words.note("not there at this time")
         region = words.region_of(scene, picked.region)
         why = self._wanted.told.get("why", "")
         if picked.itself:

@@ -37,7 +37,7 @@ def text_of(text: str) -> str:
 
 def headline(scene: Scene, title: str) -> str:
     """The task in force, where, and how much there is."""
-    task = text_of(members.headline(scene.task, scene.merged_of))
+    task = text_of(members.headline(scene.task, scene.merged_of, scene.plain))
     counts = ", ".join(
         _counted(count, name)
         for count, name in (

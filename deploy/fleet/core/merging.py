@@ -102,7 +102,6 @@ def merged(robot: str, sources: Sequence[Source], memory: Memory) -> Merged:
         frontier_areas_m2=areas.astype(np.float32),
         origin_m=maps[0].scene.origin_m,
         markers=markers_of(maps),
-        merged_of=list(dict.fromkeys(one.name.robot for one in maps)),
     )
     return Merged(scene, frame_ids, ground)
 

@@ -28,6 +28,7 @@ class Teller:
 
     robot: str
     epoch: int
+    merged_of: tuple[str, ...] = ()  # robots that the command names
     graph: ToldGraph = field(default_factory=ToldGraph)
     objects: ToldObjects = field(default_factory=ToldObjects)
     regions: Ledger = field(default_factory=Ledger)
@@ -43,8 +44,7 @@ class Teller:
         before, self.scene = self.scene, scene
         told = self.graph.follow(scene, min_change_m)
         fresh = self._cameras(merged.frame_ids, scene.trajectory)
-        joined = before is not None and before.merged_of != scene.merged_of
-        if told is not None or len(fresh.past_frame_ids) or event or joined:
+        if told is not None or len(fresh.past_frame_ids) or event:
             self.place_revision += 1
             columns = told if told is not None else ToldGraph().snapshot()
             yield place_delta(self._heading(event), *columns, fresh)
@@ -58,6 +58,11 @@ class Teller:
             self.markers |= {marker.key: marker for marker in marks}
             removed_ids = np.array(gone, np.int64)
             yield msgspec.structs.replace(self._objects(), objects=news, removed_ids=removed_ids, markers=marks)
+
+    def greeting(self) -> PlaceDelta:
+        """Whose the merged map is, before anything is in it."""
+        self.place_revision += 1
+        return self.places_snapshot()
 
     def places_snapshot(self) -> PlaceDelta:
         """Everything that was told of places."""
@@ -80,11 +85,9 @@ class Teller:
         return [marker for key, marker in sorted((now | gone).items()) if self.markers.get(key) != marker]
 
     def _heading(self, event: str) -> Heading:
-        bare = Heading(self.robot, self.epoch, self.place_revision, 0, NO_FRAME, event=event)
-        if self.scene is None:
-            return bare
-        scene = self.scene
-        return bare._replace(stamp_ns=scene.stamp_ns, origin_m=scene.origin_m, merged_of=tuple(scene.merged_of))
+        stamp_ns, origin_m = (0, (0.0, 0.0, 0.0)) if self.scene is None else (self.scene.stamp_ns, self.scene.origin_m)
+        heading = Heading(self.robot, self.epoch, self.place_revision, stamp_ns, NO_FRAME, event=event)
+        return heading._replace(origin_m=origin_m, merged_of=self.merged_of)
 
     def _cameras(self, frame_ids: np.ndarray, cameras_m: np.ndarray) -> CameraColumns:
         """Cameras that are new or have moved."""

@@ -27,7 +27,7 @@ from prior_sg.schemas.objects import ObjectDelta
 from prior_sg.schemas.places import PlaceDelta
 from prior_sg.schemas.priors import Prior, PriorList, PriorRequest
 from prior_sg.schemas.regions import RegionDelta
-from prior_sg.schemas.scene import Scene
+from prior_sg.schemas.scene import Scene, SceneRequest
 from prior_sg.schemas.status import Tick
 from prior_sg.services.losses import Losses
 from prior_sg.services.scene_store.core import graph as scenes
@@ -53,8 +53,8 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
         for robot in (*self.robots, *self.transforms):
             if fault := fault_of_robot(robot):
                 raise ValueError(fault)
-        if len({*self.robots}) < len(self.robots):
-            raise ValueError("a robot is named twice")
+        if twice := sorted(robot for robot in {*self.robots} if self.robots.count(robot) > 1):
+            raise ValueError(f"{twice[0]} is named twice: name each robot once")
         if unknown := sorted(self.transforms.keys() - {*self.robots}):
             raise ValueError(f"a transform is given for {unknown[0]}, whose map is not to be merged: name it, too")
 
@@ -97,6 +97,9 @@ def update(state: State, message: Message, cfg: Config) -> Iterator[Message]:
         for prior in message.priors:
             if prior.digest() == state.wanted:
                 state.prior = state.wanted, copied(prior)
+    elif isinstance(message, Scene):
+        if message.robot == state.robot and not len(message.place_ids) and state.teller.place_revision < 0:
+            yield state.teller.greeting()
     elif isinstance(message, Tick):
         yield from _tick(state, cfg)
 
@@ -147,6 +150,8 @@ def _follow(state: State, delta: Delta) -> Iterator[Message]:
 def _tick(state: State, cfg: Config) -> Iterator[Message]:
     members = state.members()
     state.ticks += 1
+    if state.ticks == 1:  # what the store has of a former start stays until there is something to put in its place
+        yield SceneRequest(robot=state.robot)
     yield from _aim(state, members)
     aimed = state.in_force is not state.memory.levels.prior
     if not (aimed or any(one.changed or one.to_fit for one in members)):

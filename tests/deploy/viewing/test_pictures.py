@@ -216,7 +216,8 @@ def test_a_merged_map_without_a_task_says_whose_it_is_and_what_to_do() -> None:
     assert "merged map of robot1, robot2: give a task to a robot" in told and "no task yet" not in told
     assert "a task of robot1 or robot2" in legend(bare, {})
     assert "home, merged map of robot1, robot2" in headline(home(robot="home", merged_of=["robot1", "robot2"]), "live")
-    assert "no task yet" in headline(home(task=""), "live") and "merged" not in headline(home(), "live")
+    assert "no task: residential home as it is" in headline(home(task=""), "live")
+    assert "no task yet" in headline(home(task="", regions=[]), "live") and "merged" not in headline(home(), "live")
 
 
 def test_points_lie_where_the_depth_says_and_are_sent_once() -> None:

@@ -75,7 +75,7 @@ def _data(material: Material) -> dict[str, Any]:
     colors = [label_colors(moment.scene) for moment in moments]
     counts = f"{len(scene.regions)} regions, {len(scene.place_ids)} places, {len(scene.objects)} objects"
     return {
-        "task": headline(scene.task, scene.merged_of),
+        "task": headline(scene.task, scene.merged_of, scene.plain),
         "about": " · ".join(text for text in (scene.environment, scene.robot, counts) if text),
         "colors": {label: list(color) for known in colors for label, color in known.items()},
         "grid": _grid(scene, material.voxels),
