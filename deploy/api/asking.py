@@ -186,12 +186,14 @@ class Asking(ABC):
         right as not. Without `what`, regions, objects, and the best place of each region.
 
         Where no embedding of the text can be had, labels are compared with it word by word; where the scene's prior is
-        not at hand, by their names alone. A warning says so.
+        not at hand, by their names alone. A warning says so, and why nothing answers.
         """
         regions, objects, missing = self.likeness(text)
         question = AnswersTo(text=text, regions=regions, objects=objects, what=what, limit=limit)
         ranking: Any
         (ranking,) = self.ask(question)
+        if ranking.reason:
+            warnings.warn(ranking.reason, stacklevel=2)
         if missing:
             warnings.warn(f"{ranking.note}: {missing}" if ranking.note else missing, stacklevel=2)
         return list(ranking.things)

@@ -292,6 +292,15 @@ def test_a_sentence_is_any_other_question_and_what_stands_in_is_said(capsys, sav
     assert status == 0 and found["answer"][0]["label"] == "kitchen" and "word by word" in found["notes"][0]
 
 
+def test_why_nothing_answers_is_said(capsys, tmp_path):
+    bare = message(
+        task="", regions=[], objects=[], labels=[], posteriors=np.zeros((3, 0), np.float16), merged_of=["r1", "r2"]
+    )
+    Scene(bare).save(tmp_path / "scene.json")
+    status, out, _ = asked(capsys, tmp_path / "scene.json", "kitchen")
+    assert status == 0 and "follow the tasks of r1, r2, and none of them was given any" in " ".join(out.split())
+
+
 @pytest.mark.parametrize(
     ("words", "reason"),
     [
