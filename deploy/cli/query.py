@@ -93,7 +93,7 @@ def cmd_query(arguments: argparse.Namespace) -> int:
     if arguments.object:
         arguments.what, arguments.label = "object", arguments.object
     word, *rest = arguments.words
-    run, show = ASKED.get(word, FOUND) if rest else ALONE.get(word, FOUND)
+    run, show = ASKED.get(word, FOUND) if rest else (ASKED | ALONE).get(word, FOUND)
     try:
         with warnings.catch_warnings(record=True) as said, _opened(arguments) as scene:
             warnings.simplefilter("always", UserWarning)
@@ -151,20 +151,20 @@ def _objects(scene: "Asking", arguments: argparse.Namespace, words: Sequence[str
 
 def _one(scene: "Asking", arguments: argparse.Namespace, words: Sequence[str]) -> "dict[str, Any]":
     what: Any = arguments.words[0]
-    number = _id(words)
+    number = _id(words, f"{what} 7")
     found: dict[str, Any] = {"details": scene.describe(what, number), "neighbours": scene.neighbours(what, number)}
     return found | ({"beliefs": scene.candidates(number, arguments.limit)} if what == "region" else {})
 
 
 def _levels(scene: "Asking", arguments: argparse.Namespace, words: Sequence[str]) -> "list[NodeWithRegions]":
-    level, *label = words
+    level, *label = words or ("",)
     if level not in LEVELS:
         raise UserError(f"name a level: {', '.join(LEVELS)}; such as `prior-sg query level zone ward`")
     return scene.levels(level, " ".join(label) or arguments.label, limit=arguments.limit)
 
 
 def _markers(scene: "Asking", arguments: argparse.Namespace, words: Sequence[str]) -> "list[MarkerInRegion]":
-    return scene.markers(_id(words) if words else None, limit=arguments.limit)
+    return scene.markers(_id(words, "marker 7") if words else None, limit=arguments.limit)
 
 
 def _route(scene: "Asking", arguments: argparse.Namespace, words: Sequence[str]) -> "Route":
@@ -186,7 +186,7 @@ def _changed(scene: "Asking", arguments: argparse.Namespace, words: Sequence[str
 
     if not isinstance(scene, Client):
         raise UserError("a saved scene is of one revision; ask the running store, without --scene")
-    return scene.changed_since(_id(words))
+    return scene.changed_since(_id(words, "changed 120"))
 
 
 def _numbers(words: Sequence[str], count: int, form: str) -> list[float]:
@@ -199,9 +199,9 @@ def _numbers(words: Sequence[str], count: int, form: str) -> list[float]:
     return numbers
 
 
-def _id(words: Sequence[str]) -> int:
+def _id(words: Sequence[str], example: str) -> int:
     if len(words) != 1 or not words[0].lstrip("-").isdigit():
-        raise UserError("name one number, such as `prior-sg query region 7`, or put a sentence in quotes")
+        raise UserError(f"name one number, such as `prior-sg query {example}`, or put a sentence in quotes")
     return int(words[0])
 
 
@@ -350,4 +350,4 @@ ASKED: dict[str, Asked] = {  # by first word; whatever else is a sentence
     "changed": (_changed, _show_difference),
 }
 FOUND: Asked = (_find, _show_things)
-ALONE: dict[str, Asked] = {"missing": (_missing, _show_missing), "marker": (_markers, _show_markers)}
+ALONE: dict[str, Asked] = {"missing": (_missing, _show_missing)}  # words that ask by themselves, and begin sentences
