@@ -16,6 +16,7 @@ from prior_sg.schemas.members import said
 
 if TYPE_CHECKING:
     from prior_sg.deploy.api.asking import Asking
+    from prior_sg.deploy.api.client import Client
     from prior_sg.schemas.answers import (
         Details,
         Difference,
@@ -97,6 +98,8 @@ def cmd_query(arguments: argparse.Namespace) -> int:
     try:
         with warnings.catch_warnings(record=True) as said, _opened(arguments) as scene:
             warnings.simplefilter("always", UserWarning)
+            if arguments.scene is None:
+                _require_some(scene)
             found = run(scene, arguments, rest if run is not _find else arguments.words)
     except (NotInSceneError, ValueError) as error:  # the latter of what no question may hold
         raise UserError(str(error)) from error
@@ -119,6 +122,17 @@ def _opened(arguments: argparse.Namespace) -> Any:
     from prior_sg.deploy.api.scene import Scene
 
     return contextlib.nullcontext(Scene.read(arguments.scene, arguments.robot))
+
+
+def _require_some(client: "Client") -> None:
+    """Raise UserError where nothing is stored of the robot that is asked about."""
+    from prior_sg.schemas.queries import WordsInUse
+
+    if client.answers(WordsInUse()).revision < 0:
+        raise UserError(
+            f"nothing is stored of a robot {client.robot!r}: its services have told nothing yet, or it has another "
+            "name (--robot)"
+        )
 
 
 def _find(scene: "Asking", arguments: argparse.Namespace, words: Sequence[str]) -> "list[Thing]":

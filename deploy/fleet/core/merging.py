@@ -74,8 +74,8 @@ def merged(robot: str, sources: Sequence[Source], memory: Memory) -> Merged:
     described = _described(found, beliefs, regions, objects, _parents(maps))
     nodes, directions, areas = openings(maps, found)
     frame_ids, cameras_m = _cameras(sources, memory)
-    newest = max((one.scene for one in maps), key=_age)
-    aimed = max((one.scene for one in maps if one.scene.prior_digest), key=_age, default=newest)
+    newest = max((one.scene for one in maps), key=lambda scene: scene.stamp_ns)
+    aimed = next((one.scene for one in maps if one.scene.prior_digest), newest)
     scene = Scene(
         robot=robot,
         stamp_ns=newest.stamp_ns,
@@ -106,19 +106,16 @@ def merged(robot: str, sources: Sequence[Source], memory: Memory) -> Merged:
     return Merged(scene, frame_ids, ground)
 
 
-def _age(scene: Scene) -> int:
-    return scene.stamp_ns
-
-
 def _told_by(maps: Sequence[Placed], said: Callable[[Scene], str]) -> str:
-    """What the robots say of themselves, each by its newest map: once where they agree, else with the robots' names."""
-    newest = {one.name.robot: one.scene for one in sorted(maps, key=lambda one: _age(one.scene))}
-    saying: dict[str, list[str]] = {}
-    for robot in dict.fromkeys(one.name.robot for one in maps):
-        if told := said(newest[robot]):
-            saying.setdefault(told, []).append(robot)
-    if len(saying) < 2:
-        return next(iter(saying), "")
+    """What the robots say of themselves, each by the first of its maps that says anything: once where they agree, else
+    with the robots' names."""
+    words: dict[str, str] = {}
+    for one in maps:
+        if told := said(one.scene):
+            words.setdefault(one.name.robot, told)
+    if len({*words.values()}) < 2:
+        return next(iter(words.values()), "")
+    saying = {told: [robot for robot in words if words[robot] == told] for told in words.values()}
     return "; ".join(f"{told} ({', '.join(robots)})" for told, robots in saying.items())
 
 

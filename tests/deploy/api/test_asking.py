@@ -12,6 +12,8 @@ from prior_sg.deploy.api.client import Client
 from prior_sg.deploy.api.scene import Scene
 from prior_sg.deploy.api.vectors import RecentVectors
 from prior_sg.deploy.cli.main import main
+from prior_sg.deploy.cli.query import _require_some
+from prior_sg.deploy.errors import UserError
 from prior_sg.schemas.codec import decode, encode
 from prior_sg.schemas.features import TextEmbeddings
 from prior_sg.schemas.members import MapMember
@@ -290,6 +292,16 @@ def test_a_sentence_is_any_other_question_and_what_stands_in_is_said(capsys, sav
     status, out, _ = asked(capsys, saved, "where", "is", "the", "kitchen?", "--json")
     found = json.loads(out)
     assert status == 0 and found["answer"][0]["label"] == "kitchen" and "word by word" in found["notes"][0]
+
+
+def test_a_robot_of_whom_nothing_is_stored_is_told():
+    hub, index = Hub(), Index(message(regions=[], objects=[]))
+    LocalBus(hub).serve(
+        SCENE_QUERY.key.format(robot="*"),
+        lambda request: request.reply(encode(reply(index, decode(SceneQuery, request.payload)))),
+    )
+    with Client(robot="adda", bus=LocalBus(hub)) as client, pytest.raises(UserError, match="of a robot 'adda'"):
+        _require_some(client)
 
 
 def test_why_nothing_answers_is_said(capsys, tmp_path):

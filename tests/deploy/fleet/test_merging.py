@@ -75,9 +75,9 @@ def test_a_merged_map_has_the_tasks_of_its_robots(tasks, told):
     assert scene.environment == ("home" if told else "") and bool(scene.prior_digest) == bool(told)
 
 
-def test_of_two_sessions_of_a_robot_the_later_task_counts():
+def test_of_two_sessions_of_a_robot_the_present_ones_task_counts_whatever_its_stamps():
     former, now = aimed("r1", np.eye(4), "tidy up"), aimed("r1", MOVED, "serve drinks")
-    now = msgspec.structs.replace(now, stamp_ns=former.stamp_ns + 1)
+    former = msgspec.structs.replace(former, stamp_ns=now.stamp_ns + 1)
     sources = [Source(Name("r1", 1), now, inverse(MOVED)), Source(ONE, former, np.eye(4))]
     scene = merged("home", sources, Memory()).scene
     assert scene.task == "serve drinks"
