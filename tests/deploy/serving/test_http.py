@@ -127,6 +127,7 @@ def test_questions_by_address(get):
 def test_markers_by_number():
     marked = replace(SCENE, markers=marked_home().markers)
     with opened() as (store, app, _), client_of(app) as client:
+        store.store(replace(SCENE, markers=[]))
         assert "no printed marker" in client.get(f"{V1}/markers").json()["answer"]["reason"]
         store.store(marked)
         assert [one["marker"]["id"] for one in client.get(f"{V1}/markers").json()["answer"]["markers"]] == [7, 9]
