@@ -15,6 +15,7 @@ from prior_sg.deploy.errors import UserError
 from prior_sg.deploy.evaluation import command as evaluation
 from prior_sg.deploy.evaluation import tune_command as tuning
 from prior_sg.deploy.terminal import Part, line
+from prior_sg.services.errors import PriorSgError
 
 if TYPE_CHECKING:
     from prior_sg.deploy.inspecting.health import Found
@@ -157,17 +158,19 @@ def cmd_explain(arguments: argparse.Namespace) -> int:
     """Each expert's vote on a place, its neighbours' pull, and what follows."""
     import msgspec
 
+    from prior_sg.deploy.api.client import Client
     from prior_sg.deploy.inspecting import explain
-    from prior_sg.schemas.regions import PosteriorRequest
-    from prior_sg.schemas.topics import POSTERIOR
 
     if arguments.log is not None:
         if not arguments.log.exists():
             raise UserError(f"{arguments.log} does not exist; `run`, `demo` and `record` write one")
         reply = explain.from_log(arguments.log, arguments.robot, arguments.place)
     else:
-        with open_client(arguments.connect) as client:
-            reply = client.ask(POSTERIOR, PosteriorRequest(robot=arguments.robot, place_id=arguments.place))
+        with Client(arguments.connect, arguments.robot) as client:
+            try:
+                reply = client.explain(arguments.place)
+            except PriorSgError as error:
+                raise UserError(str(error)) from error
     if not reply.found:
         raise UserError(f"{arguments.robot} has no labelled place {arguments.place}; scene.json lists their ids")
     if arguments.json:
