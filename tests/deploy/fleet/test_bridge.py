@@ -107,7 +107,9 @@ def test_another_task_of_a_robot_is_told_though_its_regions_stay():
     fleet.tell(msgspec.structs.replace(first(), task="tidy up"))
     fleet.tick()
     assert fleet.scene().task == "tidy up"
-    fleet.tell(msgspec.structs.replace(first(), task="serve drinks"))
+    (now,) = (one for one in houses.deltas(first()) if isinstance(one, RegionDelta))
+    now = msgspec.structs.replace(now, revision=1, task="serve drinks")
+    fleet.pipeline.publish(topic_of(RegionDelta), now)
     fleet.tick()
     assert fleet.scene().task == "serve drinks"
 
