@@ -22,6 +22,7 @@ from prior_sg.deploy.viewing.sources import Likeness, Source
 from prior_sg.deploy.viewing.stage import SafeServer, Stage
 from prior_sg.deploy.viewing.ways import FROM_THE_ROBOT, Trip, Way
 from prior_sg.schemas.answers import Markers
+from prior_sg.schemas.members import only_of_robots
 from prior_sg.schemas.queries import MarkersOf, Spot
 from prior_sg.schemas.regions import NO_REGION
 from prior_sg.schemas.scene import Scene
@@ -281,6 +282,9 @@ class Page:
 
         place = picked.place if picked.itself else typical_place(scene, picked.region)
         if place is None:
+            return
+        if scene.merged_of:
+            tell(words.note(only_of_robots(scene.robot, scene.merged_of, "why a place carries its label")))
             return
         try:
             tell(words.explanation(self._source.explain(place, lambda text: tell(words.note(text)))))

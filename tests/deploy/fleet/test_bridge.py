@@ -102,6 +102,18 @@ def test_what_cannot_be_merged_is_said_before_a_router_is_looked_for(words, says
     assert says in " ".join(capsys.readouterr().err.split())
 
 
+def test_another_task_of_a_robot_is_told_though_its_regions_stay():
+    fleet = Fleet()
+    fleet.tell(msgspec.structs.replace(first(), task="tidy up"))
+    fleet.tick()
+    assert fleet.scene().task == "tidy up"
+    (now,) = (one for one in houses.deltas(first()) if isinstance(one, RegionDelta))
+    now = msgspec.structs.replace(now, revision=1, task="serve drinks")
+    fleet.pipeline.publish(topic_of(RegionDelta), now)
+    fleet.tick()
+    assert fleet.scene().task == "serve drinks"
+
+
 def test_two_robots_make_one_map():
     fleet = Fleet()
     fleet.tell(first())

@@ -110,6 +110,17 @@ def test_what_is_known_of_a_marker_is_told_when_it_is_clicked(shown: tuple[Held,
     until(lambda: "not there at this time" in page.panel.text("selected"))
 
 
+def test_why_a_place_of_a_merged_map_carries_its_label_is_known_of_its_robots(shown: tuple[Held, Page]) -> None:
+    source, page = shown
+    merged = joined_home(merged_of=["robot1", "robot2"], robot="home")
+    source.put(merged)
+    until(lambda: "merged map of robot1, robot2" in page.panel.text("headline"))
+    picked = Picked(place=12, region=3, itself=True)
+    page._want(picked=picked)
+    page._explain(merged, picked)
+    until(lambda: "known of a robot&#x27;s own map (--robot robot1)" in page.panel.text("selected"))
+
+
 @pytest.mark.skipif(not CHROMIUM, reason="Chromium is not installed")
 def test_a_click_in_the_browser_on_a_marker_tells_of_it(shown: tuple[Held, Page]) -> None:
     sync_api = pytest.importorskip("playwright.sync_api")
