@@ -68,8 +68,12 @@ def _opening(
     openings: Openings, row: int, *, foreseen: Beyond, prior: Prior, found: Found, cfg: ForesightConfig
 ) -> Opening:
     here = int(openings.beliefs[row].argmax())
-    within = foreseen.within[row]
-    likely = np.argsort(-within, kind="stable")[: cfg.told_labels].tolist()
+    within, whole = foreseen.within[row], foreseen.within.sum(axis=0)
+    by_chance = np.argsort(-within, kind="stable")
+    likely = within >= cfg.least_within
+    likely[by_chance[cfg.told_labels :]] = False
+    likely |= (within >= cfg.least_share * whole) & (np.round(within, DIGITS) > 0)
+    told = by_chance[likely[by_chance]].tolist()
     return Opening(
         place_id=int(openings.place_ids[row]),
         position_m=_point(openings.positions_m[row]),
@@ -87,8 +91,7 @@ def _opening(
                 found=int(found.regions[label]),
                 met=int(found.borders[here, label]),
             )
-            for label in likely
-            if within[label] >= cfg.least_within
+            for label in told
         ],
     )
 
