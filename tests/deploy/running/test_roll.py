@@ -87,6 +87,7 @@ def test_a_router_that_does_not_answer_is_not_one_on_which_nobody_is(monkeypatch
         with BusClient(ZenohBus(address)) as anybody:
             assert anybody.standings() == [] and look(anybody).remarks == []
             os.kill(router.pid, signal.SIGSTOP)
+            os.waitpid(router.pid, os.WUNTRACED)  # until then some of its threads may go on
             with pytest.raises(BusError, match=r"has not said within 0.2 s who is there"):
                 anybody.standings()
             found = look(anybody)
