@@ -291,8 +291,10 @@ def settle(state: State, cfg: Config, *, hurried: bool) -> None:
     given_away = places.labels != places.cut_labels
     changed = places.unsettled | given_away | (labels != places.cut_labels)
     places.cut_labels, places.solved = labels, rows
-    labels = consolidated(field_of(state), labels, cfg.region_cost, changed)
-    places.unbelieved |= with_neighbours(state.map.graph, labels != places.labels)
+    labels = consolidated(field_of(state), labels, cfg.region_cost, changed, state.map.ties)
+    relabelled = labels != places.labels
+    places.unbelieved |= with_neighbours(state.map.graph, relabelled)
+    places.unparted |= relabelled
     places.labels = labels
     places.unsettled[:] = False
 

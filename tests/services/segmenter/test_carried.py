@@ -22,6 +22,7 @@ from prior_sg.services.segmenter.core.layers.layer_map import LayerMap
 from prior_sg.services.segmenter.core.map.arcs import arcs_of
 from prior_sg.services.segmenter.core.map.place_map import PlaceMap, edge_weights
 from prior_sg.services.segmenter.core.map.received import ReceivedGraph, apply
+from prior_sg.services.segmenter.core.regions.region_map import RegionMap
 from prior_sg.services.segmenter.service import SERVICE
 from tests.help.fields import random_field
 from tests.help.world import ROBOT, place_delta, place_grid, prior, task, text, walk
@@ -126,14 +127,21 @@ def test_a_segmenter_that_carries_on_tells_what_one_that_starts_anew_tells(budge
     anew = [joined_anew(one) if hasattr(one, "removed_edges") else one for one in messages]
     monkeypatch.setattr(LayerMap, "renew", partialmethod(_all_afresh, LayerMap.renew))
     monkeypatch.setattr(inference, "consolidated", _consolidated_anew)
+    monkeypatch.setattr(RegionMap, "partition", partialmethod(_parted_afresh, RegionMap.partition))
     found, kept_anew = deltas_of(anew, cfg)
     assert carried == found and len(carried) > 20
     assert kept - kept_anew > 5
 
 
-def _consolidated_anew(field, labels, cost, _changed):
+def _consolidated_anew(field, labels, cost, _changed, _ties):
     """`consolidated` as if every place had changed."""
     return consolidated(field, labels, cost)
+
+
+def _parted_afresh(regions, partition, place_map, *arguments):
+    """`partition` as if all places were marked."""
+    place_map.places.unparted[:] = True
+    return partition(regions, place_map, *arguments)
 
 
 def _all_afresh(layers, renew, *arguments, changed, **named):

@@ -6,7 +6,9 @@ import pytest
 from prior_sg.services.segmenter.core.energy.mrf import Field, energy
 from prior_sg.services.segmenter.core.energy.region_cost import _pass, consolidated
 from prior_sg.services.segmenter.core.energy.solver import minimise
+from prior_sg.services.segmenter.core.map.arcs import arcs_of
 from prior_sg.services.segmenter.core.regions.components import numbered
+from tests.help import fields
 
 POTTS = 1.0 - np.eye(3)
 
@@ -56,10 +58,10 @@ def test_without_cost_or_neighbours_nothing_changes():
 def test_passes_over_what_was_relabelled_equal_passes_over_all(seed):
     field = random_field(seed)
     labels = field.unary.argmin(axis=1)
-    expected, before = labels.copy(), None
-    while before is None or (expected != before).any():
-        before = expected.copy()
-        _pass(expected, numbered(expected, field.edges), np.ones(len(expected), bool), *field, 2.0)
+    expected, near, nobody = labels.copy(), arcs_of(len(labels), field.edges, field.weights), np.full(len(labels), -1)
+    while len(_pass(expected, np.arange(len(labels)), near, nobody, *field, 2.0)):
+        pass
+    assert (nobody == -1).all()
     np.testing.assert_array_equal(consolidated(field, labels, 2.0), expected)
 
 
@@ -79,3 +81,21 @@ def test_each_region_that_is_left_pays_and_those_given_away_did_not(seed, cost):
         for label in set(after[field.edges[crossing].reshape(-1)].tolist()) - set(after[inside].tolist()):
             otherwise = np.where(inside, label, after)
             assert energy(field, otherwise) - energy(field, after) >= cost - 1e-9
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_what_is_found_again_where_something_changed_is_what_is_found_anywhere(seed):
+    """A hundred places, of which a few change at a time, in costs, labels or weights."""
+    rng = np.random.default_rng(seed)
+    field = fields.random_field(seed, 100, 4, degree=3)
+    labels = field.unary.argmin(axis=1)
+    found = consolidated(field, labels, 2.0)
+    for _ in range(15):
+        changed = found != labels  # given away
+        costly, other, edges = rng.choice(100, 2), rng.choice(100, 2), rng.choice(len(field.edges), 2)
+        field.unary[costly], field.weights[edges] = rng.uniform(0, 4, (2, 4)), rng.uniform(0, 1, 2)
+        labels = labels.copy()
+        labels[other] = rng.integers(0, 4, 2)
+        changed[[*costly, *other, *field.edges[edges].reshape(-1)]] = True
+        found = consolidated(field, labels, 2.0, changed, arcs_of(100, field.edges, field.weights))
+        np.testing.assert_array_equal(found, consolidated(field, labels, 2.0))

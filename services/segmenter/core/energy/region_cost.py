@@ -11,84 +11,131 @@ import numpy as np
 
 from prior_sg.services.compiled import compiled
 from prior_sg.services.segmenter.core.energy.mrf import Field
-from prior_sg.services.segmenter.core.regions.components import numbered
+from prior_sg.services.segmenter.core.map.arcs import Arcs, arcs_of, spread
 
 
-def consolidated(field: Field, labels: np.ndarray, cost: float, changed: np.ndarray | None = None) -> np.ndarray:
+def consolidated(
+    field: Field, labels: np.ndarray, cost: float, changed: np.ndarray | None = None, ties: Arcs | None = None
+) -> np.ndarray:
     """Labels (place,) in which no region gains less than `cost` by its own label against its best neighbour's.
 
     Regions are taken by what they gain, least first, and never two that touch in one pass. A pass weighs those that
     were relabelled by the one before, and their neighbours: the others have been found to pay for themselves. So does
     the first with `changed` (place,): where costs, edges or labels are others than at the last call, and where that
-    gave a region away; None = anywhere.
+    gave a region away; None = anywhere. `ties` are the field's edges as arcs, where the caller has them.
     """
     labels = labels.copy()
     if cost <= 0 or not len(field.edges):
         return labels
-    relabelled = np.ones(len(labels), dtype=bool) if changed is None else changed
-    while relabelled.any():
-        before = labels.copy()
-        _pass(labels, numbered(labels, field.edges), relabelled, *field, cost)
-        relabelled = labels != before
+    near = arcs_of(len(labels), field.edges, field.weights) if ties is None else ties
+    region_of = np.full(len(labels), -1)
+    rows = np.arange(len(labels)) if changed is None else np.flatnonzero(changed)
+    while len(rows):
+        rows = _pass(labels, rows, near, region_of, *field, cost)
     return labels
 
 
 @compiled()
-def _pass(labels, region_of, relabelled, unary, edges, weights, pairwise, cost):  # noqa: ANN001, ANN202, PLR0917
-    """Weigh the regions that hold a relabelled place or touch one that does, and relabel some of them."""
-    regions, count = region_of.max() + 1, unary.shape[1]
+def _pass(labels, rows, near, region_of, unary, edges, weights, pairwise, cost):  # noqa: ANN001, ANN202, PLR0917
+    """Weigh the regions that hold any of the places `rows` or touch one that does, and relabel some of them; returns
+    the places (n,) relabelled. `region_of` (place,) is scratch, all -1 before and after.
+
+    Sums run over places and edges in the order of their rows, and regions are numbered by their first places: what a
+    region costs does not depend on which others are weighed.
+    """
+    places = _weighed(labels, rows, near, region_of)
+    regions, count = _renumbered(places, region_of), unary.shape[1]
     label_of = np.zeros(regions, np.int64)
-    renewed, weighed = np.zeros(regions, np.bool_), np.zeros(regions, np.bool_)
-    for place in range(len(labels)):
-        label_of[region_of[place]] = labels[place]
-        if relabelled[place]:
-            renewed[region_of[place]] = weighed[region_of[place]] = True
-    for edge in range(len(edges)):
-        one, other = region_of[edges[edge, 0]], region_of[edges[edge, 1]]
-        if renewed[one] or renewed[other]:
-            weighed[one] = weighed[other] = True
     costs = np.zeros((regions, count))  # of the region under each label while all others keep theirs
-    for place in range(len(labels)):
-        region = region_of[place]
-        if weighed[region]:
-            for label in range(count):
-                costs[region, label] += unary[place, label]
+    for place in places:
+        label_of[region_of[place]] = labels[place]
+        for label in range(count):
+            costs[region_of[place], label] += unary[place, label]
+    borders = _borders(labels, places, near)
     beside = np.zeros((regions, count), np.bool_)
     starts = np.zeros(regions + 1, np.int64)
-    for edge in range(len(edges)):
-        one, other = region_of[edges[edge, 0]], region_of[edges[edge, 1]]
-        if one == other or not (weighed[one] or weighed[other]):
-            continue
-        for here, there in ((one, other), (other, one)):
-            beside[here, label_of[there]] = True
+    for edge in borders:
+        for side in range(2):
+            here, there = region_of[edges[edge, side]], edges[edge, 1 - side]
+            if here < 0:
+                continue
+            beside[here, labels[there]] = True
             starts[here + 1] += 1
             for label in range(count):
-                costs[here, label] += weights[edge] * pairwise[label, label_of[there]]
+                costs[here, label] += weights[edge] * pairwise[label, labels[there]]
     for region in range(regions):
         starts[region + 1] += starts[region]
-    neighbours, fill = np.empty(starts[-1], np.int64), starts[:-1].copy()
-    for edge in range(len(edges)):
-        one, other = region_of[edges[edge, 0]], region_of[edges[edge, 1]]
-        if one != other and (weighed[one] or weighed[other]):
-            neighbours[fill[one]], neighbours[fill[other]] = other, one
-            fill[one] += 1
-            fill[other] += 1
+    neighbours, fill = np.empty(starts[-1], np.int64), starts[:-1].copy()  # a region, -1 = one that keeps its label
+    for edge in borders:
+        for side in range(2):
+            here = region_of[edges[edge, side]]
+            if here >= 0:
+                neighbours[fill[here]] = region_of[edges[edge, 1 - side]]
+                fill[here] += 1
     gains, best = np.full(regions, np.inf), np.zeros(regions, np.int64)
     for region in range(regions):
         for label in range(count):
             gain = costs[region, label] - costs[region, label_of[region]]
-            if weighed[region] and beside[region, label] and gain < gains[region]:
+            if beside[region, label] and gain < gains[region]:
                 gains[region], best[region] = gain, label
     settled, given = np.zeros(regions, np.bool_), label_of.copy()
     for region in np.argsort(gains, kind="mergesort"):
         if gains[region] >= cost:
             break
         free = not settled[region]
-        for at in range(starts[region], starts[region + 1]):
-            free = free and given[neighbours[at]] == label_of[neighbours[at]]
+        for other in neighbours[starts[region] : starts[region + 1]]:
+            free = free and (other < 0 or given[other] == label_of[other])
         if free:
             given[region] = best[region]
-            for at in range(starts[region], starts[region + 1]):
-                settled[neighbours[at]] = True
-    for place in range(len(labels)):
-        labels[place] = given[region_of[place]]
+            for other in neighbours[starts[region] : starts[region + 1]]:
+                if other >= 0:
+                    settled[other] = True
+    relabelled, found = np.empty(len(places), np.int64), 0
+    for place in places:
+        if given[region_of[place]] != labels[place]:
+            labels[place] = given[region_of[place]]
+            relabelled[found] = place
+            found += 1
+        region_of[place] = -1
+    return relabelled[:found].copy()
+
+
+@compiled()
+def _weighed(labels, rows, near, region_of):  # noqa: ANN001, ANN202
+    """Places (n,), ascending, of the regions that hold any of `rows` or touch one that does, with numbers."""
+    members, count = np.empty(len(labels), np.int64), 0
+    for row in rows:
+        count = spread(row, labels, near, region_of, members, count)
+    for index in range(count):
+        place = members[index]
+        for arc in range(near.starts[place], near.starts[place + 1]):
+            count = spread(near.neighbours[arc], labels, near, region_of, members, count)
+    return np.sort(members[:count])
+
+
+@compiled()
+def _renumbered(places, region_of):  # noqa: ANN001, ANN202
+    """How many regions the ascending `places` are in; afterwards their numbers count from 0 in this order."""
+    number_of, regions = np.full(len(places), -1), 0
+    for place in places:
+        if number_of[region_of[place]] < 0:
+            number_of[region_of[place]] = regions
+            regions += 1
+        region_of[place] = number_of[region_of[place]]
+    return regions
+
+
+@compiled()
+def _borders(labels, places, near):  # noqa: ANN001, ANN202
+    """Numbers (n,), ascending, of the edges from `places` to places of other labels, each once."""
+    found = [np.int64(0) for _ in range(0)]
+    for place in places:
+        for arc in range(near.starts[place], near.starts[place + 1]):
+            if labels[near.neighbours[arc]] != labels[place]:
+                found.append(np.int64(near.edges[arc]))
+    crossing, count = np.sort(np.array(found, np.int64)), 0
+    for edge in crossing:
+        if not count or edge != crossing[count - 1]:
+            crossing[count] = edge
+            count += 1
+    return crossing[:count]

@@ -13,15 +13,19 @@ from prior_sg.services.segmenter.core.regions.components import numbered
 NEAREST = 4  # places of another piece that are looked at from each place
 
 
-def near_regions(graph: ReceivedGraph, rows: np.ndarray, edges: np.ndarray, count: int, join_m: float) -> np.ndarray:
+def near_regions(
+    graph: ReceivedGraph, regions: np.ndarray, ids: np.ndarray, edges: np.ndarray, join_m: float
+) -> np.ndarray:
     """Pairs (n, 2) of regions of different pieces, smaller first, where the free space of these pieces is nearest.
 
-    `rows` (place,) is the region of each place, of `count`; `edges` (contact, 2) join regions that a way leads
-    between. Pieces whose nearest spheres are more than `join_m` apart are not joined.
+    `regions` (place,) is the id of each place's region. Pairs and `edges` (contact, 2), which join regions that a way
+    leads between, are numbers into `ids` (region,), ascending. Pieces whose nearest spheres are more than `join_m`
+    apart are not joined.
     """
-    piece = numbered(np.zeros(count, np.int64), edges)
+    piece = numbered(np.zeros(len(ids), np.int64), edges)
     if not piece.any():
         return np.zeros((0, 2), np.int64)
+    rows = numbers_of(ids, regions)[regions]
     of_place = piece[rows]
     members = sorted((np.flatnonzero(of_place == one) for one in np.unique(of_place).tolist()), key=len)
     trees = [scipy.spatial.cKDTree(graph.positions_m[one]) for one in members]
@@ -32,6 +36,14 @@ def near_regions(graph: ReceivedGraph, rows: np.ndarray, edges: np.ndarray, coun
             if nearest is not None:
                 pairs.append(sorted((int(rows[nearest[0]]), int(rows[nearest[1]]))))
     return np.array(sorted(pairs), np.int64).reshape(-1, 2)
+
+
+def numbers_of(ids: np.ndarray, regions: np.ndarray) -> np.ndarray:
+    """Where each region (region id,) that there is in `ids` or `regions` comes in `ids`, -1 = not; the last entry is
+    that of no region."""
+    numbers = np.full(max(int(regions.max(initial=-1)), int(ids.max(initial=-1))) + 2, -1)
+    numbers[ids] = np.arange(len(ids))
+    return numbers
 
 
 def _nearest(

@@ -30,10 +30,11 @@ _FILLS: dict[str, tuple[float | bool, str]] = {  # what a new place gets, and th
     "reshaped": (True, "bool"),
     "doubtful": (True, "bool"),
     "unsettled": (True, "bool"),
+    "unparted": (True, "bool"),
     "unbelieved": (True, "bool"),
 }
 _PER_LABEL = ("own_similarity", "similarity", "correction", "contents", "unary", "posteriors")
-_AFTER_A_SWITCH = ("stale", "unshared", "doubtful", "unsettled", "unbelieved")
+_AFTER_A_SWITCH = ("stale", "unshared", "doubtful", "unsettled", "unparted", "unbelieved")
 
 
 @dataclass
@@ -60,6 +61,7 @@ class Places:
     reshaped: np.ndarray  # graph changed nearby: find the local surface again
     doubtful: np.ndarray  # what an expert looks at changed: ask the experts again
     unsettled: np.ndarray  # costs changed: look for a better label
+    unparted: np.ndarray  # its label, its edges or where it stands changed: find the regions around it again
     unbelieved: np.ndarray  # costs or a neighbour's label changed: find the posterior again
 
     def looks(self, rows: np.ndarray) -> np.ndarray:
