@@ -15,7 +15,7 @@ from prior_sg.services.runtime.service import Identity
 from prior_sg.services.segmenter.core import inference
 from prior_sg.services.segmenter.core.config import Config
 from prior_sg.services.segmenter.core.energy import swap_work
-from prior_sg.services.segmenter.core.energy.region_cost import consolidated
+from prior_sg.services.segmenter.core.energy.region_cost import passes
 from prior_sg.services.segmenter.core.energy.solver import Solver
 from prior_sg.services.segmenter.core.evidence.kernel import Frame, KernelConfig, project, visible
 from prior_sg.services.segmenter.core.layers.layer_map import LayerMap
@@ -126,16 +126,16 @@ def test_a_segmenter_that_carries_on_tells_what_one_that_starts_anew_tells(budge
     carried, kept = deltas_of(messages, cfg)
     anew = [joined_anew(one) if hasattr(one, "removed_edges") else one for one in messages]
     monkeypatch.setattr(LayerMap, "renew", partialmethod(_all_afresh, LayerMap.renew))
-    monkeypatch.setattr(inference, "consolidated", _consolidated_anew)
+    monkeypatch.setattr(inference, "passes", _passes_anew)
     monkeypatch.setattr(RegionMap, "partition", partialmethod(_parted_afresh, RegionMap.partition))
     found, kept_anew = deltas_of(anew, cfg)
     assert carried == found and len(carried) > 20
     assert kept - kept_anew > 5
 
 
-def _consolidated_anew(field, labels, cost, _changed, _ties):
-    """`consolidated` as if every place had changed."""
-    return consolidated(field, labels, cost)
+def _passes_anew(field, labels, cost, *_former, **_changed):
+    """`passes` as if there had been none before."""
+    return passes(field, labels, cost)
 
 
 def _parted_afresh(regions, partition, place_map, *arguments):

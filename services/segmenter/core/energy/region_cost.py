@@ -7,6 +7,8 @@ instead of per label): a region takes the label of a neighbour, and becomes part
 less.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from prior_sg.services.compiled import compiled
@@ -14,128 +16,140 @@ from prior_sg.services.segmenter.core.energy.mrf import Field
 from prior_sg.services.segmenter.core.map.arcs import Arcs, arcs_of, spread
 
 
-def consolidated(
-    field: Field, labels: np.ndarray, cost: float, changed: np.ndarray | None = None, ties: Arcs | None = None
-) -> np.ndarray:
+def consolidated(field: Field, labels: np.ndarray, cost: float) -> np.ndarray:
     """Labels (place,) in which no region gains less than `cost` by its own label against its best neighbour's.
 
-    Regions are taken by what they gain, least first, and never two that touch in one pass. A pass weighs those that
-    were relabelled by the one before, and their neighbours: the others have been found to pay for themselves. So does
-    the first with `changed` (place,): where costs, edges or labels are others than at the last call, and where that
-    gave a region away; None = anywhere. `ties` are the field's edges as arcs, where the caller has them.
+    Regions are taken by what they gain, least first, and never two that touch in one pass; passes go on until one
+    changes nothing.
     """
-    labels = labels.copy()
+    return passes(field, labels, cost)[-1]
+
+
+def passes(
+    field: Field,
+    labels: np.ndarray,
+    cost: float,
+    former: Sequence[np.ndarray] = (),
+    *,
+    changed: np.ndarray | None = None,
+    ties: Arcs | None = None,
+) -> list[np.ndarray]:
+    """Labels (place,) before the first pass of `consolidated` and after each that changed any.
+
+    What a pass makes of a region follows from the region and what it touches. So `former`, what was returned last on
+    these rows, is gone over again where a place has other costs, weights or edges now (rows `changed`), or another
+    label than it had before the same pass. It is changed in place. `ties` are the field's edges as arcs, where the
+    caller has them.
+    """
     if cost <= 0 or not len(field.edges):
-        return labels
+        return [labels.copy()]
     near = arcs_of(len(labels), field.edges, field.weights) if ties is None else ties
-    region_of = np.full(len(labels), -1)
-    rows = np.arange(len(labels)) if changed is None else np.flatnonzero(changed)
-    while len(rows):
-        rows = _pass(labels, rows, near, region_of, *field, cost)
-    return labels
+    given = np.arange(len(labels)) if changed is None or not former else changed
+    rows = given if not former else np.union1d(given, np.flatnonzero(labels != former[0]))
+    after, region_of = [labels.copy(), *former[1:]], np.full(len(labels), -1)
+    for number in range(1, len(after)):
+        differs = _pass(after[number - 1], rows, near, region_of, field, cost, after[number])
+        rows = np.union1d(given, differs)
+    while len(rows):  # the last pass changed nothing but there
+        after.append(after[-1].copy())
+        rows = _pass(after[-2], rows, near, region_of, field, cost, after[-1])
+    while len(after) > 1 and np.array_equal(after[-1], after[-2]):
+        after.pop()
+    return after
 
 
 @compiled()
-def _pass(labels, rows, near, region_of, unary, edges, weights, pairwise, cost):  # noqa: ANN001, ANN202, PLR0917
-    """Weigh the regions that hold any of the places `rows` or touch one that does, and relabel some of them; returns
-    the places (n,) relabelled. `region_of` (place,) is scratch, all -1 before and after.
+def _pass(labels, rows, near, region_of, field, cost, after):  # noqa: ANN001, ANN202, PLR0917
+    """Put into `after` what one pass makes of `labels` around the places `rows`; returns the places (n,) where that is
+    something else than what was there. `region_of` (place,) is scratch, all -1 before and after.
 
-    Sums run over places and edges in the order of their rows, and regions are numbered by their first places: what a
-    region costs does not depend on which others are weighed.
+    Weighed are the regions that hold any of `rows`, those that touch these, and on from these and from whatever gains
+    too little, all that it touches: who gives way may keep its neighbour from it.
     """
-    places = _weighed(labels, rows, near, region_of)
-    regions, count = _renumbered(places, region_of), unary.shape[1]
-    label_of = np.zeros(regions, np.int64)
-    costs = np.zeros((regions, count))  # of the region under each label while all others keep theirs
-    for place in places:
-        label_of[region_of[place]] = labels[place]
-        for label in range(count):
-            costs[region_of[place], label] += unary[place, label]
-    borders = _borders(labels, places, near)
-    beside = np.zeros((regions, count), np.bool_)
-    starts = np.zeros(regions + 1, np.int64)
-    for edge in borders:
-        for side in range(2):
-            here, there = region_of[edges[edge, side]], edges[edge, 1 - side]
-            if here < 0:
-                continue
-            beside[here, labels[there]] = True
-            starts[here + 1] += 1
-            for label in range(count):
-                costs[here, label] += weights[edge] * pairwise[label, labels[there]]
-    for region in range(regions):
-        starts[region + 1] += starts[region]
-    neighbours, fill = np.empty(starts[-1], np.int64), starts[:-1].copy()  # a region, -1 = one that keeps its label
-    for edge in borders:
-        for side in range(2):
-            here = region_of[edges[edge, side]]
-            if here >= 0:
-                neighbours[fill[here]] = region_of[edges[edge, 1 - side]]
-                fill[here] += 1
-    gains, best = np.full(regions, np.inf), np.zeros(regions, np.int64)
-    for region in range(regions):
-        for label in range(count):
-            gain = costs[region, label] - costs[region, label_of[region]]
-            if beside[region, label] and gain < gains[region]:
-                gains[region], best[region] = gain, label
-    settled, given = np.zeros(regions, np.bool_), label_of.copy()
-    for region in np.argsort(gains, kind="mergesort"):
-        if gains[region] >= cost:
-            break
-        free = not settled[region]
-        for other in neighbours[starts[region] : starts[region + 1]]:
-            free = free and (other < 0 or given[other] == label_of[other])
-        if free:
-            given[region] = best[region]
-            for other in neighbours[starts[region] : starts[region + 1]]:
-                if other >= 0:
-                    settled[other] = True
-    relabelled, found = np.empty(len(places), np.int64), 0
-    for place in places:
-        if given[region_of[place]] != labels[place]:
-            labels[place] = given[region_of[place]]
-            relabelled[found] = place
-            found += 1
-        region_of[place] = -1
-    return relabelled[:found].copy()
-
-
-@compiled()
-def _weighed(labels, rows, near, region_of):  # noqa: ANN001, ANN202
-    """Places (n,), ascending, of the regions that hold any of `rows` or touch one that does, with numbers."""
-    members, count = np.empty(len(labels), np.int64), 0
+    members, count = np.empty(len(labels), np.int64), 0  # of region after region; its number is where it begins
     for row in rows:
         count = spread(row, labels, near, region_of, members, count)
     for index in range(count):
-        place = members[index]
-        for arc in range(near.starts[place], near.starts[place + 1]):
-            count = spread(near.neighbours[arc], labels, near, region_of, members, count)
-    return np.sort(members[:count])
+        count = _touched(members[index], labels, near, region_of, members, count)
+    certain, begin = count, 0
+    gains, best, given = np.empty(len(labels)), np.empty(len(labels), np.int64), np.empty(len(labels), np.int64)
+    settled = np.zeros(len(labels), np.bool_)
+    poor = [np.int64(0) for _ in range(0)]
+    while begin < count:
+        end = begin
+        while end < count and region_of[members[end]] == begin:
+            end += 1
+        inside = members[begin:end]
+        inside.sort()
+        given[begin] = labels[inside[0]]
+        gains[begin], best[begin] = _gain(inside, labels, near, field)
+        if gains[begin] < cost:
+            poor.append(begin)
+        if begin < certain or gains[begin] < cost:
+            for place in inside:
+                count = _touched(place, labels, near, region_of, members, count)
+        begin = end
+    _give(np.array(poor, np.int64), gains, best, given, settled, members[:count], labels, near, region_of)
+    differs, found = np.empty(count, np.int64), 0
+    for place in members[:count]:
+        if after[place] != given[region_of[place]]:
+            after[place] = given[region_of[place]]
+            differs[found] = place
+            found += 1
+        region_of[place] = -1
+    return differs[:found].copy()
 
 
 @compiled()
-def _renumbered(places, region_of):  # noqa: ANN001, ANN202
-    """How many regions the ascending `places` are in; afterwards their numbers count from 0 in this order."""
-    number_of, regions = np.full(len(places), -1), 0
-    for place in places:
-        if number_of[region_of[place]] < 0:
-            number_of[region_of[place]] = regions
-            regions += 1
-        region_of[place] = number_of[region_of[place]]
-    return regions
+def _touched(place, labels, near, region_of, members, count):  # noqa: ANN001, ANN202, PLR0917
+    """`spread` from all neighbours of a place."""
+    for arc in range(near.starts[place], near.starts[place + 1]):
+        count = spread(near.neighbours[arc], labels, near, region_of, members, count)
+    return count
 
 
 @compiled()
-def _borders(labels, places, near):  # noqa: ANN001, ANN202
-    """Numbers (n,), ascending, of the edges from `places` to places of other labels, each once."""
-    found = [np.int64(0) for _ in range(0)]
-    for place in places:
+def _gain(inside, labels, near, field):  # noqa: ANN001, ANN202
+    """What the region of the places `inside` (ascending) gains against its best neighbour's label, and that label.
+
+    Sums run in the order of places and edges: they are the same wherever the search for regions began.
+    """
+    own = labels[inside[0]]
+    costs, beside = np.zeros(field.unary.shape[1]), np.zeros(field.unary.shape[1], np.bool_)
+    edges, others = [np.int64(0) for _ in range(0)], [np.int64(0) for _ in range(0)]
+    for place in inside:
+        for label in range(len(costs)):
+            costs[label] += field.unary[place, label]
         for arc in range(near.starts[place], near.starts[place + 1]):
-            if labels[near.neighbours[arc]] != labels[place]:
-                found.append(np.int64(near.edges[arc]))
-    crossing, count = np.sort(np.array(found, np.int64)), 0
-    for edge in crossing:
-        if not count or edge != crossing[count - 1]:
-            crossing[count] = edge
-            count += 1
-    return crossing[:count]
+            if labels[near.neighbours[arc]] != own:
+                edges.append(np.int64(near.edges[arc]))
+                others.append(labels[near.neighbours[arc]])
+    across = np.array(edges, np.int64)
+    for at in np.argsort(across):
+        beside[others[at]] = True
+        for label in range(len(costs)):
+            costs[label] += field.weights[across[at]] * field.pairwise[label, others[at]]
+    gain, best = np.inf, own
+    for label in range(len(costs)):
+        if beside[label] and costs[label] - costs[own] < gain:
+            gain, best = costs[label] - costs[own], label
+    return gain, best
+
+
+@compiled()
+def _give(poor, gains, best, given, settled, members, labels, near, region_of):  # noqa: ANN001, ANN202, PLR0917
+    """Give away the regions `poor`, least gain first and of equals that with the first place, none beside another."""
+    order = poor[np.argsort(members[poor])]
+    for region in order[np.argsort(gains[order], kind="mergesort")]:
+        free, index = not settled[region], region
+        while index < len(members) and region_of[members[index]] == region:
+            for arc in range(near.starts[members[index]], near.starts[members[index] + 1]):
+                other = near.neighbours[arc]
+                free = free and (region_of[other] == region or given[region_of[other]] == labels[other])
+            index += 1
+        if not free:
+            continue
+        given[region] = best[region]
+        for place in members[region:index]:
+            for arc in range(near.starts[place], near.starts[place + 1]):
+                settled[region_of[near.neighbours[arc]]] = True

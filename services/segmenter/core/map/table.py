@@ -77,10 +77,7 @@ class Places:
         """The same on the rows of the next graph."""
         if step.same_rows:
             return self
-        old = step.previous >= 0
-        columns = {
-            name: _realigned(getattr(self, name), step.previous, old, fill) for name, (fill, _) in _FILLS.items()
-        }
+        columns = {name: realigned(getattr(self, name), step.previous, fill) for name, (fill, _) in _FILLS.items()}
         return Places(**columns)
 
     def relabelled(self, count: int) -> "Places":
@@ -91,9 +88,10 @@ class Places:
         return Places(**(columns | {name: np.full(rows, UNLABELLED) for name in ("labels", "cut_labels")}))
 
 
-def _realigned(column: np.ndarray, previous: np.ndarray, old: np.ndarray, fill: float | bool) -> np.ndarray:
+def realigned(column: np.ndarray, previous: np.ndarray, fill: float | bool) -> np.ndarray:
+    """A column on other rows: `previous` is the former row of each, -1 = new, which gets `fill`."""
     if not len(column):
         return np.full((len(previous), *column.shape[1:]), fill, dtype=column.dtype)
     after = column[np.maximum(previous, 0)]
-    after[~old] = fill
+    after[previous < 0] = fill
     return after
