@@ -22,8 +22,8 @@ from prior_sg.services.segmenter.core.experts import REGISTRY, Vote
 from prior_sg.services.segmenter.core.experts.contents import words_of_contents
 from prior_sg.services.segmenter.core.experts.context import Context, ObjectView, standardised
 from prior_sg.services.segmenter.core.map import inclination
-from prior_sg.services.segmenter.core.map.received import with_neighbours
-from prior_sg.services.segmenter.core.map.table import UNLABELLED, realigned
+from prior_sg.services.segmenter.core.map.received import realigned, with_neighbours
+from prior_sg.services.segmenter.core.map.table import UNLABELLED
 from prior_sg.services.segmenter.core.regions.contents import held_around
 from prior_sg.services.segmenter.core.state import State
 

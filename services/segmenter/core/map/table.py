@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from prior_sg.schemas.regions import NO_REGION
-from prior_sg.services.segmenter.core.map.received import Step
+from prior_sg.services.segmenter.core.map.received import Step, realigned
 
 UNLABELLED = -1
 
@@ -86,12 +86,3 @@ class Places:
         columns |= {name: np.zeros((rows, count), _FILLS[name][1]) for name in _PER_LABEL}
         columns |= {name: np.ones(rows, dtype=bool) for name in _AFTER_A_SWITCH}
         return Places(**(columns | {name: np.full(rows, UNLABELLED) for name in ("labels", "cut_labels")}))
-
-
-def realigned(column: np.ndarray, previous: np.ndarray, fill: float | bool) -> np.ndarray:
-    """A column on other rows: `previous` is the former row of each, -1 = new, which gets `fill`."""
-    if not len(column):
-        return np.full((len(previous), *column.shape[1:]), fill, dtype=column.dtype)
-    after = column[np.maximum(previous, 0)]
-    after[previous < 0] = fill
-    return after
