@@ -265,6 +265,32 @@ def test_regions_found_around_what_changed_are_those_of_the_whole_map(seed):
     assert storeys_met == {1, 2}
 
 
+def test_a_storey_found_elsewhere_tears_a_region_that_nothing_touched():
+    """A house with a loft, too small to be a storey of its own until the house far away turns out to have one."""
+    positions, edges = place_grid(2)
+    far, up, count = np.array((100, 0, 0), np.float32), np.array((0, 0, 3), np.float32), len(positions)
+    loft = positions[:10] + up
+    house = np.concatenate((positions, loft))
+    inside = np.concatenate((edges, edges[(edges < 10).all(axis=1)] + count, [(0, count)]))
+    held, regions = PlaceMap(), RegionMap()
+    both = np.concatenate((house, positions + far)), np.concatenate((inside, edges + len(house)))
+    upstairs = np.arange(count) + len(both[0])
+    late = place_delta(
+        positions + far + up,
+        np.concatenate((edges + len(both[0]), [(len(house), upstairs[0])])),
+        place_ids=upstairs,
+        revision=1,
+    )
+    found = []
+    for delta in (place_delta(*both), late):
+        regions.follow(held.advance(delta, Config()), held)
+        held.places.slots, held.places.labels = np.arange(len(held.graph.ids)), np.zeros(len(held.graph.ids), np.int64)
+        regions.partition(held, ["hall"], StoreyConfig(least_m2=20.0, part_m2=2.0))
+        regions.describe({region: SimpleNamespace(label="hall") for region in np.unique(held.places.regions).tolist()})
+        found.append(len(np.unique(held.places.regions[: len(house)])))
+    assert found == [1, 2]
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_rows_put_in_block_by_block_are_those_of_numpy(seed):
     rng = np.random.default_rng(seed)
