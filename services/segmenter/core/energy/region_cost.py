@@ -15,6 +15,8 @@ from prior_sg.services.compiled import compiled
 from prior_sg.services.segmenter.core.energy.mrf import Field
 from prior_sg.services.segmenter.core.map.arcs import Arcs, arcs_of, spread
 
+MOST_CHANGED = 0.1  # of the places; with more, to go over former passes again takes longer than to begin anew
+
 
 def consolidated(field: Field, labels: np.ndarray, cost: float) -> np.ndarray:
     """Labels (place,) in which no region gains less than `cost` by its own label against its best neighbour's.
@@ -44,12 +46,14 @@ def passes(
     if cost <= 0 or not len(field.edges):
         return [labels.copy()]
     near = arcs_of(len(labels), field.edges, field.weights) if ties is None else ties
-    given = np.arange(len(labels)) if changed is None or not former else changed
-    rows = given if not former else np.union1d(given, np.flatnonzero(labels != former[0]))
+    if changed is None or not former or len(changed) > MOST_CHANGED * len(labels):
+        rows, former = np.arange(len(labels)), ()
+    else:
+        rows = np.union1d(changed, np.flatnonzero(labels != former[0]))
     after, region_of = [labels.copy(), *former[1:]], np.full(len(labels), -1)
     for number in range(1, len(after)):
         differs = _pass(after[number - 1], rows, near, region_of, field, cost, after[number])
-        rows = np.union1d(given, differs)
+        rows = np.union1d(changed, differs)
     while len(rows):  # the last pass changed nothing but there
         after.append(after[-1].copy())
         rows = _pass(after[-2], rows, near, region_of, field, cost, after[-1])
@@ -66,11 +70,12 @@ def _pass(labels, rows, near, region_of, field, cost, after):  # noqa: ANN001, A
     Weighed are the regions that hold any of `rows`, those that touch these, and on from these and from whatever gains
     too little, all that it touches: who gives way may keep its neighbour from it.
     """
+    starts, neighbours = near.starts, near.neighbours
     members, count = np.empty(len(labels), np.int64), 0  # of region after region; its number is where it begins
     for row in rows:
-        count = spread(row, labels, near, region_of, members, count)
+        count = spread(row, labels, starts, neighbours, region_of, members, count)
     for index in range(count):
-        count = _touched(members[index], labels, near, region_of, members, count)
+        count = _touched(members[index], labels, starts, neighbours, region_of, members, count)
     certain, begin = count, 0
     gains, best, given = np.empty(len(labels)), np.empty(len(labels), np.int64), np.empty(len(labels), np.int64)
     settled = np.zeros(len(labels), np.bool_)
@@ -87,7 +92,7 @@ def _pass(labels, rows, near, region_of, field, cost, after):  # noqa: ANN001, A
             poor.append(begin)
         if begin < certain or gains[begin] < cost:
             for place in inside:
-                count = _touched(place, labels, near, region_of, members, count)
+                count = _touched(place, labels, starts, neighbours, region_of, members, count)
         begin = end
     _give(np.array(poor, np.int64), gains, best, given, settled, members[:count], labels, near, region_of)
     differs, found = np.empty(count, np.int64), 0
@@ -101,10 +106,10 @@ def _pass(labels, rows, near, region_of, field, cost, after):  # noqa: ANN001, A
 
 
 @compiled()
-def _touched(place, labels, near, region_of, members, count):  # noqa: ANN001, ANN202, PLR0917
+def _touched(place, labels, starts, neighbours, region_of, members, count):  # noqa: ANN001, ANN202, PLR0917
     """`spread` from all neighbours of a place."""
-    for arc in range(near.starts[place], near.starts[place + 1]):
-        count = spread(near.neighbours[arc], labels, near, region_of, members, count)
+    for arc in range(starts[place], starts[place + 1]):
+        count = spread(neighbours[arc], labels, starts, neighbours, region_of, members, count)
     return count
 
 
@@ -114,21 +119,24 @@ def _gain(inside, labels, near, field):  # noqa: ANN001, ANN202
 
     Sums run in the order of places and edges: they are the same wherever the search for regions began.
     """
-    own = labels[inside[0]]
-    costs, beside = np.zeros(field.unary.shape[1]), np.zeros(field.unary.shape[1], np.bool_)
-    edges, others = [np.int64(0) for _ in range(0)], [np.int64(0) for _ in range(0)]
+    own, starts, neighbours, numbers = labels[inside[0]], near.starts, near.neighbours, near.edges
+    unary, weights, pairwise = field.unary, field.weights, field.pairwise
+    costs, beside = np.zeros(unary.shape[1]), np.zeros(unary.shape[1], np.bool_)
+    arcs, count = 0, 0
+    for place in inside:
+        arcs += starts[place + 1] - starts[place]
+    across, others = np.empty(arcs, np.int64), np.empty(arcs, np.int64)
     for place in inside:
         for label in range(len(costs)):
-            costs[label] += field.unary[place, label]
-        for arc in range(near.starts[place], near.starts[place + 1]):
-            if labels[near.neighbours[arc]] != own:
-                edges.append(np.int64(near.edges[arc]))
-                others.append(labels[near.neighbours[arc]])
-    across = np.array(edges, np.int64)
-    for at in np.argsort(across):
+            costs[label] += unary[place, label]
+        for arc in range(starts[place], starts[place + 1]):
+            if labels[neighbours[arc]] != own:
+                across[count], others[count] = numbers[arc], labels[neighbours[arc]]
+                count += 1
+    for at in np.argsort(across[:count]):
         beside[others[at]] = True
         for label in range(len(costs)):
-            costs[label] += field.weights[across[at]] * field.pairwise[label, others[at]]
+            costs[label] += weights[across[at]] * pairwise[label, others[at]]
     gain, best = np.inf, own
     for label in range(len(costs)):
         if beside[label] and costs[label] - costs[own] < gain:
@@ -139,17 +147,18 @@ def _gain(inside, labels, near, field):  # noqa: ANN001, ANN202
 @compiled()
 def _give(poor, gains, best, given, settled, members, labels, near, region_of):  # noqa: ANN001, ANN202, PLR0917
     """Give away the regions `poor`, least gain first and of equals that with the first place, none beside another."""
+    starts, neighbours = near.starts, near.neighbours
     order = poor[np.argsort(members[poor])]
     for region in order[np.argsort(gains[order], kind="mergesort")]:
         free, index = not settled[region], region
         while index < len(members) and region_of[members[index]] == region:
-            for arc in range(near.starts[members[index]], near.starts[members[index] + 1]):
-                other = near.neighbours[arc]
+            for arc in range(starts[members[index]], starts[members[index] + 1]):
+                other = neighbours[arc]
                 free = free and (region_of[other] == region or given[region_of[other]] == labels[other])
             index += 1
         if not free:
             continue
         given[region] = best[region]
         for place in members[region:index]:
-            for arc in range(near.starts[place], near.starts[place + 1]):
-                settled[region_of[near.neighbours[arc]]] = True
+            for arc in range(starts[place], starts[place + 1]):
+                settled[region_of[neighbours[arc]]] = True

@@ -139,7 +139,7 @@ def ball(centers, reach, starts, neighbours, inside):  # noqa: ANN001, ANN201
 
 
 @compiled()
-def spread(row, labels, near, number_of, members, count):  # noqa: ANN001, ANN201, PLR0917
+def spread(row, labels, starts, neighbours, number_of, members, count):  # noqa: ANN001, ANN201, PLR0917
     """Number all places that chains of places with the label of `row` join to it, unless it has a number already.
 
     They are put into `members` from `count` on, which is also their number; returns how many are there now. `number_of`
@@ -152,8 +152,8 @@ def spread(row, labels, near, number_of, members, count):  # noqa: ANN001, ANN20
     count += 1
     while index < count:
         place = members[index]
-        for arc in range(near.starts[place], near.starts[place + 1]):
-            other = near.neighbours[arc]
+        for arc in range(starts[place], starts[place + 1]):
+            other = neighbours[arc]
             if number_of[other] < 0 and labels[other] == labels[place]:
                 number_of[other], members[count] = number, other
                 count += 1
@@ -165,19 +165,20 @@ def spread(row, labels, near, number_of, members, count):  # noqa: ANN001, ANN20
 def joined(labels, near, rows):  # noqa: ANN001, ANN201
     """Places (n,), ascending, that chains of places with one label join to any of `rows` or of their neighbours, and
     the edges (m, 2) between those of one label, as numbers into them."""
+    starts, neighbours = near.starts, near.neighbours
     number_of, members, count = np.full(len(labels), -1), np.empty(len(labels), np.int64), 0
     for row in rows:
-        count = spread(row, labels, near, number_of, members, count)
-        for arc in range(near.starts[row], near.starts[row + 1]):
-            count = spread(near.neighbours[arc], labels, near, number_of, members, count)
+        count = spread(row, labels, starts, neighbours, number_of, members, count)
+        for arc in range(starts[row], starts[row + 1]):
+            count = spread(neighbours[arc], labels, starts, neighbours, number_of, members, count)
     places, arcs = np.sort(members[:count]), 0
     for number in range(count):
         number_of[places[number]] = number
-        arcs += near.starts[places[number] + 1] - near.starts[places[number]]
+        arcs += starts[places[number] + 1] - starts[places[number]]
     edges, found = np.empty((arcs, 2), np.int64), 0
     for number in range(count):
-        for arc in range(near.starts[places[number]], near.starts[places[number] + 1]):
-            other = near.neighbours[arc]
+        for arc in range(starts[places[number]], starts[places[number] + 1]):
+            other = neighbours[arc]
             if other > places[number] and labels[other] == labels[places[number]]:
                 edges[found, 0], edges[found, 1] = number, number_of[other]
                 found += 1
