@@ -46,14 +46,15 @@ def passes(
     if cost <= 0 or not len(field.edges):
         return [labels.copy()]
     near = arcs_of(len(labels), field.edges, field.weights) if ties is None else ties
-    if changed is None or not former or len(changed) > MOST_CHANGED * len(labels):
-        rows, former = np.arange(len(labels)), ()
+    given = np.arange(len(labels)) if changed is None else changed
+    if former and len(given) <= MOST_CHANGED * len(labels):
+        rows = np.union1d(given, np.flatnonzero(labels != former[0]))
     else:
-        rows = np.union1d(changed, np.flatnonzero(labels != former[0]))
+        rows, former = np.arange(len(labels)), ()
     after, region_of = [labels.copy(), *former[1:]], np.full(len(labels), -1)
     for number in range(1, len(after)):
         differs = _pass(after[number - 1], rows, near, region_of, field, cost, after[number])
-        rows = np.union1d(changed, differs)
+        rows = np.union1d(given, differs)
     while len(rows):  # the last pass changed nothing but there
         after.append(after[-1].copy())
         rows = _pass(after[-2], rows, near, region_of, field, cost, after[-1])
@@ -89,7 +90,7 @@ def _pass(labels, rows, near, region_of, field, cost, after):  # noqa: ANN001, A
         given[begin] = labels[inside[0]]
         gains[begin], best[begin] = _gain(inside, labels, near, field)
         if gains[begin] < cost:
-            poor.append(begin)
+            poor.append(np.int64(begin))
         if begin < certain or gains[begin] < cost:
             for place in inside:
                 count = _touched(place, labels, starts, neighbours, region_of, members, count)

@@ -42,7 +42,8 @@ class Held(NamedTuple):
     def without(self, ids: np.ndarray) -> "Held":
         """Those of other regions."""
         stays, leads = ~np.isin(self.ids, ids), ~np.isin(self.contacts[:, 0], ids)
-        return Held(*(column[stays] for column in self[:3]), self.contacts[leads], self.ways[leads])
+        kept = self.ids[stays], self.beliefs[stays], self.ground_m2[stays]
+        return Held(*kept, self.contacts[leads], self.ways[leads])
 
     def joined(self, other: "Held") -> "Held":
         """Those of both, which have no region in common."""
