@@ -108,7 +108,9 @@ def _pass(labels, rows, near, region_of, field, cost, after):  # noqa: ANN001, A
 
 @compiled()
 def _touched(place, labels, starts, neighbours, region_of, members, count):  # noqa: ANN001, ANN202, PLR0917
-    """`spread` from all neighbours of a place."""
+    """`spread` from all neighbours of a place, unless every place of the map has a number."""
+    if count == len(members):
+        return count
     for arc in range(starts[place], starts[place + 1]):
         count = spread(neighbours[arc], labels, starts, neighbours, region_of, members, count)
     return count
