@@ -1,5 +1,6 @@
 """Parts of a scene (pure)."""
 
+import itertools
 from collections.abc import Sequence
 
 import msgspec
@@ -7,6 +8,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from prior_sg.schemas.levels import LevelNode, nodes_above
+from prior_sg.schemas.markers import SceneMarker
 from prior_sg.schemas.objects import SceneObject
 from prior_sg.schemas.scene import Scene
 
@@ -48,15 +50,16 @@ def floors_of(scene: Scene) -> list[LevelNode]:
 
 
 def storey_of(scene: Scene, floor: int) -> Scene:
-    """What is on one floor, by the id of its node: its regions with their places, and the objects, the openings and the
-    keyframes nearest to these. All levels stay that hold any of the regions. A floor that is not there holds nothing.
+    """What is on one floor, by the id of its node: its regions with their places, and the objects, the markers, the
+    openings and the keyframes nearest to these. All levels stay that hold any of the regions. A floor that is not there
+    holds nothing.
     """
     above = nodes_above(scene.nodes)
     on_it = {number for number, nodes in above.items() if ("floor", floor) in {(one.level, one.id) for one in nodes}}
     holding = {(node.level, node.id) for number in on_it for node in above[number]}
     kept = np.isin(scene.place_regions, sorted(on_it))
-    nearest = _nearest(scene, kept, spots_of(scene.objects))
-    part = part_of(scene, kept, [item for item, on in zip(scene.objects, nearest, strict=True) if on])
+    objects, markers = (_nearest(scene, kept, spots_of(items)).tolist() for items in (scene.objects, scene.markers))
+    part = part_of(scene, kept, list(itertools.compress(scene.objects, objects)))
     openings = [one for one in scene.foresight.openings if one.place_id in part.place_ids]
     return msgspec.structs.replace(
         part,
@@ -64,12 +67,13 @@ def storey_of(scene: Scene, floor: int) -> Scene:
         nodes=[node for node in scene.nodes if (node.level, node.id) in holding],
         trajectory=scene.trajectory[_nearest(scene, kept, scene.trajectory)],
         foresight=msgspec.structs.replace(scene.foresight, openings=openings),
+        markers=list(itertools.compress(scene.markers, markers)),
     )
 
 
-def spots_of(objects: Sequence[SceneObject]) -> np.ndarray:
-    """Positions (object, 3) of objects, in their own frame."""
-    return np.array([item.position_m for item in objects], float).reshape(-1, 3)
+def spots_of(items: Sequence[SceneObject | SceneMarker]) -> np.ndarray:
+    """Positions (item, 3) of objects or markers, in their own frame."""
+    return np.array([item.position_m for item in items], float).reshape(-1, 3)
 
 
 def _nearest(scene: Scene, kept: np.ndarray, spots_m: np.ndarray) -> np.ndarray:

@@ -4,6 +4,8 @@ Names, tasks, paths and notes come from users, models, files and other robots. N
 can move the cursor, colour or turn what others read. Styles are given beside the text (`line`), never inside it.
 """
 
+import io
+import os
 import sys
 from typing import Any
 
@@ -66,6 +68,20 @@ def forgive() -> None:
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="replace")
+
+
+def keep_apart() -> None:
+    """What libraries write past Python, as Zenoh does its errors, goes to standard error from now on, so that nothing
+    but results is on standard output. Where `sys.stdout` is something else than the process's, nothing changes."""
+    stream, errors = sys.stdout, sys.__stderr__
+    if not isinstance(stream, io.TextIOWrapper) or stream is not sys.__stdout__ or errors is None:
+        return
+    stream.flush()
+    file = os.fdopen(os.dup(stream.fileno()), "wb", 0 if isinstance(stream.buffer, io.RawIOBase) else -1)
+    os.dup2(errors.fileno(), stream.fileno())
+    sys.stdout = io.TextIOWrapper(
+        file, stream.encoding, stream.errors, line_buffering=stream.line_buffering, write_through=stream.write_through
+    )
 
 
 def _plain(text: Any) -> Any:

@@ -51,6 +51,7 @@ class PlaceDelta(Message, frozen=True, kw_only=True):
     hull_counts: Annotated[np.ndarray, Shape("int64", "surface")] = _NO_IDS
     hulls_m: Annotated[np.ndarray, Shape("float32", "hull", 2)] = _NO_CORNERS
     origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of the world, as in Keyframe
+    merged_of: list[str] = []  # robots whose maps it is merged of; empty = it is a robot's own
 
     def check(self) -> None:
         if (self.hull_counts < 0).any() or self.hull_counts.sum() != len(self.hulls_m):

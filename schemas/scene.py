@@ -108,6 +108,12 @@ class Scene(Message, frozen=True, kw_only=True):
     nodes: list[LevelNode] = []  # of the levels above regions, from below, by id
     foresight: Foresight = Foresight()  # what is expected beyond: predictions, none of which has been seen
     markers: list[SceneMarker] = []  # by dictionary and id
+    merged_of: list[str] = []  # robots whose maps it is merged of, as in PlaceDelta; empty = it is a robot's own
+
+    @property
+    def plain(self) -> str:
+        """The environment whose regions these are where no task has said which; empty where there are none."""
+        return self.environment if self.regions else ""
 
     def unnumbered(self) -> "Scene":
         """The same without its revision, which counts what a store has applied: of one and the same scene it is another

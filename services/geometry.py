@@ -52,6 +52,13 @@ def rotation_angle_rad(b_from_a: np.ndarray) -> float:
     return float(np.arccos(np.clip((np.trace(b_from_a[:3, :3]) - 1) / 2, -1.0, 1.0)))
 
 
+def rows_before(world_from_sheet: np.ndarray, points_world: np.ndarray) -> np.ndarray:
+    """Rows (n,) of the points (point, 3) in front of a sheet (4, 4), out of which its z axis points; all where there
+    are none. Nobody sees it from behind, and what is nearest may lie behind the wall that it hangs on."""
+    before = (points_world - world_from_sheet[:3, 3]) @ world_from_sheet[:3, 2] > 0
+    return np.flatnonzero(before) if before.any() else np.arange(len(points_world))
+
+
 def project(points_camera: np.ndarray, camera: Intrinsics) -> tuple[np.ndarray, np.ndarray]:
     """Pixels (n, 2) and depths (n,) of points (n, 3); pixels of points with depth <= 0 are not meaningful."""
     depths_m = points_camera[:, 2]

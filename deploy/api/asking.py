@@ -11,36 +11,41 @@ import numpy as np
 from prior_sg.deploy.api.errors import NotInSceneError
 from prior_sg.deploy.api.spots import spot_in
 from prior_sg.deploy.api.vectors import RecentVectors
+from prior_sg.schemas.answers import (
+    Answer,
+    Details,
+    MarkerInRegion,
+    Neighbour,
+    NodeWithRegions,
+    Outlook,
+    Point,
+    RegionBeliefs,
+    Route,
+    Thing,
+    What,
+)
 from prior_sg.schemas.foresight import MissingLabel
 from prior_sg.schemas.levels import LevelName
+from prior_sg.schemas.markers import SceneMarker
 from prior_sg.schemas.objects import SceneObject
 from prior_sg.schemas.priors import Prior
 from prior_sg.schemas.queries import (
     MOST_LISTED,
     MOST_RANKED,
-    Answer,
     AnswersTo,
     BeliefsOf,
     ById,
     ByLabel,
-    Details,
     InBox,
     InRadius,
+    MarkersOf,
     Nearest,
-    Neighbour,
     NeighboursOf,
     NodesOf,
-    NodeWithRegions,
     ObjectsInRegions,
-    Outlook,
-    Point,
     Question,
-    RegionBeliefs,
-    Route,
     RouteBetween,
     Spot,
-    Thing,
-    What,
     WhatIsMissing,
     WhereToLook,
     WordsInUse,
@@ -50,7 +55,7 @@ from prior_sg.services.errors import PriorSgError
 
 NO_PRIOR = "the prior of this scene is not at hand, so labels were compared with the text by their names alone"
 PointLike = Sequence[float] | np.ndarray[Any, Any]
-SpotLike = str | Spot | Thing | Region | SceneObject | PointLike
+SpotLike = str | Spot | Thing | Region | SceneObject | SceneMarker | PointLike
 
 
 class Asking(ABC):
@@ -124,8 +129,9 @@ class Asking(ABC):
 
     def route(self, start: SpotLike, goal: SpotLike, clearance_m: float = 0.0) -> Route:
         """The shortest way on which nothing is closer than `clearance_m`. Both ends are a point, a Thing, a Region, a
-        SceneObject, a Spot, or text: a label, "here" (where the camera was last), "region:7", "1.0,2.0,0.5". `found`
-        says whether there is one, and `reason` why not. Raises ValueError where an end is none of these.
+        SceneObject, a SceneMarker, a Spot, or text: a label, "here" (where the camera was last), "region:7",
+        "marker:7", "1.0,2.0,0.5". `found` says whether there is one, and `reason` why not. Raises ValueError where an
+        end is none of these.
         """
         route: Route
         (route,) = self.ask(RouteBetween(start=_spot(start), goal=_spot(goal), clearance_m=clearance_m))  # type: ignore[assignment]
@@ -144,6 +150,15 @@ class Asking(ABC):
         within its level, or those that hold a region."""
         question = NodesOf(level=level, label=label, id=number, region=region, limit=limit)
         found: list[NodeWithRegions] = self._understood(question).nodes
+        return found
+
+    def markers(
+        self, number: int | None = None, dictionary: str = "", limit: int = MOST_LISTED
+    ) -> list[MarkerInRegion]:
+        """Where printed markers are, each with the region that it hangs in, by dictionary and number: all, or those of
+        a number. Of one with a `doubt` nothing may be concluded."""
+        question = MarkersOf(id=number, dictionary=dictionary, limit=limit)
+        found: list[MarkerInRegion] = self._understood(question).markers
         return found
 
     def where_to_look(
@@ -171,12 +186,14 @@ class Asking(ABC):
         right as not. Without `what`, regions, objects, and the best place of each region.
 
         Where no embedding of the text can be had, labels are compared with it word by word; where the scene's prior is
-        not at hand, by their names alone. A warning says so.
+        not at hand, by their names alone. A warning says so, and why nothing answers.
         """
         regions, objects, missing = self.likeness(text)
         question = AnswersTo(text=text, regions=regions, objects=objects, what=what, limit=limit)
         ranking: Any
         (ranking,) = self.ask(question)
+        if ranking.reason:
+            warnings.warn(ranking.reason, stacklevel=2)
         if missing:
             warnings.warn(f"{ranking.note}: {missing}" if ranking.note else missing, stacklevel=2)
         return list(ranking.things)
@@ -227,6 +244,8 @@ def _spot(value: SpotLike) -> Spot:
             return Spot(what="region", id=value.id)
         case SceneObject():
             return Spot(what="object", id=value.id)
+        case SceneMarker():
+            return Spot(what="marker", id=value.id)
         case _:
             return Spot(point_m=_point(value))
 

@@ -17,21 +17,14 @@ from prior_sg.deploy.api.errors import NotInSceneError, PosesError, TaskError
 from prior_sg.deploy.api.kept import kept
 from prior_sg.deploy.api.scene import Scene
 from prior_sg.deploy.settings import DEFAULT_CONNECT, DEFAULT_ROBOT, ROUTER_WAIT_S
+from prior_sg.schemas.answers import Answer, Difference
 from prior_sg.schemas.codec import DecodeError, Message
 from prior_sg.schemas.features import TextEmbeddings, TextRequest
 from prior_sg.schemas.frames import PoseUpdate
+from prior_sg.schemas.members import follows_robots, only_of_robots
 from prior_sg.schemas.objects import ObjectDelta
 from prior_sg.schemas.priors import Prior, PriorList, PriorRequest, Task
-from prior_sg.schemas.queries import (
-    Answer,
-    ChangedSince,
-    Difference,
-    Question,
-    SceneAnswer,
-    SceneQuery,
-    WordsInUse,
-    checked,
-)
+from prior_sg.schemas.queries import ChangedSince, Question, SceneAnswer, SceneQuery, WordsInUse, checked
 from prior_sg.schemas.regions import PosteriorReply, PosteriorRequest, RegionDelta
 from prior_sg.schemas.scene import HistoryRequest, RevisionList, SceneRequest, StoredRevision
 from prior_sg.schemas.scene import Scene as SceneMessage
@@ -189,6 +182,8 @@ class Client(Asking):
 
     def explain(self, place: int) -> PosteriorReply:
         """Why a place carries its label. Raises NotInSceneError, BusError."""
+        if robots := self._merged_of():
+            raise NotInSceneError(only_of_robots(self.robot, robots, "why a place carries its label"))
         reply: PosteriorReply = self._client.ask(POSTERIOR, PosteriorRequest(robot=self.robot, place_id=place))
         if not reply.found:
             raise NotInSceneError(f"{self.robot} has no labelled place {place}; Scene.places.ids lists them")
@@ -218,6 +213,8 @@ class Client(Asking):
         """
         before: Any
         (before,) = self.ask(WordsInUse())
+        if before.merged_of:
+            raise TaskError(follows_robots(self.robot, before.merged_of, "the task"))
         environment = environment or before.environment
         if not environment:
             raise TaskError(f"{self.robot} has no environment yet; name one (--environment) with the task")
@@ -261,6 +258,8 @@ class Client(Asking):
         the map has taken them; returns the seconds. Raises PosesError.
         """
         update = self._pose_update(poses)
+        if robots := self._merged_of():
+            raise PosesError(follows_robots(self.robot, robots, "the poses"))
         if "place_graph" not in self._client.alive().values():
             raise PosesError("no place_graph is running to take the poses; start it with `prior-sg up`")
         taken: queue.SimpleQueue[int] = queue.SimpleQueue()  # which of ours; the journal's history tells of older ones
@@ -280,6 +279,14 @@ class Client(Asking):
             except queue.Empty:
                 raise PosesError(f"the map took no poses within {timeout_s:.0f} s; see `prior-sg health`") from None
         return time.monotonic() - started_s
+
+    def _merged_of(self) -> list[str]:
+        """Whose maps this one is merged of; none where it is a robot's own, or no store says."""
+        if "scene_store" not in self._client.alive().values():
+            return []
+        words: Any
+        (words,) = self.ask(WordsInUse())
+        return list(words.merged_of)
 
     def _pose_update(self, poses: Mapping[int, np.ndarray[Any, Any]]) -> PoseUpdate:
         if not poses:

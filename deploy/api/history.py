@@ -16,6 +16,8 @@ from prior_sg.services.runtime.record import read_log
 from prior_sg.services.runtime.runner import Runner
 from prior_sg.services.runtime.service import Identity
 from prior_sg.services.scene_store.core import graph as core
+from prior_sg.services.scene_store.core import telling
+from prior_sg.services.scene_store.core.config import Config
 from prior_sg.services.scene_store.database import Database
 from prior_sg.services.scene_store.storage import is_url
 from prior_sg.services.scene_store.storage.tables import LAST, StoreError
@@ -60,7 +62,7 @@ class History:
         """The newest scene of a robot, that of one revision, or the newest at a time. Raises NotInSceneError."""
         with self._asking:
             graph = self.database.at(robot, revision, stamp_ns)
-            found = core.scene(core.Graph(robot) if graph is None else graph)
+            found = telling.scene(core.Graph(robot) if graph is None else graph)
         return kept(Scene(found), revision, stamp_ns)
 
 
@@ -74,7 +76,7 @@ def open_history(path_or_url: str | Path) -> History:
     if not is_url(place) and not Path(place).is_file():
         raise StoreError(f"{place} does not exist or is no file; name the scene.sqlite or log.mcap of a run")
     try:
-        return History(Database(core.Config(path=place), read_only=True))
+        return History(Database(Config(path=place), read_only=True))
     except ValueError as error:
         raise StoreError(str(error)) from error
 

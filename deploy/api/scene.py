@@ -15,8 +15,9 @@ from prior_sg.deploy.api.asking import Asking
 from prior_sg.deploy.api.errors import NotInSceneError, PackageMissingError, SaveError
 from prior_sg.deploy.json_text import json_text
 from prior_sg.deploy.settings import DEFAULT_ROBOT
+from prior_sg.schemas.answers import Answer, Difference
 from prior_sg.schemas.priors import Prior
-from prior_sg.schemas.queries import Answer, Difference, Question, checked
+from prior_sg.schemas.queries import Question, checked
 from prior_sg.schemas.regions import NO_REGION, Region
 from prior_sg.schemas.scene import Scene as SceneMessage
 

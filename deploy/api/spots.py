@@ -2,10 +2,15 @@
 
 from typing import get_args
 
-from prior_sg.schemas.queries import Spot, What
+from prior_sg.schemas.answers import What
+from prior_sg.schemas.queries import Spot
 
 HERE = "here"
-ENDS = "a label; or `here`, where the camera was last; or `place:ID`, `region:ID`, `object:ID`; or a point `X,Y,Z`"
+KINDS = (*get_args(What), "marker")
+ENDS = (
+    "a label; or `here`, where the camera was last; or `place:ID`, `region:ID`, `object:ID`, `marker:NUMBER`; or a "
+    "point `X,Y,Z`"
+)
 MOST_DIGITS = 18
 FARTHEST_M = 1e9
 
@@ -15,7 +20,7 @@ def spot_in(text: str) -> Spot:
     if text == HERE:
         return Spot(here=True)
     kind, _, number = text.partition(":")
-    if kind in get_args(What) and number.isascii() and number.isdigit() and len(number) <= MOST_DIGITS:
+    if kind in KINDS and number.isascii() and number.isdigit() and len(number) <= MOST_DIGITS:
         return Spot(what=kind, id=int(number))  # type: ignore[arg-type]
     point = _numbers(text)
     if len(point) == 3 and all(abs(value) <= FARTHEST_M for value in point):

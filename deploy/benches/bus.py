@@ -132,6 +132,7 @@ def _write(put: Callable[[int], None], number: int, pipe: Connection) -> float:
 
 def _read(endpoint: str, number: int, typed: bool, pipe: Connection) -> None:
     """In the reader's process."""
+    reader: ZenohBus | zenoh.Session
     arrivals_s: list[float] = []
     first, last = threading.Event(), threading.Event()
 
@@ -142,11 +143,11 @@ def _read(endpoint: str, number: int, typed: bool, pipe: Connection) -> None:
             last.set()
 
     if typed:
-        bus = ZenohBus(endpoint)
-        bus.subscribe(KEYFRAME, KEYFRAME.pattern("bench"), lambda sample: handle(_decoded(sample)), lambda *_: None)
+        reader = ZenohBus(endpoint)
+        reader.subscribe(KEYFRAME, KEYFRAME.pattern("bench"), lambda sample: handle(_decoded(sample)), lambda *_: None)
     else:
-        session = zenoh.open(client_config(endpoint))
-        session.declare_subscriber(BARE_KEY, lambda sample: handle(sample.payload.to_bytes()))
+        reader = zenoh.open(client_config(endpoint))
+        reader.declare_subscriber(BARE_KEY, lambda sample: handle(sample.payload.to_bytes()))
     time.sleep(0.5)  # until the router has told the writers
     pipe.send(None)
     first.wait(TIMEOUT_S)
@@ -156,6 +157,7 @@ def _read(endpoint: str, number: int, typed: bool, pipe: Connection) -> None:
     read_s = time.process_time() - began_s
     pipe.send(None)
     pipe.recv()
+    reader.close()
     pipe.send(((len(arrivals_s) - 1) / (arrivals_s[-1] - arrivals_s[0]), read_s))
 
 

@@ -23,6 +23,8 @@ from prior_sg.services.registry import BY_NAME
 from prior_sg.services.runtime.runner import Runner
 from prior_sg.services.runtime.service import Identity
 from prior_sg.services.scene_store.core import graph as core
+from prior_sg.services.scene_store.core import telling
+from prior_sg.services.scene_store.core.config import Config
 from prior_sg.services.scene_store.database import Database
 from prior_sg.services.scene_store.storage.tables import StoreError
 
@@ -47,14 +49,14 @@ class Found:
         self.points += 1
         self.kinds[kind] += 1
         try:
-            database = Database(core.Config(path=str(path), synchronous="normal"))
+            database = Database(Config(path=str(path), synchronous="normal"))
         except StoreError:
             self.refused += 1
             return
         with contextlib.closing(database):
             graph = database.graphs().get(ROBOT, core.Graph(ROBOT))
             self.lost += max(acknowledged - graph.revision, 0)
-            self.wrong += encode(core.scene(graph)) != told.get(graph.revision)
+            self.wrong += encode(telling.scene(graph)) != told.get(graph.revision)
 
 
 def crashes(points: int = POINTS, kills: int = KILLS, seed: int = 0) -> tuple[dict, dict]:
@@ -83,13 +85,13 @@ def writes(rng: np.random.Generator) -> Iterator[Message]:
 def torn_files(folder: Path, points: int, rng: np.random.Generator) -> Found:
     """Crash points of a store in this process, `PER_WRITE` in each of its writes."""
     path, found = folder / "scene.sqlite", Found()
-    cfg = core.Config(path=str(path), checkpoint_pages=100, history="last", history_last=200)
-    told = {-1: encode(core.scene(core.Graph(ROBOT)))}
+    cfg = Config(path=str(path), checkpoint_pages=100, history="last", history_last=200)
+    told = {-1: encode(telling.scene(core.Graph(ROBOT)))}
     with Runner(BY_NAME["scene_store"], cfg, IDENTITY) as runner:
         before, acknowledged = _files(path), -1
         for message in writes(rng):
             runner.feed(message)
-            scene = core.scene(runner.state.robots[ROBOT].graph)
+            scene = telling.scene(runner.state.robots[ROBOT].graph)
             told[scene.revision] = encode(scene)
             after = _files(path)
             for _ in range(min(PER_WRITE, points - found.points)):
@@ -178,7 +180,7 @@ def _killed(path: Path, seed: int, after_s: float) -> int:
 def _write_until_killed(path: Path, seed: int, writing: int) -> None:
     """One revision after the other, each acknowledged with eight bytes; never returns."""
     try:
-        cfg = core.Config(path=str(path), synchronous="normal", checkpoint_pages=100)
+        cfg = Config(path=str(path), synchronous="normal", checkpoint_pages=100)
         runner = Runner(BY_NAME["scene_store"], cfg, IDENTITY)
         for message in writes(np.random.default_rng(seed)):
             for _ in runner.feed(message):
@@ -190,10 +192,10 @@ def _write_until_killed(path: Path, seed: int, writing: int) -> None:
 def _told(seed: int, limit: int) -> dict[int, bytes]:
     """What the scene is at the last revisions of such a writer."""
     told = {}
-    with Runner(BY_NAME["scene_store"], core.Config(path=":memory:"), IDENTITY) as runner:
+    with Runner(BY_NAME["scene_store"], Config(path=":memory:"), IDENTITY) as runner:
         for message in writes(np.random.default_rng(seed)):
             if runner.feed(message):
-                scene = core.scene(runner.state.robots[ROBOT].graph)
+                scene = telling.scene(runner.state.robots[ROBOT].graph)
                 told[scene.revision] = encode(scene)
                 if scene.revision >= limit:
                     return told

@@ -116,17 +116,8 @@ class World:
         return priors
 
     def errors(self, prior: Prior) -> dict[str, float]:
-        """Mean absolute errors of the entries; of adjacency those between different regions that met."""
-        met = np.isfinite(self.adjacency) & ~np.eye(len(REGIONS), dtype=bool)
-        gross = np.abs(self.prior.containment - self.truth.containment) >= GROSS
-        held = np.abs(prior.containment - self.truth.containment)
-        ours, theirs = ([region.existence for region in one.regions] for one in (prior, self.truth))
-        return {
-            "containment_error": float(held.mean()),
-            "containment_error_gross": float(held[gross].mean()),
-            "adjacency_error": float(np.abs(prior.adjacency - self.adjacency)[met].mean()),
-            "existence_error": float(np.abs(np.subtract(ours, theirs)).mean()),
-        }
+        """Of a prior's entries, see `errors`."""
+        return errors(prior, self.prior, self.truth, self.adjacency)
 
     def f1(self, prior: Prior) -> float:
         """Mean F1_S of the test homes."""
@@ -135,6 +126,21 @@ class World:
             label(state, home, prior)
             scores.append(f1_s(home.truth, state))
         return statistics.mean(scores)
+
+
+def errors(prior: Prior, in_hand: Prior, truth: Prior, adjacency: np.ndarray) -> dict[str, float]:
+    """Mean absolute errors of a prior's entries; of adjacency (region, region), NaN = never met, those between
+    different regions; of containment as well those by which the prior in hand is wrong by GROSS, if there are any."""
+    met = np.isfinite(adjacency) & ~np.eye(len(adjacency), dtype=bool)
+    gross = np.abs(in_hand.containment - truth.containment) >= GROSS
+    held = np.abs(prior.containment - truth.containment)
+    ours, theirs = ([region.existence for region in one.regions] for one in (prior, truth))
+    found = {
+        "containment_error": float(held.mean()),
+        "adjacency_error": float(np.abs(prior.adjacency - adjacency)[met].mean()),
+        "existence_error": float(np.abs(np.subtract(ours, theirs)).mean()),
+    }
+    return found | ({"containment_error_gross": float(held[gross].mean())} if gross.any() else {})
 
 
 def explore(home: Home) -> State:

@@ -20,6 +20,7 @@ from prior_sg.deploy.benches.homes import Sight, exchanged
 from prior_sg.deploy.benches.learning import EXPLORED, LEARNING, MOST_TICKS
 from prior_sg.deploy.evaluation import oracles
 from prior_sg.deploy.evaluation.datasets import Dataset, WorldName, of_world
+from prior_sg.deploy.evaluation.errors import EvaluationError
 from prior_sg.deploy.evaluation.methods import labelling, put_in_force, scene_of
 from prior_sg.deploy.evaluation.metrics import evaluate
 from prior_sg.deploy.evaluation.perception import CACHE, Perception, simulated_perception
@@ -36,9 +37,10 @@ from prior_sg.services.segmenter.core.inference import see_objects
 
 TASK = "find the way around"
 SIGHT = Sight(lookalike=0.0, detected=0.8, mistaken=0.15)  # of the detector; looks are the encoder's
-EXPLORED_SEEDS, TESTED_SEEDS = range(60, 70), range(70, 76)
+SEEDS = tuple(range(60, 70)), tuple(range(70, 76))  # of the worlds to explore, of those to test
 ENCODER = "simlike:0.4"  # most like a real encoder, see `simulated`
 HANDS = {"": True, "_right": False}  # by the suffix of their figures: whether the prior in hand is half wrong
+LEAST_TESTED = 2  # for a standard error
 CFG = Config(evidence_ticks=0)
 
 Say = Callable[[str], None]
@@ -56,7 +58,7 @@ class SeenWorld:
 def learning_worlds_bench(
     kind: str,
     say: Say,
-    seeds: tuple[Sequence[int], Sequence[int]] = (EXPLORED_SEEDS, TESTED_SEEDS),
+    seeds: tuple[Sequence[int], Sequence[int]] = SEEDS,
     encoder: str = ENCODER,
     folder: Path = CACHE,
 ) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -78,8 +80,19 @@ def learning_worlds_bench(
         scores = {n: f1_s(tested, priors[n]) for n in EXPLORED if n < len(priors)}
         metrics |= {name + suffix: value for name, value in figures(scores).items()}
         say(f"{kind}{suffix}: F1_S {' / '.join(f'{statistics.mean(found):.3f}' for found in scores.values())}")
-    settings = {"kind": kind, "encoder": encoder, "explored": len(explored), "tested": len(tested)}
+    settings = {"kind": kind, "encoder": encoder, "explored": list(seeds[0]), "tested": list(seeds[1])}
     return metrics, settings | {"regions": len(names), "exchanged_pairs": pairs, "strength": LEARNING.strength}
+
+
+def parted(seeds: Sequence[int]) -> tuple[Sequence[int], Sequence[int]]:
+    """Seeds of the worlds to explore, as many as are scored after, and of those to test. Raises EvaluationError."""
+    explored, tested = seeds[: max(EXPLORED)], seeds[max(EXPLORED) :]
+    if len(tested) < LEAST_TESTED:
+        raise EvaluationError(
+            f"{len(seeds)} seeds are too few: {max(EXPLORED)} worlds are explored and {LEAST_TESTED} or more tested, "
+            "such as --seeds 0-15"
+        )
+    return explored, tested
 
 
 def exchanged_pairs(names: Sequence[str]) -> int:

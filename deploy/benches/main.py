@@ -6,7 +6,7 @@ import statistics
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from prior_sg.deploy.benches import exactness, segmenter
 from prior_sg.deploy.benches import features as bench_features
@@ -20,6 +20,7 @@ from prior_sg.deploy.benches.places import keyframes_of, place_bench
 from prior_sg.deploy.benches.queries import query_bench
 from prior_sg.deploy.benches.store import store_bench
 from prior_sg.deploy.benches.swap import swap_bench
+from prior_sg.deploy.evaluation.errors import EvaluationError
 from prior_sg.deploy.sample import SAMPLE
 from prior_sg.deploy.settings import DEMO_ENVIRONMENT, DEMO_TASK
 from prior_sg.schemas.frames import Keyframe
@@ -30,6 +31,9 @@ from prior_sg.services.registry import BY_NAME
 from prior_sg.services.runtime.runner import Pipeline, Runner
 from prior_sg.services.runtime.service import Identity
 
+if TYPE_CHECKING:
+    from prior_sg.deploy.evaluation.datasets import WorldName
+
 
 def _silent(text: str) -> None:
     """Nobody hears how far a measurement is."""
@@ -39,10 +43,10 @@ class Asked(NamedTuple):
     """What may be asked of measurements."""
 
     seconds: float = 300.0  # how long the pool is attacked
-    paths: Sequence[Path] = ()  # recordings and worlds to measure on: of places, foresight and merge
+    paths: Sequence[Path] = ()  # recordings and worlds to measure on
     presets: Sequence[str] = exactness.PRESETS  # of the place graph, with `paths`
     worlds: str = ""  # the kind of generated worlds in which learning takes place
-    seeds: int = 0  # worlds of each kind that an explorer foresees, 0 = all
+    seeds: Sequence[int] = ()  # of the worlds that an explorer foresees, or that robots learn from and are tested in
     report: Callable[[str], None] = _silent  # hears how far it is
 
 
@@ -100,11 +104,12 @@ def lidar() -> tuple[dict, dict]:
     return lidar_bench(SAMPLE)
 
 
-def levels() -> tuple[dict, dict]:
-    """Levels above regions; see `prior_sg.deploy.benches.levels`."""
-    from prior_sg.deploy.benches.levels import levels_bench  # needs what evaluation needs
+def levels(asked: Asked) -> tuple[dict, dict]:
+    """Levels above regions, in the worlds that are named; see `prior_sg.deploy.benches.levels`. Raises
+    EvaluationError."""
+    from prior_sg.deploy.benches.levels import WORLDS, levels_bench  # needs what evaluation needs
 
-    return levels_bench()
+    return levels_bench(_named(asked) or WORLDS, report=asked.report)
 
 
 def exchanged() -> tuple[dict, dict]:
@@ -118,10 +123,8 @@ def foresight(asked: Asked) -> tuple[dict, dict]:
     """Regions foreseen and searched for in generated worlds, and on maps of those named; see
     `prior_sg.deploy.benches.foresight`. Raises EvaluationError."""
     from prior_sg.deploy.benches.foresight import MAPPED, SEEDS, foresight_bench  # compiles the worlds' loops
-    from prior_sg.deploy.evaluation.datasets import named_worlds
 
-    worlds = [world for path in asked.paths for world in named_worlds(str(path))] or MAPPED
-    return foresight_bench(SEEDS[: asked.seeds or len(SEEDS)], worlds, report=asked.report)
+    return foresight_bench(asked.seeds or SEEDS, _named(asked) or MAPPED, report=asked.report)
 
 
 def memory() -> tuple[dict, dict]:
@@ -165,13 +168,17 @@ def markers(asked: Asked) -> tuple[dict, dict]:
 
 def _worlds_of(asked: Asked, bench: str) -> dict[str, Any]:
     """Seeds and kind of the worlds that were named, as keywords; none where none were. Raises EvaluationError."""
-    from prior_sg.deploy.evaluation.datasets import named_worlds
-    from prior_sg.deploy.evaluation.errors import EvaluationError
-
-    worlds = [world for path in asked.paths for world in named_worlds(str(path))]
+    worlds = _named(asked)
     if len({world.kind for world in worlds}) > 1:
         raise EvaluationError(f"{bench} walks worlds of one kind: name one, such as world:home:80-91")
     return {"seeds": [world.seed for world in worlds], "kind": worlds[0].kind} if worlds else {}
+
+
+def _named(asked: Asked) -> "list[WorldName]":
+    """The worlds that were named. Raises EvaluationError."""
+    from prior_sg.deploy.evaluation.datasets import named_worlds
+
+    return [world for path in asked.paths for world in named_worlds(str(path))]
 
 
 def e2e() -> tuple[dict, dict]:
@@ -218,7 +225,7 @@ LONG: dict[str, Callable[[Asked], tuple[dict, dict]]] = {  # no part of `all`; t
     "pool": attacked_pool,
     "store_crashes": lambda asked: crashes(),
     "lidar": lambda asked: lidar(),  # seven minutes and more
-    "levels": lambda asked: levels(),  # many minutes
+    "levels": levels,  # many minutes
     "exchange": lambda asked: exchanged(),  # nine runs of the sample at half its pace
     "foresight": foresight,  # worlds of every kind: long
     "fleet": lambda asked: fleet(),  # processes of its own, for minutes
@@ -230,17 +237,17 @@ LONG: dict[str, Callable[[Asked], tuple[dict, dict]]] = {  # no part of `all`; t
 
 
 TAKERS = {
-    "on": ("places", "foresight", "merge", "markers"),
+    "on": ("places", "foresight", "levels", "merge", "markers"),
     "worlds": ("learning",),
-    "seeds": ("foresight",),
+    "seeds": ("foresight", "learning"),
 }  # by option
 
 
 def learning_in_worlds(asked: Asked) -> tuple[dict, dict]:
     """Learning in generated worlds; see `prior_sg.deploy.benches.learning_worlds`. Raises EvaluationError."""
-    from prior_sg.deploy.benches.learning_worlds import learning_worlds_bench  # compiles the worlds' loops
+    from prior_sg.deploy.benches.learning_worlds import SEEDS, learning_worlds_bench, parted  # compiles loops
 
-    return learning_worlds_bench(asked.worlds, asked.report)
+    return learning_worlds_bench(asked.worlds, asked.report, parted(asked.seeds) if asked.seeds else SEEDS)
 
 
 def table(found: dict[str, Any]) -> tuple[Sequence[str], list[list[str]]]:
@@ -263,6 +270,8 @@ def run(name: str, asked: Asked) -> dict[str, Any]:
     """One measurement as the object that `--json` prints."""
     if name == "places" and asked.paths:
         metrics, settings = exactness.exactness_bench(asked.paths, asked.presets, asked.report)
+    elif name == "learning" and asked.seeds and not asked.worlds:
+        raise EvaluationError("--seeds are of generated worlds: say of which kind, such as --worlds home")
     elif name == "learning" and asked.worlds:
         metrics, settings = learning_in_worlds(asked)
     else:

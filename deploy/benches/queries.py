@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from prior_sg.schemas.codec import encode
+from prior_sg.schemas.markers import SceneMarker
 from prior_sg.schemas.objects import SceneObject
 from prior_sg.schemas.queries import (
     AnswersTo,
@@ -21,6 +22,7 @@ from prior_sg.schemas.queries import (
     ByLabel,
     InBox,
     InRadius,
+    MarkersOf,
     Nearest,
     NeighboursOf,
     NodesOf,
@@ -45,6 +47,7 @@ REPEATS = 100
 PER_ROOM = 15  # places along each side of a room
 SPACING_M = 0.5
 JITTER_M = 0.1
+MARKERS = 8
 LABELS = [f"room kind {number}" for number in range(20)]
 KINDS = [f"object kind {number}" for number in range(100)]
 
@@ -117,6 +120,7 @@ def kinds_of_questions(scene: Scene, rng: np.random.Generator, count: int) -> di
         "beliefs_of": lambda: BeliefsOf(region=some(regions)),
         "words_in_use": WordsInUse,
         "answers_to": lambda: AnswersTo(text="t", regions={LABELS[1]: 0.5}, objects={KINDS[1]: 0.5}),
+        "markers_of": MarkersOf,
         "nodes_of": lambda: NodesOf(region=some(regions)),
         "where_to_look": lambda: WhereToLook(label=LABELS[1], start=Spot(point_m=point())),
         "what_is_missing": WhatIsMissing,
@@ -159,7 +163,25 @@ def synthetic_scene(places: int, objects: int, seed: int = 0) -> Scene:
         clearances_m=rng.uniform(0.15, 0.6, len(edges)).astype(np.float32),
         trajectory=np.zeros((0, 3), np.float32),
         objects=found,
+        markers=_markers(positions),
     )
+
+
+def _markers(positions: np.ndarray) -> list[SceneMarker]:
+    """Some, evenly over the places (place, 3), that look along x."""
+    spots = positions[:: -(-len(positions) // MARKERS)].tolist()
+    upright = (0.5, 0.5, 0.5, 0.5)
+    return [
+        SceneMarker(
+            dictionary="apriltag_36h11",
+            id=number,
+            size_m=0.16,
+            position_m=(x, y, z),
+            quaternion_xyzw=upright,
+            frames=3,
+        )
+        for number, (x, y, z) in enumerate(spots)
+    ]
 
 
 def _edges(places: int, side: int, column: np.ndarray, row: np.ndarray) -> np.ndarray:

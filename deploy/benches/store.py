@@ -19,6 +19,7 @@ from prior_sg.services.registry import BY_NAME
 from prior_sg.services.runtime.runner import Runner
 from prior_sg.services.runtime.service import Identity
 from prior_sg.services.scene_store.core import graph as core
+from prior_sg.services.scene_store.core.config import Config
 from prior_sg.services.scene_store.core.image import image_of
 from prior_sg.services.scene_store.storage.writing import compressed
 
@@ -64,7 +65,7 @@ PLACES: dict[str, Callable[[], contextlib.AbstractContextManager[str]]] = {"sqli
 def _measure(place: str, places: int, deltas: int, asked: int, past: int) -> dict[str, float]:
     hall, rng = Hall(places), np.random.default_rng(0)
     count = len(hall.positions_m)
-    with Runner(BY_NAME["scene_store"], core.Config(path=place), Identity("*", "bench", 1)) as runner:
+    with Runner(BY_NAME["scene_store"], Config(path=place), Identity("*", "bench", 1)) as runner:
         storage = runner.state.database.storage
         empty_bytes = storage.disk_bytes()
         runner.feed(hall.delta(0, np.arange(count)), Tick(stamp_ns=1))

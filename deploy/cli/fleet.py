@@ -74,12 +74,17 @@ def transforms_of(texts: list[str], robots: list[str], same_frame: bool) -> dict
 
 def cmd_fleet(arguments: argparse.Namespace) -> int:
     """Run the bridge."""
-    from prior_sg.deploy.fleet.bridge import SERVICE
+    from prior_sg.deploy.fleet.bridge import NAME_OF_A_ROBOT, SERVICE
     from prior_sg.deploy.fleet.core.finding.config import MatchConfig
     from prior_sg.deploy.fleet.core.update import Config
     from prior_sg.deploy.running.serve import stay
+    from prior_sg.schemas.names import fault_of_robot
     from prior_sg.services.runtime.service import Identity
 
+    if fault := fault_of_robot(arguments.name):
+        raise UserError(fault)
+    if arguments.name in arguments.robots:
+        raise UserError(NAME_OF_A_ROBOT.format(arguments.name))
     try:
         cfg = Config(
             robots=tuple(arguments.robots),

@@ -11,6 +11,7 @@ from prior_sg.deploy.cli.shared import (
     add_bus,
     add_router,
     console,
+    open_client,
     reach_of,
     until_interrupted,
     wait,
@@ -141,6 +142,7 @@ def _list(arguments: argparse.Namespace) -> int:
 
 
 def _router(arguments: argparse.Namespace) -> int:
+    from prior_sg.services.runtime.hearing import end_deaf
     from prior_sg.services.runtime.zenoh_router import check_router, open_router, router_settings
 
     beyond = reach_of(arguments)
@@ -151,9 +153,9 @@ def _router(arguments: argparse.Namespace) -> int:
         console.print(f"wrote {arguments.write}; start it with `zenohd -c {arguments.write}`")
         return 0
     stop = open_router(arguments.connect, beyond)
-    console.print(f"router {' and '.join((arguments.connect, *arguments.listen))}; Ctrl-C stops")
     try:
-        with until_interrupted():
+        with until_interrupted(), open_client(arguments.connect, on_deaf=end_deaf):
+            console.print(f"router {' and '.join((arguments.connect, *arguments.listen))}; Ctrl-C stops")
             wait()
         return 0
     finally:

@@ -116,6 +116,7 @@ def _stay_up(arguments: argparse.Namespace, names: list[str]) -> int:
     from prior_sg.deploy.running.supervisor import Supervisor
     from prior_sg.deploy.running.swaps import RouterHere, Swaps
     from prior_sg.services.registry import BY_NAME
+    from prior_sg.services.runtime.hearing import end_deaf
 
     require_files()
     _check_place(arguments, names)
@@ -124,7 +125,7 @@ def _stay_up(arguments: argparse.Namespace, names: list[str]) -> int:
         open_client(arguments.connect).bus.close()  # finds out at once whether a router is there
     router = None if arguments.no_router else RouterHere(arguments.connect, lambda: reach_of(arguments))
     supervisor = Supervisor(arguments.connect, arguments.robot, arguments.out / "logs", settings, arguments.config)
-    client = open_client(arguments.connect)
+    client = open_client(arguments.connect, on_deaf=end_deaf if router is not None else None)
     roll = Roll(client.bus)
     supervisor.hears = roll.hears
     swaps = Swaps(client.bus, supervisor, arguments.out, router)

@@ -103,10 +103,11 @@ def _run(argv: list[str] | None) -> int:
     from prior_sg.deploy.interrupts import interrupt
     from prior_sg.deploy.limits import check_memory
     from prior_sg.deploy.settings import use_keys
-    from prior_sg.deploy.terminal import forgive
+    from prior_sg.deploy.terminal import forgive, keep_apart
     from prior_sg.services.runtime import extras
 
     forgive()
+    keep_apart()
     check_encoding(sys.argv[1:] if argv is None else argv)
     arguments = build_parser().parse_args(argv)
     check_arguments(arguments)

@@ -16,11 +16,11 @@ from prior_sg.schemas.members import said
 
 if TYPE_CHECKING:
     from prior_sg.deploy.api.asking import Asking
-    from prior_sg.schemas.foresight import MissingLabel
-    from prior_sg.schemas.members import MapMember
-    from prior_sg.schemas.queries import (
+    from prior_sg.deploy.api.client import Client
+    from prior_sg.schemas.answers import (
         Details,
         Difference,
+        MarkerInRegion,
         Neighbour,
         NodeWithRegions,
         Outlook,
@@ -28,6 +28,8 @@ if TYPE_CHECKING:
         Route,
         Thing,
     )
+    from prior_sg.schemas.foresight import MissingLabel
+    from prior_sg.schemas.members import MapMember
 
 FORMS = """\
 what to ask:
@@ -39,8 +41,9 @@ what to ask:
   objects [LABEL] [in REGION]      objects of a label in regions of a label
   level LEVEL [LABEL]              zones, floors, buildings, districts, with their regions
   region ID, place ID, object ID   one of them in full: beliefs, neighbours, what it holds
+  marker [NUMBER]                  where printed markers are, and what is doubtful about them
   route FROM TO                    the shortest way; each a label, here (where the camera was last), place:ID,
-                                   region:ID, object:ID or X,Y,Z
+                                   region:ID, object:ID, marker:NUMBER or X,Y,Z
   unseen LABEL                     where a region that was not seen may be, and the way there from here (--start SPOT)
   missing                          what is probably still to be found behind the map's openings
   changed REVISION                 what is different since a revision (running store only)
@@ -91,10 +94,12 @@ def cmd_query(arguments: argparse.Namespace) -> int:
     if arguments.object:
         arguments.what, arguments.label = "object", arguments.object
     word, *rest = arguments.words
-    run, show = ASKED.get(word, FOUND) if rest else ALONE.get(word, FOUND)
+    run, show = ASKED.get(word, FOUND) if rest else (ASKED | ALONE).get(word, FOUND)
     try:
         with warnings.catch_warnings(record=True) as said, _opened(arguments) as scene:
             warnings.simplefilter("always", UserWarning)
+            if arguments.scene is None:
+                _require_some(scene)
             found = run(scene, arguments, rest if run is not _find else arguments.words)
     except (NotInSceneError, ValueError) as error:  # the latter of what no question may hold
         raise UserError(str(error)) from error
@@ -117,6 +122,17 @@ def _opened(arguments: argparse.Namespace) -> Any:
     from prior_sg.deploy.api.scene import Scene
 
     return contextlib.nullcontext(Scene.read(arguments.scene, arguments.robot))
+
+
+def _require_some(client: "Client") -> None:
+    """Raise UserError where nothing is stored of the robot that is asked about."""
+    from prior_sg.schemas.queries import WordsInUse
+
+    if client.answers(WordsInUse()).revision < 0:
+        raise UserError(
+            f"nothing is stored of a robot {client.robot!r}: its services have told nothing yet, or it has another "
+            "name (--robot)"
+        )
 
 
 def _find(scene: "Asking", arguments: argparse.Namespace, words: Sequence[str]) -> "list[Thing]":
@@ -149,16 +165,20 @@ def _objects(scene: "Asking", arguments: argparse.Namespace, words: Sequence[str
 
 def _one(scene: "Asking", arguments: argparse.Namespace, words: Sequence[str]) -> "dict[str, Any]":
     what: Any = arguments.words[0]
-    number = _id(words)
+    number = _id(words, f"{what} 7")
     found: dict[str, Any] = {"details": scene.describe(what, number), "neighbours": scene.neighbours(what, number)}
     return found | ({"beliefs": scene.candidates(number, arguments.limit)} if what == "region" else {})
 
 
 def _levels(scene: "Asking", arguments: argparse.Namespace, words: Sequence[str]) -> "list[NodeWithRegions]":
-    level, *label = words
+    level, *label = words or ("",)
     if level not in LEVELS:
         raise UserError(f"name a level: {', '.join(LEVELS)}; such as `prior-sg query level zone ward`")
     return scene.levels(level, " ".join(label) or arguments.label, limit=arguments.limit)
+
+
+def _markers(scene: "Asking", arguments: argparse.Namespace, words: Sequence[str]) -> "list[MarkerInRegion]":
+    return scene.markers(_id(words, "marker 7") if words else None, limit=arguments.limit)
 
 
 def _route(scene: "Asking", arguments: argparse.Namespace, words: Sequence[str]) -> "Route":
@@ -180,7 +200,7 @@ def _changed(scene: "Asking", arguments: argparse.Namespace, words: Sequence[str
 
     if not isinstance(scene, Client):
         raise UserError("a saved scene is of one revision; ask the running store, without --scene")
-    return scene.changed_since(_id(words))
+    return scene.changed_since(_id(words, "changed 120"))
 
 
 def _numbers(words: Sequence[str], count: int, form: str) -> list[float]:
@@ -193,9 +213,9 @@ def _numbers(words: Sequence[str], count: int, form: str) -> list[float]:
     return numbers
 
 
-def _id(words: Sequence[str]) -> int:
+def _id(words: Sequence[str], example: str) -> int:
     if len(words) != 1 or not words[0].lstrip("-").isdigit():
-        raise UserError("name one number, such as `prior-sg query region 7`, or put a sentence in quotes")
+        raise UserError(f"name one number, such as `prior-sg query {example}`, or put a sentence in quotes")
     return int(words[0])
 
 
@@ -248,6 +268,14 @@ def _show_one(found: "dict[str, Any]") -> None:
         length = f", {one.length_m:.2f} m" if one.length_m else ""
         clearance = f", clearance {one.clearance_m:.2f} m" if one.clearance_m else ""
         console.print(f"beside {one.thing.what} {one.thing.id} {one.thing.label}{length}{clearance}{doors}")
+
+
+def _show_markers(found: "list[MarkerInRegion]") -> None:
+    for one in found:
+        marker, region = one.marker, one.region
+        where = "in no region" if region is None else f"in {region.label} (region {region.id})"
+        doubt = f"; in doubt: {marker.doubt}" if marker.doubt else ""
+        console.print(f"{marker.key} at {_at(marker.position_m)} {where}, from {marker.frames} keyframes{doubt}")
 
 
 def _made_of(members: "Sequence[MapMember]") -> str:
@@ -330,9 +358,10 @@ ASKED: dict[str, Asked] = {  # by first word; whatever else is a sentence
     "region": (_one, _show_one),
     "place": (_one, _show_one),
     "object": (_one, _show_one),
+    "marker": (_markers, _show_markers),
     "route": (_route, _show_route),
     "unseen": (_unseen, _show_outlook),
     "changed": (_changed, _show_difference),
 }
 FOUND: Asked = (_find, _show_things)
-ALONE: dict[str, Asked] = {"missing": (_missing, _show_missing)}
+ALONE: dict[str, Asked] = {"missing": (_missing, _show_missing)}  # words that ask by themselves, and begin sentences

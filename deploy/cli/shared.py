@@ -117,12 +117,12 @@ def _not_negative(text: str) -> float:
     return number
 
 
-def open_client(connect: str) -> "BusClient":
-    """A client on the bus. Raises BusError."""
+def open_client(connect: str, on_deaf: Callable[[], None] | None = None) -> "BusClient":
+    """A client on the bus; `on_deaf` as of ZenohBus. Raises BusError."""
     from prior_sg.services.runtime.client import BusClient
     from prior_sg.services.runtime.zenoh_bus import ZenohBus
 
-    return BusClient(ZenohBus(connect, ROUTER_WAIT_S))
+    return BusClient(ZenohBus(connect, ROUTER_WAIT_S, on_deaf=on_deaf))
 
 
 class _Sentences(logging.Handler):
@@ -139,6 +139,11 @@ def tell_logs() -> None:
     root = logging.getLogger()
     root.handlers[:] = [_Sentences(logging.WARNING)]
     root.setLevel(logging.WARNING)
+
+
+def hush_logs() -> None:
+    """What services of a measurement in this process warn of is no news: it tells its own figures and errors."""
+    logging.getLogger("prior_sg").addHandler(logging.NullHandler())
 
 
 @contextlib.contextmanager

@@ -10,11 +10,12 @@ from typing import TYPE_CHECKING
 
 from rich.table import Table
 
-from prior_sg.deploy.cli.shared import Commands, add_bus, add_log_mb, console, open_client
+from prior_sg.deploy.cli.shared import Commands, add_bus, add_log_mb, console, hush_logs, open_client
 from prior_sg.deploy.errors import UserError
 from prior_sg.deploy.evaluation import command as evaluation
 from prior_sg.deploy.evaluation import tune_command as tuning
 from prior_sg.deploy.terminal import Part, line
+from prior_sg.services.errors import PriorSgError
 
 if TYPE_CHECKING:
     from prior_sg.deploy.inspecting.health import Found
@@ -135,9 +136,15 @@ def _add_measuring(commands: Commands) -> None:
         type=Path,
         default=[],
         metavar="PATH",
-        help="measure places, merge or markers on these instead, or map these for foresight, such as world:home:80-91",
+        help="measure places, levels, merge or markers on these instead, or map these for foresight, such as "
+        "world:home:80-91",
     )
-    bench.add_argument("--seeds", type=int, default=0, help="of each kind of world, for foresight (default: all four)")
+    bench.add_argument(
+        "--seeds",
+        default="",
+        help="of each kind of world for foresight, or of --worlds for learning, of which the first ten are explored, "
+        "such as 76-79",
+    )
     bench.add_argument(
         "--presets", nargs="+", help="of the place graph, for places with --on (default: indoor habitat mixed)"
     )
@@ -151,17 +158,19 @@ def cmd_explain(arguments: argparse.Namespace) -> int:
     """Each expert's vote on a place, its neighbours' pull, and what follows."""
     import msgspec
 
+    from prior_sg.deploy.api.client import Client
     from prior_sg.deploy.inspecting import explain
-    from prior_sg.schemas.regions import PosteriorRequest
-    from prior_sg.schemas.topics import POSTERIOR
 
     if arguments.log is not None:
         if not arguments.log.exists():
             raise UserError(f"{arguments.log} does not exist; `run`, `demo` and `record` write one")
         reply = explain.from_log(arguments.log, arguments.robot, arguments.place)
     else:
-        with open_client(arguments.connect) as client:
-            reply = client.ask(POSTERIOR, PosteriorRequest(robot=arguments.robot, place_id=arguments.place))
+        with Client(arguments.connect, arguments.robot) as client:
+            try:
+                reply = client.explain(arguments.place)
+            except PriorSgError as error:
+                raise UserError(str(error)) from error
     if not reply.found:
         raise UserError(f"{arguments.robot} has no labelled place {arguments.place}; scene.json lists their ids")
     if arguments.json:
@@ -309,6 +318,7 @@ def _topic_line(count: "TopicCount") -> list[Part]:
 def cmd_bench(arguments: argparse.Namespace) -> int:
     """Measure."""
     from prior_sg.deploy.benches import main as bench
+    from prior_sg.deploy.evaluation.datasets import seeds_of
 
     if arguments.name not in (*bench.BENCHES, *bench.LONG, "all"):
         raise UserError(
@@ -317,6 +327,10 @@ def cmd_bench(arguments: argparse.Namespace) -> int:
     for option, takers in bench.TAKERS.items():
         if getattr(arguments, option) and arguments.name not in takers:
             raise UserError(f"--{option} is of the measurements {', '.join(takers)}, not of {arguments.name}")
+    hush_logs()
+    seeds = seeds_of(arguments.seeds)
+    if arguments.seeds and not seeds:
+        raise UserError(f"--seeds {arguments.seeds} names no seeds: write 3, 0-9 or 1,4,7")
     for name in bench.BENCHES if arguments.name == "all" else [arguments.name]:
         with console.status(f"measuring {name}") as status:
             asked = bench.Asked(
@@ -324,7 +338,7 @@ def cmd_bench(arguments: argparse.Namespace) -> int:
                 paths=arguments.on,
                 presets=arguments.presets or bench.exactness.PRESETS,
                 worlds=arguments.worlds,
-                seeds=arguments.seeds,
+                seeds=seeds,
                 report=partial(_tell, status.update, name),
             )
             found = bench.run(name, asked)
@@ -352,9 +366,11 @@ def _tell(update: Callable[[str], None], name: str, text: str) -> None:
 
 def cmd_eval(arguments: argparse.Namespace) -> int:
     """Compare methods on datasets with ground truth."""
+    hush_logs()
     return evaluation.run(arguments, console)
 
 
 def cmd_tune(arguments: argparse.Namespace) -> int:
     """Choose settings on some datasets and score the choice on those left out."""
+    hush_logs()
     return tuning.run(arguments, console)

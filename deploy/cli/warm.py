@@ -1,9 +1,8 @@
 """`warm`: what would be made at first use is made now."""
 
 import argparse
-import logging
 
-from prior_sg.deploy.cli.shared import Commands, console
+from prior_sg.deploy.cli.shared import Commands, console, hush_logs
 
 
 def add_commands(commands: Commands) -> None:
@@ -24,7 +23,7 @@ def cmd_warm(arguments: argparse.Namespace) -> int:
     from prior_sg.deploy.running.warm import warm
     from prior_sg.deploy.terminal import Description
 
-    logging.getLogger("prior_sg").addHandler(logging.NullHandler())  # what becomes of the sample's frames is no news
+    hush_logs()
     with Progress(Description(), BarColumn(), TimeElapsedColumn(), console=console) as progress:
         bar = progress.add_task("compiling inner loops")
         done = warm(lambda frames, whole: progress.update(bar, total=whole, completed=frames))

@@ -102,14 +102,20 @@ def named_worlds(text: str) -> list[WorldName]:
     kind, _, seeds = text.removeprefix(WORLD).partition(":")
     if kind not in KINDS:
         raise EvaluationError(f"there is no kind of world {kind!r}: choose from {', '.join(KINDS)}")
-    try:
-        ranges = [part.partition("-") for part in seeds.split(",")]
-        chosen = [seed for low, _, high in ranges for seed in range(int(low), int(high or low) + 1)]
-    except ValueError:
-        chosen = []
+    chosen = seeds_of(seeds)
     if not chosen:
         raise EvaluationError(f"{text} names no seeds: write world:{kind}:3, world:{kind}:0-9 or world:{kind}:1,4,7")
-    return [WorldName(kind, seed) for seed in dict.fromkeys(chosen)]
+    return [WorldName(kind, seed) for seed in chosen]
+
+
+def seeds_of(text: str) -> tuple[int, ...]:
+    """The seeds of `3`, `0-9` or `1,4,7`, each once; none where the text names none."""
+    try:
+        ranges = [part.partition("-") for part in text.split(",")]
+        named = [seed for low, _, high in ranges for seed in range(int(low), int(high or low) + 1)]
+    except ValueError:
+        return ()
+    return tuple(dict.fromkeys(named))
 
 
 def world_source(name: WorldName, walk: "Manner" = "scanner") -> Source:

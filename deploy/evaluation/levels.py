@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import msgspec
 import numpy as np
 
-from prior_sg.deploy.evaluation.datasets import Dataset
+from prior_sg.deploy.evaluation.datasets import Dataset, WorldName, of_world
 from prior_sg.deploy.evaluation.level_metrics import NONE, level_scores, levels_in, nodes_at, true_nodes
 from prior_sg.deploy.evaluation.methods import Case, labelling, put_in_force, scene_of
 from prior_sg.deploy.evaluation.metrics import evaluate
@@ -106,11 +106,9 @@ def ids_kept(moments: Sequence[Held], truth: GroundTruth, level: LevelName) -> f
     return kept / steps if steps else float("nan")
 
 
-def dataset_of(kind: str, seed: int) -> Dataset:
+def dataset_of(world: WorldName) -> Dataset:
     """A world with the prior for its kind's task. Raises EvaluationError."""
-    from prior_sg.deploy.evaluation.datasets import WorldName, of_world
-
-    return of_world(WorldName(kind, seed), TASKS[kind])
+    return of_world(world, TASKS[world.kind])
 
 
 def _held(state: State) -> Held:

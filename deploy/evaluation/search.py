@@ -13,9 +13,9 @@ from prior_sg.deploy.api.scene import Scene as Api
 from prior_sg.deploy.evaluation.kinds import OURS, SIMULATED
 from prior_sg.deploy.evaluation.search_questions import TextQuestion
 from prior_sg.deploy.truth import GroundTruth, TrueObject
+from prior_sg.schemas.answers import Thing
 from prior_sg.schemas.features import DEFAULT_SPACE
 from prior_sg.schemas.priors import Prior
-from prior_sg.schemas.queries import Thing
 from prior_sg.schemas.scene import Scene
 
 PLAIN = "plain"

@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
+from prior_sg.deploy.cli.shared import hush_logs
 from prior_sg.deploy.settings import DEMO_TASK, Layers, settings_layers
 from prior_sg.deploy.terminal import Description, Terminal
 
@@ -100,7 +101,7 @@ def in_parallel(
     """Each dataset judged in one of several processes, which start anew: compiled code and threads do not fork."""
     asked = argparse.Namespace(**{name: value for name, value in vars(arguments).items() if name != "run"})
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(jobs, context, signal.signal, (signal.SIGINT, signal.SIG_IGN)) as pool:
+    with ProcessPoolExecutor(jobs, context, _begin_process) as pool:
         futures = [pool.submit(judge, asked, dataset) for dataset in datasets]
         try:
             for done, _ in enumerate(as_completed(futures)):
@@ -110,6 +111,12 @@ def in_parallel(
             for process in multiprocessing.active_children():
                 process.kill()
             raise
+
+
+def _begin_process() -> None:
+    """Ctrl-C is the first process's to hear, and what services warn of nobody's."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    hush_logs()
 
 
 @contextmanager

@@ -17,6 +17,7 @@ from prior_sg.schemas.objects import ObjectDelta
 from prior_sg.schemas.places import PlaceDelta, SnapshotRequest
 from prior_sg.schemas.priors import PriorRequest
 from prior_sg.schemas.regions import RegionDelta
+from prior_sg.schemas.scene import SceneRequest
 from prior_sg.schemas.status import Loss
 from prior_sg.schemas.topics import (
     OBJECT_DELTA,
@@ -26,26 +27,30 @@ from prior_sg.schemas.topics import (
     PRIORS,
     REGION_DELTA,
     REGION_SNAPSHOT,
+    SCENE,
     topic_of,
 )
 from prior_sg.services.runtime.service import Ask, Errand, Identity, Output, Service, ServiceError
 from prior_sg.services.scene_store.core import graph as scenes
 
 log = logging.getLogger(__name__)
+NAME_OF_A_ROBOT = "{} is one of the robots: give the merged map another name"
 SNAPSHOTS = {"PlaceDelta": PLACE_SNAPSHOT, "RegionDelta": REGION_SNAPSHOT, "ObjectDelta": OBJECT_SNAPSHOT}
 
 
 def init(cfg: Config, identity: Identity) -> State:
     """Nothing has come yet but what is stored. Raises ServiceError."""
     if identity.robot in cfg.robots:
-        raise ServiceError(f"{identity.robot} is one of the robots: give the merged map another name")
+        raise ServiceError(NAME_OF_A_ROBOT.format(identity.robot))
     memory = kept_memory(cfg.memory)
     former = stored_members(cfg.stored, memory.sessions)
     followed = {
         robot: Followed(Member(memory.sessions.following(robot), scenes.Graph(robot)), sessions=memory.sessions)
         for robot in cfg.robots
     }
-    return State(identity.robot, followed, Teller(identity.robot, identity.epoch), former=former, memory=memory)
+    return State(
+        identity.robot, followed, Teller(identity.robot, identity.epoch, cfg.robots), former=former, memory=memory
+    )
 
 
 def step(state: State, message: Message, cfg: Config) -> Iterator[Output]:
@@ -54,6 +59,8 @@ def step(state: State, message: Message, cfg: Config) -> Iterator[Output]:
         match output:
             case Lacking():
                 yield Ask(SNAPSHOTS[output.kind], SnapshotRequest(robot=output.robot))
+            case SceneRequest():
+                yield Ask(SCENE, output)
             case PriorRequest():
                 yield Ask(PRIORS, output)
             case KeepNumbers():
@@ -108,7 +115,7 @@ SERVICE = Service(
     reads=(PLACE_DELTA, REGION_DELTA, OBJECT_DELTA),
     reads_of=lambda cfg: cfg.robots,
     writes=(PLACE_DELTA, REGION_DELTA, OBJECT_DELTA),
-    asks=(PLACE_SNAPSHOT, REGION_SNAPSHOT, OBJECT_SNAPSHOT, PRIORS),
+    asks=(PLACE_SNAPSHOT, REGION_SNAPSHOT, OBJECT_SNAPSHOT, PRIORS, SCENE),
     errands=(KEEP_NUMBERS,),
     answers={PLACE_SNAPSHOT: _places, REGION_SNAPSHOT: _regions, OBJECT_SNAPSHOT: _objects},
     tick_s=1.0,

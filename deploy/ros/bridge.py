@@ -159,7 +159,7 @@ class Bridge:
             self._ros.serve(channel, partial(self._answer, service), self._complain)
 
     def _complain(self, topic: str, reason: str) -> None:
-        log.warning("message of ROS not taken", extra={"topic": topic, "reason": reason})
+        log.warning("message of ROS not taken", extra={"topic": topic, "why": reason})
 
     def _answer(self, service: str, request: bytes) -> bytes:
         asked = self._types.decode(request, f"{parameters.type_of(service)}_Request")

@@ -13,6 +13,7 @@ from prior_sg.deploy.api.spots import ENDS, spot_in
 from prior_sg.deploy.serving.planner_text import lean_json
 from prior_sg.deploy.serving.system import LONGEST_SEARCH, System
 from prior_sg.deploy.showing.text import LEAST_TOKENS, USUAL_TOKENS, scene_text
+from prior_sg.schemas.answers import Outlook, Route, What
 from prior_sg.schemas.levels import LevelName
 from prior_sg.schemas.queries import (
     BeliefsOf,
@@ -20,15 +21,13 @@ from prior_sg.schemas.queries import (
     ByLabel,
     ChangedSince,
     InRadius,
+    MarkersOf,
     Nearest,
     NeighboursOf,
     NodesOf,
     ObjectsInRegions,
-    Outlook,
     Question,
-    Route,
     RouteBetween,
-    What,
     WhatIsMissing,
     WhereToLook,
 )
@@ -162,6 +161,13 @@ async def levels(
 
 
 @asking
+async def markers(system: System, number: Number | None = None) -> str:
+    """Where printed markers (AprilTag, ArUco) hang, and in which region: all, or those of a number. Where `doubt` says
+    something, do not rely on the position."""
+    return await _answer(system, lambda: MarkersOf(id=number))
+
+
+@asking
 async def region_candidates(system: System, region: Number) -> str:
     """What a region may be: labels with probabilities, what is unknown, and how much of it is only predicted."""
     return await _answer(system, lambda: BeliefsOf(region=region))
@@ -214,6 +220,7 @@ ASKING = [
     within,
     describe,
     levels,
+    markers,
     region_candidates,
     route,
     where_to_look,

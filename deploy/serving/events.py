@@ -11,7 +11,8 @@ import msgspec
 
 from prior_sg.deploy.serving.errors import BusyError
 from prior_sg.deploy.serving.system import System
-from prior_sg.schemas.queries import ChangedSince, Difference, SceneAnswer, WordsInUse
+from prior_sg.schemas.answers import Difference
+from prior_sg.schemas.queries import ChangedSince, SceneAnswer, WordsInUse
 from prior_sg.schemas.scene import SceneRevision
 from prior_sg.services.errors import PriorSgError
 

@@ -20,7 +20,8 @@ from prior_sg.deploy.serving.gate import App, Entrance, Gate
 from prior_sg.deploy.serving.planner_text import lean_json
 from prior_sg.deploy.serving.system import EVERYWHERE, MOST_LIMIT, System
 from prior_sg.deploy.showing.text import scene_text
-from prior_sg.schemas.queries import InBox, Question, What, Words, WordsInUse
+from prior_sg.schemas.answers import What, Words
+from prior_sg.schemas.queries import InBox, Question, WordsInUse
 from prior_sg.schemas.scene import SceneRevision
 from prior_sg.services.errors import PriorSgError
 

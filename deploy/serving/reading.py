@@ -13,28 +13,25 @@ from prior_sg.deploy.api.spots import ENDS, spot_in
 from prior_sg.deploy.serving.errors import FaultyRequestError
 from prior_sg.deploy.serving.parameters import FAULTS, Coordinate, Count, Distance, Label, Robot, system_of
 from prior_sg.deploy.serving.system import EVERYWHERE, LONGEST_SEARCH, MOST_QUESTIONS
+from prior_sg.schemas.answers import Answer, Details, Markers, Neighbourhood, RegionBeliefs, What
 from prior_sg.schemas.levels import LevelName
 from prior_sg.schemas.names import LONGEST_NAME
 from prior_sg.schemas.queries import (
     MOST_LISTED,
     MOST_RANKED,
-    Answer,
     BeliefsOf,
     ById,
     ByLabel,
     ChangedSince,
-    Details,
     InBox,
     InRadius,
+    MarkersOf,
     Nearest,
-    Neighbourhood,
     NeighboursOf,
     NodesOf,
     Question,
-    RegionBeliefs,
     RouteBetween,
     SceneAnswer,
-    What,
     WhatIsMissing,
     WhereToLook,
     WordsInUse,
@@ -159,6 +156,21 @@ async def levels(
     return await _one(state, robot, _asked(NodesOf, level=level, label=label, region=region, limit=limit))
 
 
+@get("/v1/{robot:str}/markers", responses=FAULTS)
+async def markers(state: State, robot: Robot, limit: Count = MOST_LISTED) -> Answered:
+    """Printed markers with their poses, the regions they hang in, and why one may be doubted."""
+    return await _one(state, robot, _asked(MarkersOf, limit=limit))
+
+
+@get("/v1/{robot:str}/markers/{number:int}", responses=FAULTS)
+async def marker(state: State, robot: Robot, number: FromPath[int]) -> Answered:
+    """The printed marker of a number; of several dictionaries, one of each."""
+    found = await _one(state, robot, _asked(MarkersOf, id=number))
+    if isinstance(found.answer, Markers) and not found.answer.markers:
+        raise NotInSceneError(found.answer.reason)
+    return found
+
+
 @get("/v1/{robot:str}/near", responses=FAULTS)
 async def near(
     state: State,
@@ -270,6 +282,8 @@ READING = [
     object_,
     place,
     levels,
+    markers,
+    marker,
     near,
     within,
     route,

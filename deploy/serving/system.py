@@ -17,19 +17,12 @@ from prior_sg.deploy.api.client import Client, Health
 from prior_sg.deploy.api.errors import NotInSceneError, TaskError
 from prior_sg.deploy.api.scene import Scene
 from prior_sg.deploy.serving.errors import BusyError, FaultyRequestError
+from prior_sg.schemas.answers import What
 from prior_sg.schemas.codec import DecodeError
 from prior_sg.schemas.frames import IngestState
 from prior_sg.schemas.names import fault_of_robot, normal
 from prior_sg.schemas.priors import Prior, fault_of_task
-from prior_sg.schemas.queries import (
-    MOST_RANKED,
-    AnswersTo,
-    ChangedSince,
-    Question,
-    RouteBetween,
-    SceneAnswer,
-    What,
-)
+from prior_sg.schemas.queries import MOST_RANKED, AnswersTo, ChangedSince, Question, RouteBetween, SceneAnswer
 from prior_sg.schemas.scene import Scene as SceneMessage
 from prior_sg.schemas.scene import SceneRevision
 from prior_sg.schemas.topics import INGEST_STATE, SCENE_REVISION

@@ -16,8 +16,9 @@ from prior_sg.deploy.serving.parameters import FAULTS, Robot, Tokens, system_of
 from prior_sg.deploy.serving.system import EVERYWHERE, MOST_LIMIT
 from prior_sg.deploy.showing.export import scene_json
 from prior_sg.deploy.showing.text import USUAL_TOKENS, scene_text
+from prior_sg.schemas.answers import Things, Words
 from prior_sg.schemas.codec import encode
-from prior_sg.schemas.queries import InBox, Things, Words, WordsInUse
+from prior_sg.schemas.queries import InBox, WordsInUse
 from prior_sg.schemas.scene import Scene
 
 MSGPACK = "application/vnd.msgpack"

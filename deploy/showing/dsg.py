@@ -55,7 +55,9 @@ def spark_dsg_graph(scene: Scene) -> spark_dsg.DynamicSceneGraph:
     about: dict[str, Any] = {"robot": scene.robot, "environment": scene.environment, "task": scene.task}
     about |= {"prior_digest": scene.prior_digest, "embedding_space": scene.space}
     about |= {"stamp_ns": scene.stamp_ns, "trajectory_m": scene.trajectory.tolist()}
-    about |= {"levels": msgspec.to_builtins(scene.nodes)}  # zones, floors and districts have no layer there
+    about |= {"levels": msgspec.to_builtins(scene.nodes)}  # zones, floors, districts and markers have no layer
+    about |= {"merged_of": scene.merged_of}
+    about |= {"markers": msgspec.to_builtins(scene.markers)}
     about |= {"foresight": msgspec.to_builtins(scene.foresight)}
     graph.metadata.set(about | {"origin_m": list(scene.origin_m)})
     labelspace = spark_dsg.Labelspace(dict(enumerate(scene.labels)))  # kept in the metadata, hence after them

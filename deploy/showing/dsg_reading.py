@@ -10,6 +10,7 @@ import spark_dsg
 from prior_sg.deploy.showing.dsg import MESH_PLACES
 from prior_sg.schemas.foresight import Foresight
 from prior_sg.schemas.levels import LevelNode
+from prior_sg.schemas.markers import SceneMarker
 from prior_sg.schemas.members import MapMember
 from prior_sg.schemas.objects import SceneObject
 from prior_sg.schemas.regions import NO_REGION, Region
@@ -57,6 +58,7 @@ def scene_of_graph(graph: spark_dsg.DynamicSceneGraph) -> Scene:
         stamp_ns=about.get("stamp_ns") or max(map(_stamp_ns, (*places, *rooms, *objects)), default=0),
         environment=about.get("environment") or _environment(graph),
         task=about.get("task", ""),
+        merged_of=list(about.get("merged_of", ())),
         prior_digest=about.get("prior_digest", ""),
         space=about.get("embedding_space", ""),
         labels=labels,
@@ -67,6 +69,7 @@ def scene_of_graph(graph: spark_dsg.DynamicSceneGraph) -> Scene:
         revision=-1,  # of no store
         nodes=[msgspec.convert(node, LevelNode) for node in about.get("levels", ())],
         foresight=msgspec.convert(about.get("foresight", {}), Foresight),
+        markers=[msgspec.convert(marker, SceneMarker) for marker in about.get("markers", ())],
         **_edges(graph, places),
         **columns,
     )

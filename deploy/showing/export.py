@@ -3,6 +3,7 @@
 `scene_json` (lists sorted by id, metres, world with z up, null where nothing is known yet):
 
     origin_m      [x, y, z]                       of this world in the source's: add it to any position
+    merged_of     [robot]                         of a merged map: whose maps; empty = it is a robot's own
     robot, stamp_ns, environment, task, prior_digest, embedding_space
     labels        [label]                         columns of every posterior
     regions       [{id, label, parent, probability, unknown, predicted, area_m2, position_m [x, y, z], hull_m [[x, y]],
@@ -57,6 +58,7 @@ def scene_json(scene: Scene) -> dict[str, Any]:
     return {
         "robot": scene.robot,
         "stamp_ns": scene.stamp_ns,
+        "merged_of": scene.merged_of,
         "environment": scene.environment,
         "task": scene.task,
         "prior_digest": scene.prior_digest,

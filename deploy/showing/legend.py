@@ -21,6 +21,7 @@ from prior_sg.deploy.showing.canvas import (
 )
 from prior_sg.deploy.showing.colors import UNLABELLED, Color
 from prior_sg.deploy.showing.top_view import plane
+from prior_sg.schemas.members import headline
 from prior_sg.schemas.names import shown
 from prior_sg.schemas.scene import Scene
 
@@ -31,7 +32,7 @@ def draw_title(view: View, scene: Scene) -> None:
     """The task, and below it what the map is of."""
     left = SUPERSAMPLING * MARGIN_PX
     room_px = WIDTH_PX - 2 * MARGIN_PX
-    title = scene.task or "no task yet"
+    title = headline(scene.task, scene.merged_of, scene.plain)
     size = next((size for size in range(34, 22, -2) if _fitted(title, size, room_px, True) == title), 24)
     view.text(_fitted(title, size, room_px, True), (left, SUPERSAMPLING * 62), size, INK, True)
     counts = f"{len(scene.regions)} regions, {len(scene.place_ids)} places, {len(scene.edges)} edges"

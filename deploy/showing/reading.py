@@ -140,5 +140,8 @@ def _prior_in(path: Path, digest: str) -> Prior | None:
 
 def _some(scene: Scene | None, path: Path, robot: str) -> Scene:
     if scene is None or not len(scene.place_ids):
-        raise SourceUnreadable(f"{path} holds no places of {robot}; name another with --robot")
+        with open_history(path) as history:
+            others = [one for one in history.robots if one != robot]
+        instead = f"name one of {', '.join(others)} with --robot" if others else "nor of any other robot"
+        raise SourceUnreadable(f"{path} holds no places of {robot}; {instead}")
     return scene

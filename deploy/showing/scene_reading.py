@@ -22,6 +22,7 @@ def scene_of_json(told: dict[str, Any]) -> Scene:
         stamp_ns=told["stamp_ns"],
         environment=told["environment"],
         task=told["task"],
+        merged_of=list(told.get("merged_of", ())),
         prior_digest=told["prior_digest"],
         space=told["embedding_space"],
         labels=labels,

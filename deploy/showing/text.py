@@ -14,11 +14,12 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from prior_sg.schemas.foresight import Opening
-from prior_sg.schemas.members import said
+from prior_sg.schemas.members import headline, said
 from prior_sg.schemas.names import shown
 from prior_sg.schemas.objects import SceneObject
 from prior_sg.schemas.regions import NO_REGION, Region
 from prior_sg.schemas.scene import Scene
+from prior_sg.services.geometry import pose_from_quaternion, rows_before
 
 MOST_TOKENS, LEAST_TOKENS = 100_000, 200
 USUAL_TOKENS = 2000
@@ -54,7 +55,7 @@ def scene_text(scene: Scene, budget_tokens: int = USUAL_TOKENS) -> str:
         raise ValueError(f"a budget lies between {LEAST_TOKENS} and {MOST_TOKENS} tokens, not at {budget_tokens}")
     head = "".join(_head(scene))
     budget = Budget(budget_tokens - tokens_of(head) - FOR_OMISSIONS)
-    parts = (_camera, _regions, _elsewhere, _expected, _frontiers)
+    parts = (_camera, _regions, _elsewhere, _markers, _expected, _frontiers)
     body = [line for part in parts for line in part(scene, budget)]
     return head + "".join(body) + _omissions(budget.omitted)
 
@@ -73,9 +74,14 @@ def _cost(piece: str) -> int:
 def _head(scene: Scene) -> Iterator[str]:
     """What it is about; at most 130 tokens."""
     task, environment = _short(scene.task, LONGEST_TASK), _short(scene.environment, LONGEST_NAME)
-    yield f'Task: "{task}" in "{environment}".\n' if task else "No task yet.\n"
+    yield f'Task: "{task}" in "{environment}".\n' if task else f"{_no_task(scene)}.\n"
     yield f"{len(scene.regions)} regions, {len(scene.objects)} objects, {len(scene.place_ids)} places; "
     yield "positions (x, y, z) in metres, z up; # is an id, p a probability.\n"
+
+
+def _no_task(scene: Scene) -> str:
+    told = _short(headline("", scene.merged_of, scene.plain), LONGEST_TASK)
+    return told[0].upper() + told[1:]
 
 
 def _camera(scene: Scene, budget: Budget) -> Iterator[str]:
@@ -177,6 +183,21 @@ def _elsewhere(scene: Scene, budget: Budget) -> Iterator[str]:
     bare = int((scene.place_regions == NO_REGION).sum())
     if bare and budget.take(line := f"{bare} places belong to no region yet.\n", "other lines"):
         yield line
+
+
+def _markers(scene: Scene, budget: Budget) -> Iterator[str]:
+    """Printed markers: where each hangs, and what is doubtful about it."""
+    names = {region.id: _name(region) for region in scene.regions}
+    for marker in scene.markers:
+        pose = pose_from_quaternion(np.array(marker.position_m), np.array(marker.quaternion_xyzw))
+        rows = rows_before(pose, scene.positions_m)
+        gaps_m = np.linalg.norm(scene.positions_m[rows] - pose[:3, 3], axis=1)
+        holder = names.get(int(scene.place_regions[rows[gaps_m.argmin()]]), "") if len(rows) else ""
+        where = f"{_point(marker.position_m)}{f' in {holder}' if holder else ''}"
+        doubt = f", in doubt: {_short(marker.doubt, LONGEST_TASK)}" if marker.doubt else ""
+        line = f"Printed marker {marker.id} ({_short(marker.dictionary)}) at {where}{doubt}\n"
+        if budget.take(line, "markers"):
+            yield line
 
 
 def _expected(scene: Scene, budget: Budget) -> Iterator[str]:

@@ -4,6 +4,7 @@ Places and edges lie in blocks of consecutive ids, so that a change sends the bl
 faint and dashed; unknown places fade to grey; boxes larger than furniture stay out, as in the printed map.
 """
 
+import re
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -14,11 +15,14 @@ from prior_sg.deploy.showing.places import SHOWN_AREA_M2
 from prior_sg.deploy.viewing.footprint import Footprint, Grounds
 from prior_sg.deploy.viewing.shapes import Arrows, Lines, Mesh, Name, Picture, Points, dashed
 from prior_sg.schemas.levels import LEVELS, LevelName, LevelNode, regions_in
+from prior_sg.schemas.markers import SceneMarker
 from prior_sg.schemas.names import shown
 from prior_sg.schemas.objects import SceneObject
 from prior_sg.schemas.regions import NO_REGION, Region
 from prior_sg.schemas.scene import Scene
+from prior_sg.services.geometry import pose_from_quaternion, transform
 
+NO_NAME = r"\W"
 BLOCK = 4096  # consecutive ids of places whose dots and edges are one shape
 OBJECT_BLOCK = 512
 MOST_EDGES = 60_000
@@ -32,6 +36,8 @@ ABOVE_REGIONS_M, LEVEL_NAME_ABOVE_M = 0.06, 0.9  # outlines of the levels above,
 PATH_DASH_M, ROBOT_NAME_ABOVE_M = 0.12, 0.45
 LEAST_FORESEEN, MOST_FORESEEN = 0.1, 16  # expected regions: least probability, and how many are drawn
 DISC_M, DISC_CORNERS = 0.6, 24
+SHEET = np.array([(-0.5, -0.5, 0), (0.5, -0.5, 0), (0.5, 0.5, 0), (-0.5, 0.5, 0)])  # of a marker, in its own frame
+SHEET_OPACITY, MARKER_NAME_ABOVE_M = 0.85, 0.12
 SHORT_ARROW_M, LONG_ARROW_M = 0.25, 0.8
 CORNERS = np.array([(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)])
 EDGES_OF_BOX = [(a, b) for a in range(8) for b in range(a) if abs(CORNERS[a] - CORNERS[b]).sum() == 1]
@@ -98,6 +104,7 @@ class Painter:
         picture |= _edges(self.theme, scene, tints)
         picture |= _objects(self.theme, scene, lit)
         picture |= _openings(self.theme, scene)
+        picture |= _markers(self.theme, scene)
         picture |= self._foreseen(scene)
         picture |= _path(self.theme, scene)
         return picture
@@ -280,6 +287,35 @@ def _openings(theme: Theme, scene: Scene) -> Picture:
     lengths = np.clip(np.sqrt(scene.frontier_areas_m2[shown_]) * 0.5, SHORT_ARROW_M, LONG_ARROW_M)
     ends = starts + scene.frontier_directions[shown_] * lengths[:, None]
     return {"/frontiers/arrows": Arrows(np.stack((starts, ends), axis=1).astype(np.float32), theme.opening, 0.015)}
+
+
+def _markers(theme: Theme, scene: Scene) -> Picture:
+    """Each printed marker as a sheet of its own size, and its name; one in doubt is only an outline, and says so."""
+    picture: Picture = {}
+    for marker in scene.markers:
+        root = marker_root(marker)
+        corners_m = sheet_of(marker)
+        outline = np.stack((corners_m, np.roll(corners_m, -1, axis=0)), axis=1)
+        tint = theme.opening if marker.doubt else theme.ink
+        x, y, _ = marker.position_m
+        above = (x, y, float(corners_m[:, 2].max()) + MARKER_NAME_ABOVE_M)
+        picture[f"{root}/outline"] = Lines(outline, np.array(tint, np.uint8), 2.5)
+        picture[f"{root}/name"] = Name(f"marker {marker.id}{', in doubt' if marker.doubt else ''}", above, 0.65)
+        if not marker.doubt:
+            faces = np.array([(0, 1, 2), (0, 2, 3)], np.uint32)
+            picture[f"{root}/sheet"] = Mesh(corners_m, faces, tint, SHEET_OPACITY)
+    return picture
+
+
+def sheet_of(marker: SceneMarker) -> np.ndarray:
+    """Corners (4, 3) of a marker's square, float32, world, from below left as it is printed."""
+    pose = pose_from_quaternion(np.array(marker.position_m), np.array(marker.quaternion_xyzw))
+    return transform(pose, marker.size_m * SHEET).astype(np.float32)
+
+
+def marker_root(marker: SceneMarker) -> str:
+    """What the names of its shapes begin with: the number first, and of its dictionary what no path is made of."""
+    return f"/markers/{marker.id}/in_{re.sub(NO_NAME, '_', marker.dictionary)}"
 
 
 def _path(theme: Theme, scene: Scene) -> Picture:

@@ -16,15 +16,18 @@ from prior_sg.deploy.viewing import search, ways, words
 from prior_sg.deploy.viewing.drawing import DARK, LIGHT, Painter
 from prior_sg.deploy.viewing.footprint import floor_m
 from prior_sg.deploy.viewing.panel import CLOSE_WAY, CUT_M, FROM_ROBOT, Asked, Panel
-from prior_sg.deploy.viewing.picking import Picked, pick, typical_place
+from prior_sg.deploy.viewing.picking import Picked, PickedMarker, pick, typical_place
 from prior_sg.deploy.viewing.search import NOTHING_KNOWN
 from prior_sg.deploy.viewing.sources import Likeness, Source
 from prior_sg.deploy.viewing.stage import SafeServer, Stage
 from prior_sg.deploy.viewing.ways import FROM_THE_ROBOT, Trip, Way
-from prior_sg.schemas.queries import Spot
+from prior_sg.schemas.answers import Markers
+from prior_sg.schemas.members import only_of_robots
+from prior_sg.schemas.queries import MarkersOf, Spot
 from prior_sg.schemas.regions import NO_REGION
 from prior_sg.schemas.scene import Scene
 from prior_sg.services.errors import PriorSgError
+from prior_sg.services.scene_store.core.queries.answering import answer
 from prior_sg.services.scene_store.core.queries.index import Index
 
 SHARE = 4.0  # drawing takes at most one part in so many of the time
@@ -51,7 +54,7 @@ class Wanted:
 
     moment: int | None = None  # None = the newest
     text: str = ""  # searched for
-    picked: Picked | None = None
+    picked: Picked | PickedMarker | None = None
     goal: Spot | None = None  # the way there is shown
     start: Spot = FROM_THE_ROBOT
     cut_m: float = CUT_M
@@ -188,7 +191,7 @@ class Page:
         index = self._index = Index(scene) if self._index is None or self._index.scene is not scene else self._index
         until_ns = scene.stamp_ns if wanted.moment is not None else np.inf
         found = search.find(index, wanted.text, self._meant.get((wanted.text, scene.prior_digest), NOTHING_KNOWN))
-        picked = NO_REGION if wanted.picked is None else wanted.picked.region
+        picked = wanted.picked.region if isinstance(wanted.picked, Picked) else NO_REGION
         drawn = self._on_floor(scene)
         picture = self._painter.draw(drawn, replace(found.lit, picked=picked))
         ground_m = floor_m(drawn, np.arange(len(drawn.place_ids)))
@@ -199,7 +202,7 @@ class Page:
         sent = self.stage.show(picture).nbytes
         self.stage.look(self._source.camera(until_ns))
         self._frame(drawn, ground_m)
-        self._write(drawn, found, len(stamps))
+        self._write(index, drawn, found, len(stamps))
         self.panel.offer_floors(floors_of(scene))
         self._tell_way(way)
         self.sent_bytes += sent
@@ -221,14 +224,14 @@ class Page:
             low_m[2], high_m[2] = ground_m, min(high_m[2], ground_m + CUT_M)
             self.stage.set_bounds(low_m.astype(float), high_m.astype(float))
 
-    def _write(self, scene: Scene, found: search.Found, count: int) -> None:
+    def _write(self, index: Index, scene: Scene, found: search.Found, count: int) -> None:
         panel, wanted = self.panel, self._wanted
         panel.write("headline", words.headline(scene, self._source.title))
         panel.write("legend", words.legend(scene, self._painter.label_colors(scene)))
         self._hits = found.hits
         said = words.answers(found.hits) + (words.note(found.said) if found.said else "")
         panel.write("answers", said, tuple(str(row + 1) for row in range(len(found.hits))))
-        panel.write("selected", self._selected(scene, wanted.picked))
+        panel.write("selected", self._selected(index, scene, wanted.picked))
         newest = max(count - 1, 0)
         moment = newest if wanted.moment is None else min(wanted.moment, newest)
         panel.set_moments(count, moment)
@@ -242,10 +245,14 @@ class Page:
         story = words.way_story(way) if way is not None else words.note(START_CHOSEN) if chosen else ""
         self.panel.write("way", story, (CLOSE_WAY, FROM_ROBOT) if chosen else (CLOSE_WAY,))
 
-    def _selected(self, scene: Scene, picked: Picked | None) -> str:
+    def _selected(self, index: Index, scene: Scene, picked: Picked | PickedMarker | None) -> str:
         """The story of what was clicked, as far as it is there at this moment."""
         if picked is None:
             return ""
+        if isinstance(picked, PickedMarker):
+            found = answer(index, MarkersOf(id=picked.key.id, dictionary=picked.key.dictionary))
+            printed = found.markers if isinstance(found, Markers) else []
+            return words.marker_story(printed[0]) if printed else words.note("not there at this time")
         region = words.region_of(scene, picked.region)
         why = self._wanted.told.get("why", "")
         if picked.itself:
@@ -258,10 +265,11 @@ class Page:
             return
         scene = self._on_floor(self._index.scene)
         origin, direction = np.array(event.ray_origin), np.array(event.ray_direction)
-        picked = pick(scene, self._painter.ground(scene), origin, direction, self.stage.is_on("places"))
+        seen = {"dots": self.stage.is_on("places"), "markers": self.stage.is_on("markers")}
+        picked = pick(scene, self._painter.ground(scene), origin, direction, **seen)
         self._wanted.told.pop("why", None)
         self._want(picked=picked)
-        if picked is not None:
+        if isinstance(picked, Picked):
             self._explain(scene, picked)
 
     def _explain(self, scene: Scene, picked: Picked) -> None:
@@ -274,6 +282,9 @@ class Page:
 
         place = picked.place if picked.itself else typical_place(scene, picked.region)
         if place is None:
+            return
+        if scene.merged_of:
+            tell(words.note(only_of_robots(scene.robot, scene.merged_of, "why a place carries its label")))
             return
         try:
             tell(words.explanation(self._source.explain(place, lambda text: tell(words.note(text)))))

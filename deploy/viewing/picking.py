@@ -1,15 +1,18 @@
-"""What a click means: the place or region that a ray of sight meets first (pure)."""
+"""What a click means: the printed marker, place or region that a ray of sight meets first (pure)."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
+from prior_sg.deploy.parts import spots_of
 from prior_sg.deploy.viewing.footprint import PAD_M, Footprint
+from prior_sg.schemas.markers import MarkerKey
 from prior_sg.schemas.queries import Spot
 from prior_sg.schemas.regions import NO_REGION
 from prior_sg.schemas.scene import Scene
 
 CLOSE_RAD = 0.012  # a click that misses a dot by less means it
+CLOSE_TO_MARKER_RAD = 0.02  # likewise a marker, beside which its name stands
 
 
 @dataclass(frozen=True)
@@ -26,23 +29,52 @@ class Picked:
         return Spot(what="place", id=self.place) if self.itself else Spot(what="region", id=self.region)
 
 
+@dataclass(frozen=True)
+class PickedMarker:
+    """A printed marker."""
+
+    key: MarkerKey
+
+    @property
+    def spot(self) -> Spot:
+        """As an end of a way."""
+        return Spot(what="marker", id=self.key.id)
+
+
 def pick(
-    scene: Scene, ground: dict[int, Footprint], origin_m: np.ndarray, direction: np.ndarray, dots: bool
-) -> Picked | None:
-    """What a ray from `origin_m` (3,) along `direction` (3,) meets; `dots` says whether places can be seen."""
+    scene: Scene,
+    ground: dict[int, Footprint],
+    origin_m: np.ndarray,
+    direction: np.ndarray,
+    *,
+    dots: bool,
+    markers: bool = False,
+) -> Picked | PickedMarker | None:
+    """What a ray from `origin_m` (3,) along `direction` (3,) meets; `dots` and `markers` say whether places and printed
+    markers can be seen."""
+    direction = direction / np.linalg.norm(direction)
+    if markers and scene.markers:
+        half_m = np.array([one.size_m for one in scene.markers]) / 2
+        row = _nearest(spots_of(scene.markers) - origin_m, direction, CLOSE_TO_MARKER_RAD, half_m)
+        if row is not None:
+            return PickedMarker(scene.markers[row].key)
     if not len(scene.place_ids):
         return None
-    direction = direction / np.linalg.norm(direction)
-    offsets = scene.positions_m - origin_m
-    along = offsets @ direction
-    if dots:
-        aside = np.linalg.norm(offsets - along[:, None] * direction, axis=1)
-        angle = np.where(along > 0, aside / np.maximum(along, 1e-6), np.inf)
-        near = np.flatnonzero(angle < CLOSE_RAD)
-        if len(near):
-            return _picked(scene, int(near[along[near].argmin()]), itself=True)
+    if dots and (row := _nearest(scene.positions_m - origin_m, direction, CLOSE_RAD)) is not None:
+        return _picked(scene, row, itself=True)
     row = _below(scene, ground, origin_m, direction)
     return None if row is None else _picked(scene, row, itself=False)
+
+
+def _nearest(
+    offsets_m: np.ndarray, direction: np.ndarray, close_rad: float, half_m: np.ndarray | float = 0.0
+) -> int | None:
+    """Of spots (spot, 3) seen from the eye, the nearest that a ray along `direction` (3,) misses by less than an angle,
+    or by less than half their size (spot,)."""
+    along_m = offsets_m @ direction
+    aside_m = np.linalg.norm(offsets_m - along_m[:, None] * direction, axis=1)
+    near = np.flatnonzero((along_m > 0) & (aside_m < np.maximum(close_rad * along_m, half_m)))
+    return int(near[along_m[near].argmin()]) if len(near) else None
 
 
 def _below(scene: Scene, ground: dict[int, Footprint], origin_m: np.ndarray, direction: np.ndarray) -> int | None:

@@ -1,16 +1,20 @@
 """What a search lights up (pure)."""
 
+import re
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 from prior_sg.deploy.viewing.drawing import Lit
 from prior_sg.deploy.viewing.sources import Likeness
-from prior_sg.schemas.queries import AnswersTo, Ranking, What
+from prior_sg.schemas.answers import Ranking, SpotKind
+from prior_sg.schemas.queries import AnswersTo
 from prior_sg.schemas.scene import Scene
 from prior_sg.services.scene_store.core.queries.answering import answer
 from prior_sg.services.scene_store.core.queries.index import Index
+from prior_sg.services.scene_store.core.queries.markers import nothing_numbered
 
 MOST_ANSWERS = 5
+MARKER_NAME = re.compile(r"marker\s*#?\s*(\d{1,9})", re.IGNORECASE)
 NOTHING_KNOWN = Likeness({}, {})
 LIKELY = 0.5  # a score from which an answer is rather right than wrong
 AS_GOOD = 0.6  # of the best answer's score: what answers so well is lit, too
@@ -19,7 +23,7 @@ AS_GOOD = 0.6  # of the best answer's score: what answers so well is lit, too
 class Hit(NamedTuple):
     """One answer; without a score while its name is being typed."""
 
-    what: What
+    what: SpotKind
     id: int
     label: str
     score: float | None
@@ -74,10 +78,23 @@ def begun(scene: Scene, text: str) -> Found:
     return Found(best, lit, "" if best else f"nothing here answers {text.strip()!r}")
 
 
+def markers_called(scene: Scene, text: str) -> Found | None:
+    """The printed markers of a number, where a text is one's name and nothing else; None where it is not."""
+    number = MARKER_NAME.fullmatch(text.strip())
+    if number is None:
+        return None
+    there = [one for one in scene.markers if one.id == int(number[1])]
+    doubts = "; ".join(f"{one.key} is in doubt: {one.doubt}" for one in there if one.doubt)
+    hits = [Hit("marker", one.id, f"marker {one.id}", None) for one in there]
+    return Found(hits[:MOST_ANSWERS], Lit(), doubts if there else nothing_numbered(scene, int(number[1])))
+
+
 def find(index: Index, text: str, likeness: Likeness = NOTHING_KNOWN) -> Found:
     """What of a scene answers a text; nothing where it is empty. It says what was missing to know better."""
     if not text.strip():
         return Found([], Lit(), "")
+    if (marker := markers_called(index.scene, text)) is not None:
+        return marker
     found = found_in(ranked(index, text, likeness), index.scene, text)
     return replace(found, said=": ".join(part for part in (found.said, likeness.missing) if part))
 

@@ -40,6 +40,7 @@ LAYERS = (
     Layer("edges", "Edges", True),
     Layer("objects", "Objects", True),
     Layer("unnamed", "Unnamed objects", False),
+    Layer("markers", "Printed markers", True),
     Layer("way", "Way there", True),
     Layer("trajectory", "Robot's way", True),
     Layer("camera", "Camera", True),

@@ -7,8 +7,9 @@ import numpy as np
 
 from prior_sg.deploy.showing.colors import Color
 from prior_sg.deploy.viewing.shapes import Arrows, Lines, Name, Picture, Points, dashed
+from prior_sg.schemas.answers import Point, Route
 from prior_sg.schemas.names import shown
-from prior_sg.schemas.queries import Point, Route, RouteBetween, Spot
+from prior_sg.schemas.queries import RouteBetween, Spot
 from prior_sg.schemas.regions import NO_REGION
 from prior_sg.services.scene_store.core.queries.answering import answer
 from prior_sg.services.scene_store.core.queries.index import Index
@@ -41,10 +42,10 @@ class Way:
     """A route with the points that stand for its ends where they are none of its places, and its named waypoints."""
 
     route: Route
+    trip: Trip
     start_m: Point | None = None
     goal_m: Point | None = None
     stops: list[Stop] = field(default_factory=list)
-    from_robot: bool = True
 
 
 def way(index: Index, trip: Trip) -> Way:
@@ -53,9 +54,18 @@ def way(index: Index, trip: Trip) -> Way:
     if not isinstance(found, Route):
         raise TypeError(f"RouteBetween is answered by {type(found).__name__}")
     path_m = index.scene.trajectory
-    start_m = tuple(path_m[-1].tolist()) if trip.start.here and len(path_m) else trip.start.point_m
-    goal_m = found.goal.position_m if found.goal is not None and found.goal.what == "object" else None
-    return Way(found, start_m, goal_m, _stops(index, found), trip.start.here)
+    start_m = tuple(path_m[-1].tolist()) if trip.start.here and len(path_m) else _point_of(index, trip.start)
+    is_object = found.goal is not None and found.goal.what == "object"
+    goal_m = found.goal.position_m if found.goal is not None and is_object else _point_of(index, trip.goal)
+    return Way(found, trip, start_m, goal_m, _stops(index, found))
+
+
+def _point_of(index: Index, spot: Spot) -> Point | None:
+    """Where an end is that is a point or the only marker of its number."""
+    if spot.what != "marker":
+        return spot.point_m
+    found = [one.position_m for one in index.scene.markers if one.id == spot.id]
+    return found[0] if len(found) == 1 else None
 
 
 def _stops(index: Index, route: Route) -> list[Stop]:
@@ -113,7 +123,7 @@ def _names(way: Way, points_m: np.ndarray) -> Picture:
     x, y, z = points_m[-1].tolist()
     told = [(f"goal, {way.route.length_m:.1f} m", (x, y, z - 2 * NAME_ABOVE_M))]
     told += [(f"{number} {shown(stop.label)}", stop.point_m) for number, stop in enumerate(way.stops[1:], 1)]
-    told += [] if way.from_robot else [("start", points_m[0].tolist())]
+    told += [] if way.trip.start.here else [("start", points_m[0].tolist())]
     return {
         f"/way/names/{number}": Name(text, (x, y, z + NAME_ABOVE_M), 0.8)
         for number, (text, (x, y, z)) in enumerate(told)

@@ -12,10 +12,12 @@ from prior_sg.deploy.showing.colors import Color
 from prior_sg.deploy.viewing.drawing import edges_left_out, level_title
 from prior_sg.deploy.viewing.search import Hit
 from prior_sg.deploy.viewing.ways import Stop, Way
+from prior_sg.schemas import members
+from prior_sg.schemas.answers import MarkerInRegion, Thing
 from prior_sg.schemas.levels import nodes_above
 from prior_sg.schemas.members import said
 from prior_sg.schemas.names import shown
-from prior_sg.schemas.queries import Thing
+from prior_sg.schemas.queries import Spot
 from prior_sg.schemas.regions import NO_REGION, PosteriorReply, Region
 from prior_sg.schemas.scene import Scene
 from prior_sg.schemas.status import ServiceStatus
@@ -35,7 +37,7 @@ def text_of(text: str) -> str:
 
 def headline(scene: Scene, title: str) -> str:
     """The task in force, where, and how much there is."""
-    task = text_of(scene.task) or "no task yet"
+    task = text_of(members.headline(scene.task, scene.merged_of, scene.plain))
     counts = ", ".join(
         _counted(count, name)
         for count, name in (
@@ -46,7 +48,8 @@ def headline(scene: Scene, title: str) -> str:
     )
     if (one_of := edges_left_out(scene)) > 1:
         counts += f"; one of {one_of} edges is drawn"
-    where = " · ".join(part for part in (text_of(scene.environment), text_of(scene.robot), text_of(title)) if part)
+    named = f"{scene.robot}, {members.merged_map(scene.merged_of)}" if scene.merged_of else scene.robot
+    where = " · ".join(part for part in (text_of(scene.environment), text_of(named), text_of(title)) if part)
     return (
         f'<div style="{_BOX};padding-bottom:8px"><div style="font-size:19px;font-weight:650;line-height:1.25">{task}'
         f'</div><div style="font-size:12px;{FAINT};margin-top:3px">{where}<br>{counts}</div></div>'
@@ -63,6 +66,8 @@ _BOX = "padding:2px 12px 6px;font-size:13px;line-height:1.4"
 def legend(scene: Scene, colors: Mapping[str, Color]) -> str:
     """Regions, largest first: colour, name, what else they may be, probability and area."""
     if not scene.regions:
+        if scene.merged_of:
+            return note(f"no regions yet: they come with a task of {' or '.join(scene.merged_of)}")
         return note("no regions yet: they come with the first images and a task")
     ordered = sorted(scene.regions, key=lambda region: -region.area_m2)
     rows = "".join(_legend_row(scene, region, colors[region.label]) for region in ordered[:MOST_ROWS])
@@ -115,6 +120,20 @@ def region_story(scene: Scene, region: Region) -> str:
         lines.insert(0, "a prediction from its surroundings: barely seen itself")
     bars = _bars(candidates(scene, region), AGREES)
     return f'{_title(region.label, f"region {region.id}")}<div style="{_BOX}">{"<br>".join(lines)}{bars}</div>'
+
+
+def marker_story(found: MarkerInRegion) -> str:
+    """A printed marker in words: where it is, from how many keyframes, and what is doubtful about it."""
+    marker, region = found.marker, found.region
+    x, y, z = marker.position_m
+    where = "in no region yet" if region is None else f"in {text_of(region.label)} (region {region.id})"
+    lines = [
+        f"{where}, at x {x:.2f}, y {y:.2f}, z {z:.2f} m",
+        f"{100 * marker.size_m:.1f} cm wide, seen in {_counted(marker.frames, 'keyframe')}",
+        f"in doubt: {text_of(marker.doubt)}; nothing is concluded from it" if marker.doubt else "no doubt about it",
+    ]
+    title = _title(f"marker {marker.id}", marker.dictionary)
+    return f'{title}<div style="{_BOX}">{"<br>".join(lines)}</div>'
 
 
 def place_story(scene: Scene, place: int) -> str:
@@ -227,8 +246,13 @@ def way_story(way: Way) -> str:
     """A way in words: where to, how long and how wide, what it passes, and what of it nobody has checked."""
     route, goal = way.route, way.route.goal
     found = "Way" if route.found else "No way"
-    title = _title(f"{found} to {goal.label or 'there'}", f"{goal.what} {goal.id}") if goal else _title(found, "")
-    start = "where the robot is" if way.from_robot else _told_thing(route.start)
+    there = _marker_of(way.trip.goal)
+    if goal:
+        title = _title(f"{found} to {goal.label or 'there'}", f"{goal.what} {goal.id}")
+    else:
+        title = _title(f"{found} to {there}" if there else found, "")
+    begin = way.trip.start
+    start = "where the robot is" if begin.here else _marker_of(begin) or _told_thing(route.start)
     if not route.found:
         return title + note(route.reason)
     lines = [
@@ -248,6 +272,11 @@ def _passed(stops: Sequence[Stop]) -> str:
     """What a way leads through, with the numbers that stand on the map."""
     first, *then = (text_of(stop.label) for stop in stops)
     return f"{first} → " + " → ".join(f"{n} {label}" for n, label in enumerate(then, 1)) if then else f"within {first}"
+
+
+def _marker_of(spot: Spot) -> str:
+    """The marker that an end of a way is; empty where it is none."""
+    return f"marker {spot.id}" if spot.what == "marker" else ""
 
 
 def _told_thing(thing: Thing | None) -> str:

@@ -48,7 +48,7 @@ class Follower:
                 self._poll()
             except Exception as error:  # whatever somebody on the bus may tell: the next picture is another
                 self.picture.failures += 1
-                log.warning("the system could not be asked", extra={"reason": str(error)})
+                log.warning("the system could not be asked", extra={"why": str(error)})
             self._stopping.wait(PERIOD_S)
 
     def _poll(self) -> None:

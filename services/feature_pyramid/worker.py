@@ -72,11 +72,11 @@ def look_at(state: Worker, frame: Keyframe, cfg: Config) -> tuple[View, np.ndarr
         seen = view(frame, state.detector, sought, cfg)
     if seen.fault:
         state.losses.add(NOT_ENCODED, seen.fault, of=f"keyframe {frame.frame_id}")
-        log.warning("keyframe not encoded", extra={"frame": frame.frame_id, "reason": seen.fault})
+        log.warning("keyframe not encoded", extra={"frame": frame.frame_id, "why": seen.fault})
     elif not seen.selection.crops:
         reason = "no depth within range" if not seen.surface_m.any() else "no crop sees enough space at its depth"
         state.losses.add(WITHOUT_CROPS, reason, of=f"keyframe {frame.frame_id}")
-        log.warning("keyframe without crops", extra={"frame": frame.frame_id, "reason": reason})
+        log.warning("keyframe without crops", extra={"frame": frame.frame_id, "why": reason})
     for fault in seen.markers.faults:
         state.losses.add(MARKERS_LEFT_OUT, fault, of=f"keyframe {frame.frame_id}")
     return seen, state.encoded.pop(key) if key in state.encoded else encode(state, seen)

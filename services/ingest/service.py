@@ -89,10 +89,10 @@ def _told(state: selection.State, message: Message, cfg: Config) -> Iterator[tup
         case RawFrame():
             yield from _take(state, message, cfg)
         case BadFrame():
-            log.warning("frame unreadable", extra={"frame": message.frame_id, "reason": message.reason})
+            log.warning("frame unreadable", extra={"frame": message.frame_id, "why": message.reason})
             yield from selection.lose(state, message)
         case Unused():
-            log.warning("not used", extra={"what": message.what, "count": message.count, "reason": message.example})
+            log.warning("not used", extra={"what": message.what, "count": message.count, "why": message.example})
             yield from selection.pass_over(state, message)
         case JobDone():
             yield from selection.encoded(state, message)
@@ -120,17 +120,17 @@ def _take(state: selection.State, frame: RawFrame, cfg: Config) -> Iterator[tupl
     verdict = selection.judge(state, frame, cfg)
     yield from _refuse(state, verdict.refused)
     if verdict.held is not None:
-        log.info("frame held back", extra={"frame": frame.frame_id, "reason": verdict.held.text})
+        log.info("frame held back", extra={"frame": frame.frame_id, "why": verdict.held.text})
         yield selection.progress(state)
     if verdict.jump:
-        log.warning("believed again", extra={"frame": frame.frame_id, "reason": verdict.jump})
+        log.warning("believed again", extra={"frame": frame.frame_id, "why": verdict.jump})
     for accepted in verdict.accepted:
         yield from selection.accept(state, accepted, cfg)
 
 
 def _refuse(state: selection.State, refused: list[Held]) -> Iterator[tuple[Topic, Message]]:
     for held in refused:
-        log.warning("frame refused", extra={"frame": held.frame.frame_id, "reason": held.refusal.text})
+        log.warning("frame refused", extra={"frame": held.frame.frame_id, "why": held.refusal.text})
         yield from selection.refuse(state, held)
 
 
@@ -165,7 +165,7 @@ async def _opened(port: Port, cfg: Config) -> Source | None:
         except SourceError as error:
             if isinstance(error, LastingError) or not is_live(cfg.source):
                 raise
-            log.warning("it is not there yet", extra={"reason": str(error)})
+            log.warning("it is not there yet", extra={"why": str(error)})
             await _stopped_while(port, asyncio.sleep(SEARCH_S))
     return None
 

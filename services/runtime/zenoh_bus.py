@@ -33,7 +33,14 @@ from prior_sg.services.runtime.bus import (
 from prior_sg.services.runtime.endpoints import check_endpoint, check_host, check_reach, secured, unanswered
 from prior_sg.services.runtime.hearing import watch_hearing
 from prior_sg.services.runtime.keys import bundle_in_force
-from prior_sg.services.runtime.zenoh_session import CLOSE_TIMEOUT_S, LOGGED, client_config, close_within, quietly
+from prior_sg.services.runtime.zenoh_session import (
+    CLOSE_TIMEOUT_S,
+    LOGGED,
+    client_config,
+    close_within,
+    fixed_part,
+    quietly,
+)
 
 HEARTBEAT_S = 0.3
 PRIORITIES = {
@@ -82,6 +89,7 @@ class ZenohBus:
         self._publishers: dict[str, Any] = {}
         self._lock = threading.Lock()
         self._entities: list[Any] = []
+        self._held: dict[str, zenoh.KeyExpr] = {}
         self._end_watch = watch_hearing(self, on_deaf) if on_deaf is not None else lambda: None
 
     @staticmethod
@@ -145,6 +153,7 @@ class ZenohBus:
                 payload = _payload(topic.type, sample.payload, sample.encoding, topic.most_bytes)
                 on_sample(Sample(topic, str(sample.key_expr), payload, *unpack_header(header)))
 
+        self._hold(fixed_part(pattern))
         if topic.delivery == "latest":
             return self._kept(self._session.declare_subscriber(pattern, receive))
         subscriber = zx.declare_advanced_subscriber(
@@ -156,6 +165,14 @@ class ZenohBus:
             subscriber_detection=True,
         )
         return self._kept(subscriber.sample_miss_listener(lambda miss: on_missed(topic, miss.nb)), subscriber)
+
+    def _hold(self, key: str) -> None:
+        """Keep the number that stands for a key within this process as long as the session. Zenoh gives it up with the
+        last subscription to the key, and a sample that is just then under way to another one, by that number, is lost.
+        """
+        with self._lock:
+            if key and key not in self._held:
+                self._held[key] = self._session.declare_keyexpr(key)
 
     def _kept(self, *entities: Any) -> Callable[[], None]:
         """Hold on to what is dropped with its last reference; returns what lets go of it."""
@@ -219,7 +236,8 @@ class ZenohBus:
     def close(self) -> None:
         """Leave the bus, within a bound."""
         self._end_watch()
-        close_within(self._session, CLOSE_TIMEOUT_S)
+        readers = [entity for entity in self._entities if isinstance(entity, zenoh.Subscriber | zx.AdvancedSubscriber)]
+        close_within(self._session, CLOSE_TIMEOUT_S, readers)
 
 
 def _encoding(kind: type[Message] | None) -> zenoh.Encoding:

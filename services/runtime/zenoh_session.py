@@ -3,7 +3,8 @@
 import contextlib
 import json
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from itertools import takewhile
 from typing import Any
 
 import zenoh
@@ -54,9 +55,22 @@ def client_config(endpoint: str, bundle: Bundle | None = None) -> zenoh.Config:
     )
 
 
-def close_within(session: zenoh.Session, timeout_s: float) -> None:
-    """Close, but not for longer than the timeout: closing over a broken link can take very long."""
-    closer = threading.Thread(target=lambda: quietly(session.close), daemon=True)
+def fixed_part(pattern: str) -> str:
+    """The chunks of a key expression before its first wild card."""
+    return "/".join(takewhile(lambda chunk: "*" not in chunk, pattern.split("/")))
+
+
+def close_within(session: zenoh.Session, timeout_s: float, entities: Iterable[Any] = ()) -> None:
+    """Close, but not for longer than the timeout: closing over a broken link can take very long. `entities` of the
+    session are withdrawn first: what still comes for one while a session closes is an error to Zenoh.
+    """
+
+    def close() -> None:
+        for entity in entities:
+            quietly(entity.undeclare)
+        quietly(session.close)
+
+    closer = threading.Thread(target=close, daemon=True)
     closer.start()
     closer.join(timeout_s)
 

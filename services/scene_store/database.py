@@ -20,6 +20,7 @@ from prior_sg.schemas.priors import Prior, Task
 from prior_sg.schemas.scene import StoredRevision
 from prior_sg.services.scene_store.core import events, keeping
 from prior_sg.services.scene_store.core import graph as core
+from prior_sg.services.scene_store.core.config import Config
 from prior_sg.services.scene_store.core.image import GraphImage, graph_of, image_of
 from prior_sg.services.scene_store.storage import open_storage
 from prior_sg.services.scene_store.storage.tables import (
@@ -58,7 +59,7 @@ class Past:
 class Database:
     """One open scene database; `session` is the life of the store that writes. Raises StoreError, ExtraMissing."""
 
-    def __init__(self, cfg: core.Config, session: int = 0, *, read_only: bool = False) -> None:
+    def __init__(self, cfg: Config, session: int = 0, *, read_only: bool = False) -> None:
         self._cfg, self._session = cfg, session
         self.storage = open_storage(cfg, read_only=read_only)
         self._standings: dict[str, Standing] = {}

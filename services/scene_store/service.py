@@ -35,6 +35,8 @@ from prior_sg.schemas.topics import (
 from prior_sg.services.deltas import Follower
 from prior_sg.services.runtime.service import Ask, Identity, Output, Service
 from prior_sg.services.scene_store.core import graph as core
+from prior_sg.services.scene_store.core import telling
+from prior_sg.services.scene_store.core.config import Config
 from prior_sg.services.scene_store.core.queries.answering import reply
 from prior_sg.services.scene_store.core.queries.index import Index
 from prior_sg.services.scene_store.database import Database
@@ -65,14 +67,14 @@ class State:
     resumed: list[str]
 
 
-def init(cfg: core.Config, identity: Identity) -> State:
+def init(cfg: Config, identity: Identity) -> State:
     """Open or create the database and resume from its cursors. Raises StoreError."""
     database = Database(cfg, identity.epoch)
     robots = {name: _robot(graph) for name, graph in database.graphs().items()}
     return State(identity.epoch, database, robots, sorted(robots))
 
 
-def step(state: State, message: Message, cfg: core.Config) -> Iterator[Output]:
+def step(state: State, message: Message, cfg: Config) -> Iterator[Output]:
     """Make one input durable; every delta is committed before its revision is announced."""
     yield from _resume(state)
     match message:
@@ -135,7 +137,7 @@ def _follow(
     """Apply what is due of one writer's stream, make it durable and announce it; while deltas are missing, ask."""
     for due in follower.take(delta):
         state.database.put(robot.graph, apply(robot.graph, due), due)
-        yield SCENE_REVISION, core.revision_of(robot.graph, state.epoch)
+        yield SCENE_REVISION, telling.revision_of(robot.graph, state.epoch)
     if follower.needs_snapshot:
         yield Ask(snapshot, SnapshotRequest(robot=robot.graph.robot))
 
@@ -153,26 +155,28 @@ def _robot(graph: core.Graph) -> Robot:
     return Robot(graph, Follower(*places), Follower(*regions), Follower(*objects))
 
 
-def answer_scene(state: State, request: SceneRequest, cfg: core.Config) -> Scene:
+def answer_scene(state: State, request: SceneRequest, cfg: Config) -> Scene:
     """The scene of one robot, now or in the past; empty when nothing is stored of it, or was by then."""
     robot = state.robots.get(request.robot)
     if request.revision is None and request.stamp_ns is None:
-        return core.scene(robot.graph if robot else core.Graph(request.robot))
-    return core.scene(state.database.at(request.robot, request.revision, request.stamp_ns) or core.Graph(request.robot))
+        return telling.scene(robot.graph if robot else core.Graph(request.robot))
+    return telling.scene(
+        state.database.at(request.robot, request.revision, request.stamp_ns) or core.Graph(request.robot)
+    )
 
 
-def answer_history(state: State, request: HistoryRequest, cfg: core.Config) -> RevisionList:
+def answer_history(state: State, request: HistoryRequest, cfg: Config) -> RevisionList:
     """The revisions of one robot that can be asked for."""
     revisions = state.database.history(request.robot, request.limit, request.before)
     return RevisionList(robot=request.robot, revisions=revisions)
 
 
-def answer_query(state: State, request: SceneQuery, cfg: core.Config) -> SceneAnswer:
+def answer_query(state: State, request: SceneQuery, cfg: Config) -> SceneAnswer:
     """Questions about one robot's scene; of one that the store has never heard of, it is empty."""
 
     def older(revision: int) -> Scene | None:
         found = state.database.at(request.robot, revision)
-        return core.scene(found) if found is not None and found.revision == revision else None
+        return telling.scene(found) if found is not None and found.revision == revision else None
 
     return reply(_index(state.robots.get(request.robot) or _robot(core.Graph(request.robot))), request, older)
 
@@ -180,17 +184,17 @@ def answer_query(state: State, request: SceneQuery, cfg: core.Config) -> SceneAn
 def _index(robot: Robot) -> Index:
     """The graph as it is, prepared for questions; made once for each revision and task that somebody asks about."""
     if robot.index is None or robot.index.scene.revision != robot.graph.revision:
-        robot.index = Index(core.scene(robot.graph))
+        robot.index = Index(telling.scene(robot.graph))
     return robot.index
 
 
-def answer_task(state: State, request: TaskRequest, cfg: core.Config) -> TaskInForce:
+def answer_task(state: State, request: TaskRequest, cfg: Config) -> TaskInForce:
     """The newest task of one robot, for whoever was not there when it was given."""
     robot = state.robots.get(request.robot)
     return TaskInForce(robot=request.robot, task=robot.graph.task if robot else None)
 
 
-def answer_epoch(state: State, request: EpochRequest, cfg: core.Config) -> EpochKnown:
+def answer_epoch(state: State, request: EpochRequest, cfg: Config) -> EpochKnown:
     """How far a writer's epochs have come, for its successor."""
     robot = state.robots.get(request.robot) or _robot(core.Graph(request.robot))
     followers: dict[str, Follower[Any]] = {
@@ -217,7 +221,7 @@ SERVICE = Service(
     name="scene_store",
     purpose="keeps every robot's scene graph and its history durably and answers with it",
     scope="fleet",
-    config=core.Config,
+    config=Config,
     init=init,
     step=step,
     reads=(PLACE_DELTA, REGION_DELTA, OBJECT_DELTA, TASK, PRIOR),

@@ -1,13 +1,16 @@
 """Parts of a scene: one floor of several."""
 
+import msgspec
+
 from prior_sg.deploy.parts import floors_of, storey_of
 from prior_sg.schemas.codec import decode, encode
 from prior_sg.schemas.scene import Scene
-from tests.help.homes import joined_home, two_floors
+from tests.help.homes import joined_home, printed, two_floors
 
 
 def test_a_floor_holds_what_is_on_it_and_nothing_else():
-    scene = two_floors()
+    markers = [printed(number, (1.0, 0.2, height_m), (0.0, 1.0, 0.0)) for number, height_m in ((7, 1.5), (9, 4.5))]
+    scene = msgspec.structs.replace(two_floors(), markers=markers)
     assert [floor.id for floor in floors_of(scene)] == [4, 1]  # from below
     below, above = (storey_of(scene, floor.id) for floor in floors_of(scene))
     home = joined_home()
@@ -15,6 +18,7 @@ def test_a_floor_holds_what_is_on_it_and_nothing_else():
     assert [region.id for region in below.regions] == [region.id for region in home.regions]
     assert (above.positions_m[:, 2] > 2).all() and len(above.place_ids) == len(home.place_ids)
     assert [item.label for item in below.objects] == ["table"] and [item.label for item in above.objects] == ["bed"]
+    assert ([one.id for one in below.markers], [one.id for one in above.markers]) == ([7], [9])
     assert len(below.trajectory) == 1 and len(above.trajectory) == 2
     assert [one.place_id for one in below.foresight.openings] == [int(home.place_ids[0])]
     assert [(one.level, one.id) for one in above.nodes] == [("zone", 5), ("floor", 1), ("building", 0)]

@@ -2,7 +2,12 @@
 
 import ast
 import io
+import json
+import os
 import re
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 from hypothesis import given, settings
@@ -13,6 +18,8 @@ from prior_sg.deploy.terminal import Description, Terminal, line
 from prior_sg.schemas.names import DIRECTIONS, shown
 from tests.help.paths import ROOT
 
+FULL = Path("/dev/full")
+UNBUFFERED = {"PYTHONUNBUFFERED": "1"}
 HOSTILE = [
     "tv corner [/den]",
     "lounge [east]",
@@ -112,3 +119,23 @@ def test_house_rule_nothing_else_makes_a_console_or_writes_markup():
             if isinstance(node, ast.Attribute) and node.attr in ("from_markup", "from_ansi"):
                 found.append(f"{path.name}:{node.lineno}: {node.attr}")
     assert not found
+
+
+@pytest.mark.parametrize("more", [{}, UNBUFFERED])
+def test_what_zenoh_says_is_on_standard_error_and_results_alone_on_standard_output(endpoint, more):
+    command = [sys.executable, "-m", "prior_sg.deploy.cli.main", "health", "--json", "--connect", endpoint]
+    environment = os.environ | {"RUST_LOG": "zenoh=info", "PYTHONUNBUFFERED": ""} | more
+    done = subprocess.run(command, capture_output=True, check=False, text=True, timeout=60, env=environment)
+    assert "processes" in json.loads(done.stdout)
+    assert "zenoh::" in done.stderr
+
+
+@pytest.mark.skipif(not FULL.exists(), reason="no file that is always full")
+def test_a_full_disk_under_the_results_is_one_sentence():
+    """Also where standard output has another file than Python gave it."""
+    command, environment = [sys.executable, "-m", "prior_sg.deploy.cli.main", "topics"], os.environ | UNBUFFERED
+    with FULL.open("w") as full:
+        done = subprocess.run(
+            command, stdout=full, stderr=subprocess.PIPE, check=False, text=True, timeout=60, env=environment
+        )
+    assert done.returncode == 1 and done.stderr.startswith("prior-sg: there is no space left")

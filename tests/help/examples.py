@@ -4,6 +4,7 @@ import msgspec
 import numpy as np
 
 from prior_sg.schemas import (
+    answers,
     features,
     foresight,
     frames,
@@ -224,8 +225,9 @@ QUESTIONS = [
     queries.NodesOf(level="zone", label="ward", id=2, region=4, limit=3),
     queries.WhereToLook(label="kitchen", start=SPOT, clearance_m=0.25, limit=3),
     queries.WhatIsMissing(limit=5),
+    queries.MarkersOf(id=7, dictionary="apriltag_36h11", limit=5),
 ]
-THING = queries.Thing(
+THING = answers.Thing(
     what="object",
     id=4,
     label="stove",
@@ -236,20 +238,20 @@ THING = queries.Thing(
     distance_m=1.5,
     score=0.25,
 )
-BELIEF = queries.LabelBelief(label="kitchen", probability=0.75)
+BELIEF = answers.LabelBelief(label="kitchen", probability=0.75)
 ANSWERS = [
-    queries.Things(things=[THING], total=2, nearest_labels=["hall"], reason="r"),
-    queries.Details(
+    answers.Things(things=[THING], total=2, nearest_labels=["hall"], reason="r"),
+    answers.Details(
         thing=THING,
-        place=queries.PlaceDetails(radius_m=0.5, beliefs=[BELIEF], unknown=0.25, frontier_m2=1.5),
+        place=answers.PlaceDetails(radius_m=0.5, beliefs=[BELIEF], unknown=0.25, frontier_m2=1.5),
         region=REGION,
         object=OBJECT,
         reason="r",
     ),
-    queries.Neighbourhood(
-        neighbours=[queries.Neighbour(thing=THING, clearance_m=0.5, length_m=1.5, ways=REGION.transitions)], reason="r"
+    answers.Neighbourhood(
+        neighbours=[answers.Neighbour(thing=THING, clearance_m=0.5, length_m=1.5, ways=REGION.transitions)], reason="r"
     ),
-    queries.Route(
+    answers.Route(
         found=True,
         reason="r",
         start=THING,
@@ -262,19 +264,19 @@ ANSWERS = [
         start_gap_m=0.5,
         goal_gap_m=0.75,
     ),
-    queries.Difference(
+    answers.Difference(
         since_revision=3,
         appeared=[THING],
         gone=[THING],
-        renamed=[queries.Renamed(thing=THING, former_label="hall")],
+        renamed=[answers.Renamed(thing=THING, former_label="hall")],
         places_appeared=1,
         places_gone=2,
         places_relabelled=3,
         task_before="t",
         reason="r",
     ),
-    queries.RegionBeliefs(thing=THING, beliefs=[BELIEF], unknown=0.25, predicted_share=0.5, places=3, reason="r"),
-    queries.Words(
+    answers.RegionBeliefs(thing=THING, beliefs=[BELIEF], unknown=0.25, predicted_share=0.5, places=3, reason="r"),
+    answers.Words(
         environment="home",
         task="tidy up",
         space="s",
@@ -282,14 +284,15 @@ ANSWERS = [
         labels=["kitchen", "hall"],
         regions={"kitchen": 1},
         objects={"stove": 2},
+        merged_of=["r1", "r2"],
     ),
-    queries.Ranking(things=[THING], note="n", reason="r"),
-    queries.Nodes(nodes=[queries.NodeWithRegions(node=LEVEL_NODE, regions=[THING])], total=2, reason="r"),
-    queries.Outlook(
+    answers.Ranking(things=[THING], note="n", reason="r"),
+    answers.Nodes(nodes=[answers.NodeWithRegions(node=LEVEL_NODE, regions=[THING])], total=2, reason="r"),
+    answers.Outlook(
         label="hall",
-        prospects=[queries.Prospect(opening=FORESIGHT.openings[0], probability=0.75, expected_m=12.5, way_m=3.5)],
+        prospects=[answers.Prospect(opening=FORESIGHT.openings[0], probability=0.75, expected_m=12.5, way_m=3.5)],
         probability=0.875,
-        route=queries.Route(
+        route=answers.Route(
             found=True,
             reason="r",
             start=THING,
@@ -305,7 +308,8 @@ ANSWERS = [
         found=[THING],
         reason="r",
     ),
-    queries.Missing(labels=FORESIGHT.missing, openings=2, reason="r"),
+    answers.Missing(labels=FORESIGHT.missing, openings=2, reason="r"),
+    answers.Markers(markers=[answers.MarkerInRegion(marker=MARKER, region=THING)], total=2, reason="r"),
 ]
 
 EXAMPLES: list[Message] = [
@@ -382,6 +386,7 @@ EXAMPLES: list[Message] = [
         hull_counts=i8(3),
         hulls_m=f4([0, 0], [1, 0], [0, 1]),
         origin_m=(512e3, 5.4e6, 312.0),
+        merged_of=["r1", "r2"],
     ),
     places.SnapshotRequest(robot="r"),
     places.MapRequest(robot="r"),
@@ -535,6 +540,7 @@ EXAMPLES: list[Message] = [
         hull_counts=i8(3),
         hulls_m=f4([0, 0], [1, 0], [0, 1]),
         origin_m=(512e3, 5.4e6, 312.0),
+        merged_of=["r1", "r2"],
         revision=9,
         nodes=[LEVEL_NODE],
         foresight=FORESIGHT,

@@ -4,12 +4,15 @@ import cv2
 import msgspec
 import numpy as np
 
+from prior_sg.deploy.evaluation.printed import on_wall
 from prior_sg.schemas.foresight import Foresight, Opening
 from prior_sg.schemas.frames import Intrinsics, Keyframe
 from prior_sg.schemas.levels import LevelName, LevelNode
+from prior_sg.schemas.markers import SceneMarker
 from prior_sg.schemas.objects import SceneObject
 from prior_sg.schemas.regions import Region
 from prior_sg.schemas.scene import Scene
+from prior_sg.services.geometry import quaternion_of
 
 LABELS = ["bedroom", "kitchen"]
 
@@ -56,6 +59,24 @@ def joined_home(**changes: object) -> Scene:
     """One can go along y = 1 from the kitchen through to the bedroom, but nowhere else."""
     edges, clearances_m = np.array([(10, 12), (12, 14), (14, 16), (16, 18)]), np.array([0.5, 0.5, 0.3, 0.5], np.float32)
     return home(edges=edges, clearances_m=clearances_m, **changes)
+
+
+def printed(number: int, at_m: tuple, along_m: tuple, **changes: object) -> SceneMarker:
+    """A marker that hangs upright on a wall and looks along a level direction."""
+    x, y, z, w = quaternion_of(on_wall(np.array(at_m), np.array(along_m))).tolist()
+    fields = {"dictionary": "apriltag_36h11", "size_m": 0.16, "frames": 5, "quaternion_xyzw": (x, y, z, w)}
+    return SceneMarker(id=number, position_m=at_m, **(fields | changes))
+
+
+def marked_home(**changes: object) -> Scene:
+    """Marker 7 hangs in the kitchen on the wall to the bedroom, whose places are nearer but behind it; marker 9 has
+    been seen in two places."""
+    doubt = "it has been seen at 2 spots, up to 4.0 m from each other"
+    markers = [
+        printed(7, (4.45, 1.0, 1.5), (-1.0, 0.0, 0.0)),
+        printed(9, (8.0, 1.0, 1.5), (-1.0, 0.0, 0.0), doubt=doubt),
+    ]
+    return joined_home(markers=markers, **changes)
 
 
 def region(number: int, label: str, probability: float, position_m: tuple, **more: object) -> Region:

@@ -30,7 +30,7 @@ from prior_sg.schemas.topics import (
 )
 from prior_sg.services.runtime.bus import Hub, LocalBus
 from prior_sg.services.runtime.client import BusClient
-from prior_sg.services.scene_store.core import graph
+from prior_sg.services.scene_store.core import graph, telling
 from prior_sg.services.scene_store.core.queries.answering import reply
 from prior_sg.services.scene_store.core.queries.index import Index
 from tests.help.world import prior
@@ -155,4 +155,4 @@ def delta(robot, task, digest):
 
 
 def empty(robot):
-    return graph.scene(graph.Graph(robot))
+    return telling.scene(graph.Graph(robot))

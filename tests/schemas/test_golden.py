@@ -155,6 +155,14 @@ def test_what_was_written_before_markers_were_looked_for_has_none(name):
     assert not any(len(getattr(found, field)) for field in added if field != "marker_size_m")
 
 
+@pytest.mark.parametrize("name", ["PlaceDelta", "Scene"])
+def test_what_was_written_before_merged_maps_named_their_robots_is_a_robots_own(name):
+    message = next(example for example in EXAMPLES if by_name(example) == name)
+    fields = msgpack.unpackb(encode(message), ext_hook=msgpack.ExtType)
+    del fields["merged_of"]
+    assert decode(type(message), msgpack.packb(fields)) == msgspec.structs.replace(message, merged_of=[])
+
+
 def test_what_was_asked_before_routes_could_begin_here_begins_elsewhere():
     asked = msgpack.packb({"point_m": [1.0, 2.0, 3.0], "what": None, "id": None, "label": ""})
     assert msgspec.msgpack.decode(asked, type=Spot) == Spot(point_m=(1.0, 2.0, 3.0))

@@ -12,6 +12,7 @@ from prior_sg.services.exploring import chances_per_metre
 from prior_sg.services.segmenter.core.foresight.beyond import beyond
 from prior_sg.services.segmenter.core.foresight.config import ForesightConfig
 from prior_sg.services.segmenter.core.foresight.expectation import expected
+from prior_sg.services.segmenter.core.foresight.telling import told_chances
 
 STRAIGHT = 5  # cost of a straight step of one cell
 GOAL_SHARE = 0.5  # of a region too small to be recognised otherwise, seen: it is found
@@ -42,13 +43,16 @@ Policy = Callable[[Sight], int]
 
 
 def ours(sight: Sight) -> int:
-    """The largest chance by metre, as the product tells planners."""
+    """The largest chance by metre of those that the product tells planners; the nearest where it tells none."""
     one, cfg = sight.quest.trial, sight.cfg
     expectation = expected(one.prior, one.found(sight.explorer, sight.seen_m2), cfg)
     origins = one.origins(sight.explorer, sight.frontiers, sight.seen_m2)
     foreseen = beyond(one.views(sight.explorer, sight.frontiers, origins, sight.seen_m2, cfg), expectation, cfg)
     ways_m = sight.frontiers.steps * CELL_M / STRAIGHT
-    return int(chances_per_metre(ways_m, foreseen.within[:, sight.quest.goal], cfg.look_m).argmax())
+    chances = told_chances(foreseen.within, cfg)[:, sight.quest.goal]
+    if chances.any():
+        ways_m = np.where(chances > 0, ways_m, np.inf)
+    return int(chances_per_metre(ways_m, chances, cfg.look_m).argmax())
 
 
 POLICIES: dict[str, Policy] = {

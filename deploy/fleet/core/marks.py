@@ -15,18 +15,28 @@ APART_M = 0.5  # farther from each other, the markers of two maps under one numb
 
 
 def markers_of(maps: Iterable[Placed]) -> list[SceneMarker]:
-    """Each marker once, by its key: where the first map that knows it has it. Doubted where any of them doubts it, or
-    has it elsewhere."""
+    """Each marker once, by its key: where the first map that knows it has it, from the keyframes of all maps that have
+    it there. Doubted where any of them doubts it, or has it elsewhere."""
     found: dict[MarkerKey, tuple[str, SceneMarker]] = {}
     for one in maps:
         for marker in one.scene.markers:
             here = _moved(marker, one.fleet_from_own)
-            robot, known = found.setdefault(marker.key, (one.name.robot, here))
+            if marker.key not in found:
+                found[marker.key] = one.name.robot, here
+                continue
+            robot, known = found[marker.key]
             gap_m = float(np.linalg.norm(np.subtract(here.position_m, known.position_m)))
-            if not known.doubt and (marker.doubt or gap_m > APART_M):
-                doubt = marker.doubt or f"{robot} and {one.name.robot} have it {gap_m:.1f} m from each other"
-                found[marker.key] = robot, msgspec.structs.replace(known, doubt=doubt)
+            frames = known.frames + (here.frames if gap_m <= APART_M else 0)
+            doubt = known.doubt or _doubt(robot, one.name.robot, marker, gap_m)
+            found[marker.key] = robot, msgspec.structs.replace(known, frames=frames, doubt=doubt)
     return [marker for _, (_, marker) in sorted(found.items())]
+
+
+def _doubt(robot: str, other: str, of_other: SceneMarker, gap_m: float) -> str:
+    """Why nothing may be concluded from a marker that two maps have so far from each other; empty where it may be."""
+    if of_other.doubt:
+        return f"in {other} {of_other.doubt}"
+    return f"{robot} and {other} have it {gap_m:.1f} m from each other" if gap_m > APART_M else ""
 
 
 def _moved(marker: SceneMarker, fleet_from_own: np.ndarray) -> SceneMarker:

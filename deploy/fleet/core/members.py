@@ -13,6 +13,7 @@ from prior_sg.schemas.regions import RegionDelta
 from prior_sg.schemas.scene import Scene
 from prior_sg.services.deltas import Follower
 from prior_sg.services.scene_store.core import graph as scenes
+from prior_sg.services.scene_store.core import telling
 
 Delta = PlaceDelta | RegionDelta | ObjectDelta
 KEPT_SHARE, KEPT_M = 0.5, 1.0  # of the places that a new writer still knows under the same ids and nearby: it goes on
@@ -46,7 +47,7 @@ class Member:
     def map(self) -> Map:
         """The map as it stands."""
         if self._map is None:
-            self._map = map_of(scenes.scene(self.graph))
+            self._map = map_of(telling.scene(self.graph))
         return self._map
 
     @property

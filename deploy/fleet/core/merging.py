@@ -1,6 +1,6 @@
 """One scene of several maps, with numbers that never change (pure)."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -75,13 +75,14 @@ def merged(robot: str, sources: Sequence[Source], memory: Memory) -> Merged:
     nodes, directions, areas = openings(maps, found)
     frame_ids, cameras_m = _cameras(sources, memory)
     newest = max((one.scene for one in maps), key=lambda scene: scene.stamp_ns)
+    aimed = next((one.scene for one in maps if one.scene.prior_digest), newest)
     scene = Scene(
         robot=robot,
         stamp_ns=newest.stamp_ns,
-        environment=newest.environment,
-        task=newest.task,
-        prior_digest=newest.prior_digest,
-        space=newest.space,
+        environment=_told_by(maps, lambda scene: scene.environment),
+        task=_told_by(maps, lambda scene: scene.task),
+        prior_digest=aimed.prior_digest,
+        space=aimed.space,
         labels=beliefs.names,
         regions=[msgspec.structs.replace(region, members=members[region.id]) for region in described],
         place_ids=found.ids,
@@ -103,6 +104,19 @@ def merged(robot: str, sources: Sequence[Source], memory: Memory) -> Merged:
         markers=markers_of(maps),
     )
     return Merged(scene, frame_ids, ground)
+
+
+def _told_by(maps: Sequence[Placed], said: Callable[[Scene], str]) -> str:
+    """What the robots say of themselves, each by the first of its maps that says anything: once where they agree, else
+    with the robots' names."""
+    words: dict[str, str] = {}
+    for one in maps:
+        if told := said(one.scene):
+            words.setdefault(one.name.robot, told)
+    if len({*words.values()}) < 2:
+        return next(iter(words.values()), "")
+    saying = {told: [robot for robot in words if words[robot] == told] for told in words.values()}
+    return "; ".join(f"{told} ({', '.join(robots)})" for told, robots in saying.items())
 
 
 def levelled(found: Merged, memory: Memory, prior: Prior | None) -> Merged:

@@ -28,6 +28,7 @@ class Teller:
 
     robot: str
     epoch: int
+    merged_of: tuple[str, ...] = ()  # robots that the command names
     graph: ToldGraph = field(default_factory=ToldGraph)
     objects: ToldObjects = field(default_factory=ToldObjects)
     regions: Ledger = field(default_factory=Ledger)
@@ -58,6 +59,11 @@ class Teller:
             removed_ids = np.array(gone, np.int64)
             yield msgspec.structs.replace(self._objects(), objects=news, removed_ids=removed_ids, markers=marks)
 
+    def greeting(self) -> PlaceDelta:
+        """Whose the merged map is, before anything is in it."""
+        self.place_revision += 1
+        return self.places_snapshot()
+
     def places_snapshot(self) -> PlaceDelta:
         """Everything that was told of places."""
         cameras = _columns(dict(sorted(self.cameras_m.items())))
@@ -80,7 +86,8 @@ class Teller:
 
     def _heading(self, event: str) -> Heading:
         stamp_ns, origin_m = (0, (0.0, 0.0, 0.0)) if self.scene is None else (self.scene.stamp_ns, self.scene.origin_m)
-        return Heading(self.robot, self.epoch, self.place_revision, stamp_ns, NO_FRAME, event=event, origin_m=origin_m)
+        heading = Heading(self.robot, self.epoch, self.place_revision, stamp_ns, NO_FRAME, event=event)
+        return heading._replace(origin_m=origin_m, merged_of=self.merged_of)
 
     def _cameras(self, frame_ids: np.ndarray, cameras_m: np.ndarray) -> CameraColumns:
         """Cameras that are new or have moved."""
@@ -94,7 +101,7 @@ class Teller:
         return _columns(news)
 
     def _regions(self, scene: Scene, before: Scene | None, posterior_change: float) -> RegionDelta | None:
-        everything = before is None or before.labels != scene.labels
+        everything = before is None or _aim(before) != _aim(scene)
         if before is not None and not everything:
             self.regions.forget(np.setdiff1d(before.place_ids, scene.place_ids))
         head = msgspec.structs.replace(
@@ -133,6 +140,10 @@ class Teller:
             objects=[],
             removed_ids=np.zeros(0, np.int64),
         )
+
+
+def _aim(scene: Scene) -> tuple[list[str], str, str, str]:
+    return scene.labels, scene.task, scene.environment, scene.prior_digest
 
 
 def _columns(cameras_m: dict[int, np.ndarray]) -> CameraColumns:

@@ -27,10 +27,11 @@ from prior_sg.schemas.objects import ObjectDelta
 from prior_sg.schemas.places import PlaceDelta
 from prior_sg.schemas.priors import Prior, PriorList, PriorRequest
 from prior_sg.schemas.regions import RegionDelta
-from prior_sg.schemas.scene import Scene
+from prior_sg.schemas.scene import Scene, SceneRequest
 from prior_sg.schemas.status import Tick
 from prior_sg.services.losses import Losses
 from prior_sg.services.scene_store.core import graph as scenes
+from prior_sg.services.scene_store.core import telling
 
 GROWN = 1.1  # times as many places as when it was looked at last: a map is looked at again
 REST_TICKS = 5  # from one fitting of a relation to the next, of a map that changes and hardly grows
@@ -52,8 +53,8 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
         for robot in (*self.robots, *self.transforms):
             if fault := fault_of_robot(robot):
                 raise ValueError(fault)
-        if len({*self.robots}) < len(self.robots):
-            raise ValueError("a robot is named twice")
+        if twice := sorted(robot for robot in {*self.robots} if self.robots.count(robot) > 1):
+            raise ValueError(f"{twice[0]} is named twice: name each robot once")
         if unknown := sorted(self.transforms.keys() - {*self.robots}):
             raise ValueError(f"a transform is given for {unknown[0]}, whose map is not to be merged: name it, too")
 
@@ -96,6 +97,9 @@ def update(state: State, message: Message, cfg: Config) -> Iterator[Message]:
         for prior in message.priors:
             if prior.digest() == state.wanted:
                 state.prior = state.wanted, copied(prior)
+    elif isinstance(message, Scene):
+        if message.robot == state.robot and not len(message.place_ids) and state.teller.place_revision < 0:
+            yield state.teller.greeting()
     elif isinstance(message, Tick):
         yield from _tick(state, cfg)
 
@@ -146,6 +150,8 @@ def _follow(state: State, delta: Delta) -> Iterator[Message]:
 def _tick(state: State, cfg: Config) -> Iterator[Message]:
     members = state.members()
     state.ticks += 1
+    if state.ticks == 1:  # what the store has of a former start stays until there is something to put in its place
+        yield SceneRequest(robot=state.robot)
     yield from _aim(state, members)
     aimed = state.in_force is not state.memory.levels.prior
     if not (aimed or any(one.changed or one.to_fit for one in members)):
@@ -344,4 +350,4 @@ def _correct(state: State, one: Member, members: list[Member], cfg: Config) -> N
 
 def scene_of(state: State) -> Scene:
     """The merged scene as last made; empty before."""
-    return scenes.scene(scenes.Graph(state.robot)) if state.merged is None else state.merged.scene
+    return telling.scene(scenes.Graph(state.robot)) if state.merged is None else state.merged.scene

@@ -1,4 +1,5 @@
-"""The scene as GeoJSON: regions as polygons, objects as outlines, places and ways out as points, edges as lines.
+"""The scene as GeoJSON: regions as polygons, objects as outlines, markers, places and ways out as points, edges as
+lines.
 
 Coordinates are those of the world with its offset `origin_m` added. RFC 7946 means degrees; ours are metres, and the
 file says of what: of the reference system it was given, else of the local world. A system is written as the member
@@ -63,6 +64,9 @@ def _features(told: dict[str, Any], origin_m: np.ndarray) -> Iterator[dict[str, 
         ring = [(x0, y0), (x1, y0), (x1, y1), (x0, y1), (x0, y0)]
         facts = _facts(item, "id", "label", "probability", "known", "frames") | {"bottom_m": z0, "top_m": z1}
         yield _feature("object", "Polygon", [at(ring)], facts)
+    for marker in told["markers"]:
+        facts = _facts(marker, "id", "dictionary", "size_m", "frames", "doubt") | {"height_m": marker["position_m"][2]}
+        yield _feature("marker", "Point", at(marker["position_m"]), facts)
     for place in told["places"]:
         facts = _facts(place, "id", "radius_m", "region", "label", "unknown", "predicted")
         yield _feature("place", "Point", at(place["position_m"]), facts | {"frontier": bool(place["frontier"])})

@@ -60,6 +60,9 @@ def _layers(scene: Scene, colors: Colors) -> Iterator[Layer]:
     boxes = np.array([(*item.min_m, *item.max_m) for item in scene.objects], np.float32).reshape(-1, 2, 3)
     labels = [item.label or "?" for item in scene.objects]
     sizes = {"centers": boxes.mean(axis=1), "sizes": boxes[:, 1] - boxes[:, 0]}
+    spots_m = np.array([one.position_m for one in scene.markers], np.float32).reshape(-1, 3)
+    told = [f"marker {one.id}{', in doubt' if one.doubt else ''}" for one in scene.markers]
+    yield "markers", "Points3D", {"positions": spots_m, "labels": told, "colors": EDGE_COLOR, "radii": 0.08}
     yield "objects", "Boxes3D", sizes | {"labels": labels, "colors": OBJECT_COLOR}
 
 

@@ -14,11 +14,19 @@ import numpy as np
 from prior_sg.deploy.api.scene import Scene, flat_rows
 from prior_sg.deploy.showing.material import Material
 
+MARKER_COLUMNS = (
+    "dictionary",
+    "id",
+    "size_m",
+    *("x_m", "y_m", "z_m"),
+    *("quaternion_x", "quaternion_y", "quaternion_z", "quaternion_w"),
+    *("keyframes", "doubt"),
+)
 FORMULA_STARTS = (*"=+-@＝＋－＠", "\t", "\r", "\n")
 
 
 def write_csv(material: Material, path: Path) -> None:
-    """places, regions, objects, edges, beliefs (place, label, probability), ways, frontiers and trajectory."""
+    """places, regions, objects, edges, beliefs (place, label, probability), ways, frontiers, trajectory and markers."""
     scene, message = Scene(material.scene), material.scene
     path.mkdir(parents=True, exist_ok=True)
     for name, table in (("places", scene.places), ("regions", scene.regions), ("objects", scene.objects)):
@@ -41,6 +49,11 @@ def write_csv(material: Material, path: Path) -> None:
     frontiers = ((place, *row) for place, row in zip(message.frontier_ids.tolist(), openings, strict=True))
     _write(path / "frontiers.csv", ("place", "direction_x", "direction_y", "direction_z", "area_m2"), frontiers)
     _write(path / "trajectory.csv", ("x_m", "y_m", "z_m"), message.trajectory.tolist())
+    marks = (
+        (one.dictionary, one.id, one.size_m, *one.position_m, *one.quaternion_xyzw, one.frames, one.doubt)
+        for one in message.markers
+    )
+    _write(path / "markers.csv", MARKER_COLUMNS, marks)
 
 
 def _beliefs(scene: Scene) -> Iterator[tuple[int, str, float]]:

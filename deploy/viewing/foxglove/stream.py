@@ -33,11 +33,12 @@ from foxglove.messages import (
     Vector3,
 )
 
-from prior_sg.deploy.viewing.drawing import Painter
+from prior_sg.deploy.viewing.drawing import Painter, marker_root
 from prior_sg.deploy.viewing.foxglove.shapes import CAMERA, WORLD, cloud, entity, quaternion_of, stamp_of
 from prior_sg.deploy.viewing.shapes import Picture, Points, same
 from prior_sg.schemas.frames import Intrinsics
 from prior_sg.schemas.levels import LEVELS
+from prior_sg.schemas.markers import SceneMarker
 from prior_sg.schemas.regions import Region
 from prior_sg.schemas.scene import Scene
 
@@ -48,10 +49,12 @@ LAYERS = (
     "edges",
     "objects",
     "unnamed",
+    "markers",
     "frontiers",
     "foreseen",
     "trajectory",
 )  # of entities; the rest are points
+TOLD = {"regions": 2, "markers": 3}  # layers whose entities have facts, and how much of a shape's name names an entity
 PLACES, MAP, IMAGE, CALIBRATION = "/map/places", "/map/surface", "/camera/image", "/camera/calibration"
 DEPTH = "/camera/depth"
 TRANSFORMS, SCENE, NOTES = "/tf", "/scene", "/notes"
@@ -96,7 +99,7 @@ class Stream:
         self._notes = LogChannel(NOTES, context=context)
         self._shown: dict[str, Picture] = {}  # by topic, as sent
         self._made: dict[str, _Made] = {}  # by entity
-        self._facts: dict[str, dict[str, Any]] = {}  # by region's entity
+        self._facts: dict[str, dict[str, Any]] = {}  # by entity
         self._told: tuple[str, str] | None = None  # task and environment
 
     def show(self, scene: Scene, stamp_ns: int) -> None:
@@ -108,8 +111,9 @@ class Stream:
         if self._is_news(PLACES, points):
             self._points[PLACES].log(cloud(_dots(points), stamp_ns), log_time=stamp_ns)
         facts = {f"regions/{region.id}": facts_of(region) for region in scene.regions}
+        facts |= {marker_root(marker).lstrip("/"): marker_facts(marker) for marker in scene.markers}
         for layer, picture in by_layer.items():
-            if self._is_news(layer, picture) or (layer == "regions" and facts != self._facts):
+            if self._is_news(layer, picture) or _told_of(layer, facts) != _told_of(layer, self._facts):
                 self._layers[layer].log(self._update(layer, picture, facts, stamp_ns), log_time=stamp_ns)
         self._facts = facts
         self._scene.log(json.dumps(figures(scene)).encode(), log_time=stamp_ns)
@@ -238,6 +242,21 @@ def facts_of(region: Region) -> dict[str, Any]:
     }
 
 
+def marker_facts(marker: SceneMarker) -> dict[str, Any]:
+    """What a printed marker is, in few words."""
+    return {
+        "number": marker.id,
+        "dictionary": marker.dictionary,
+        "size_m": round(marker.size_m, 3),
+        "keyframes": marker.frames,
+        "doubt": marker.doubt or "none",
+    }
+
+
+def _told_of(layer: str, facts: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
+    return {name: told for name, told in facts.items() if _layer_of(name) == layer}
+
+
 def _layer_of(name: str) -> str:
     """Of a shape's name; what a search found lies with the objects."""
     layer = name.lstrip("/").split("/")[0]
@@ -245,9 +264,9 @@ def _layer_of(name: str) -> str:
 
 
 def _entity_of(name: str) -> str:
-    """All shapes of a region are one entity."""
+    """All shapes of a region or a marker are one entity."""
     parts = name.lstrip("/").split("/")
-    return "/".join(parts[:2] if parts[0] == "regions" else parts)
+    return "/".join(parts[: TOLD.get(parts[0])])
 
 
 def _alike(one: Picture, other: Picture) -> bool:

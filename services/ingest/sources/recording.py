@@ -164,7 +164,7 @@ def _corrections(recorded: Log, normaliser: Normaliser, options: ReadOptions) ->
         try:
             message = decode(logged.topic.type, logged.payload)
         except DecodeError as error:
-            log.warning("message unreadable", extra={"topic": logged.topic.name, "reason": str(error)})
+            log.warning("message unreadable", extra={"topic": logged.topic.name, "why": str(error)})
             continue
         if isinstance(message, Keyframe):
             stamp_ns = message.stamp_ns

@@ -80,6 +80,7 @@ class Heading(NamedTuple):
     camera_m: tuple[float, float, float] | None = None
     event: str = ""
     origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    merged_of: tuple[str, ...] = ()
 
 
 def no_ground() -> GroundColumns:
@@ -106,6 +107,7 @@ def place_delta(
         camera_m=heading.camera_m,
         event=heading.event,
         origin_m=heading.origin_m,
+        merged_of=list(heading.merged_of),
         place_ids=graph.places.place_ids,
         positions_m=graph.places.positions_m,
         radii_m=graph.places.radii_m,

@@ -95,7 +95,7 @@ class Asks:
             if answer.payload is not None:
                 self._inbox.put(Reply(ask, answer.payload))
             else:
-                log.debug("no answer yet", extra={"query": ask.query.name, "reason": answer.reason})
+                log.debug("no answer yet", extra={"query": ask.query.name, "why": answer.reason})
                 self.ask_later(ask)
 
         self._bus.call(ask.query.key_of(ask.request), encode(ask.request), ASK_TIMEOUT_S, replied)

@@ -52,7 +52,7 @@ class Giving:
     def _job_ended(self, topic: Topic) -> Callable[[Ended], None]:
         def ended(job: Ended) -> None:
             if job.error:
-                log.warning("job given up", extra={"topic": topic.name, "job": str(job.id), "reason": job.error})
+                log.warning("job given up", extra={"topic": topic.name, "job": str(job.id), "why": job.error})
             _, frame_id = cast(tuple[str, int], job.id)
             done = JobDone(
                 topic=topic.name, frame_id=frame_id, worker=job.worker, attempts=job.attempts, error=job.error

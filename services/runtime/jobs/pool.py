@@ -140,7 +140,7 @@ class JobPool:
             else:
                 ended = self._board.finished(name, job.id, self._clock_s())
         if reason not in ("", "busy"):
-            log.warning("job not done", extra={"worker": name, "job": str(job.id), "reason": reason})
+            log.warning("job not done", extra={"worker": name, "job": str(job.id), "why": reason})
         self._tell(ended)
         self._send()
 

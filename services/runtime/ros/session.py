@@ -165,9 +165,7 @@ class RosSession:
 
     def close(self) -> None:
         """Leave, within a bound; who is no longer there is told first, so that nothing comes for nobody."""
-        for entity in reversed(self._entities):
-            quietly(entity.undeclare)
-        close_within(self._session, CLOSE_TIMEOUT_S)
+        close_within(self._session, CLOSE_TIMEOUT_S, reversed(self._entities))
 
     def __enter__(self) -> "RosSession":
         return self
@@ -234,7 +232,7 @@ def _read(key: str) -> Entity | None:
     try:
         return wire.read_token(key)
     except WireError as error:
-        log.info("token not read", extra={"reason": str(error)})
+        log.info("token not read", extra={"why": str(error)})
         return None
 
 

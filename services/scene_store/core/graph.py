@@ -1,44 +1,25 @@
-"""The stored scene graph of each robot: deltas in, one consistent scene out (pure).
+"""The stored scene graph of each robot, and what deltas make of it (pure).
 
-Three streams are mirrored independently, places, regions and objects; they meet only in `scene`. So a belief about a
-place that has not arrived yet is kept, and is listed as soon as the place exists.
+Three streams are mirrored independently, places, regions and objects; they meet only in `telling.py::scene`. So a
+belief about a place that has not arrived yet is kept, and is listed as soon as the place exists.
 """
 
-import re
 from dataclasses import dataclass, field
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
 
 from prior_sg.schemas.foresight import Foresight
-from prior_sg.schemas.levels import LevelName, LevelNode, rank
+from prior_sg.schemas.levels import LevelName, LevelNode
 from prior_sg.schemas.markers import MarkerKey, SceneMarker
 from prior_sg.schemas.objects import ObjectDelta, SceneObject
 from prior_sg.schemas.places import PlaceDelta
 from prior_sg.schemas.priors import Task
-from prior_sg.schemas.regions import NO_REGION, Region, RegionDelta
-from prior_sg.schemas.scene import Scene, SceneRevision
+from prior_sg.schemas.regions import Region, RegionDelta
 from prior_sg.services.refusals import fault_of_stamp
 
 Edge = tuple[int, int]
-_PASSWORD = re.compile(r"^postgres(?:ql)?://(?:[^/@?]*:[^/@?]+@|.*[?&](?:ssl)?password=.)")
-
-
-class Config(msgspec.Struct, frozen=True, kw_only=True):
-    """Where the scene graphs are kept, and how durably."""
-
-    path: str = "out/scene.sqlite"  # file, created when missing, or postgresql://…; :memory: keeps nothing
-    synchronous: Literal["full", "normal"] = "full"  # full survives a power cut, normal a killed process
-    busy_timeout_ms: int = 5000  # wait this long for another process that holds the file
-    checkpoint_pages: int = 4000  # pages in the write-ahead log before a commit folds it into the file
-    history: Literal["all", "last", "sampled"] = "all"  # of older revisions keep all, none, or one every so often
-    history_last: int = 1000  # revisions that are always kept, the newest
-    history_every_s: float = 60.0  # what `sampled` keeps of those before: one each such time
-
-    def __post_init__(self) -> None:
-        if _PASSWORD.search(self.path):  # settings are logged and recorded
-            raise ValueError("path holds a password; leave it out and put it into PGPASSWORD or ~/.pgpass")
 
 
 class Place(NamedTuple):
@@ -106,6 +87,7 @@ class Graph:
     foresight: Foresight = field(default_factory=Foresight)
     task: Task | None = None
     origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of the world, as the place graph says
+    merged_of: tuple[str, ...] = ()  # robots, as the place graph says
     place_cursor: Cursor = field(default_factory=Cursor)
     region_cursor: Cursor = field(default_factory=Cursor)
     object_cursor: Cursor = field(default_factory=Cursor)
@@ -150,7 +132,7 @@ def apply_places(graph: Graph, delta: PlaceDelta) -> Changes:
     for (a, b), clearance_m in zip(delta.edges.tolist(), delta.clearances_m.tolist(), strict=True):
         _put_edge(graph, a, b, clearance_m, changes)
     _put_details(graph, delta, changes)
-    graph.origin_m = delta.origin_m
+    graph.origin_m, graph.merged_of = delta.origin_m, tuple(delta.merged_of)
     graph.place_cursor = Cursor(delta.epoch, delta.revision, delta.stamp_ns)
     graph.revision += 1
     return changes
@@ -265,67 +247,6 @@ def mend_task(graph: Graph, now_ns: int) -> Task | None:
     return graph.task
 
 
-def scene(graph: Graph) -> Scene:
-    """The scene graph as a message, sorted by id: equal graphs of one revision give equal bytes.
-
-    A place without a belief has region -1, a posterior of zeros and unknown mass 1. Environment and task are those the
-    regions were made for, so that they fit the labels; before the first regions, those of the task.
-    """
-    ids = sorted(graph.places)
-    places = [graph.places[place] for place in ids]
-    missing = Belief(NO_REGION, np.zeros(len(graph.alignment.labels), np.float16), 1.0)
-    beliefs = [graph.beliefs.get(place, missing) for place in ids]
-    edges = sorted(graph.edges)
-    cameras = [seen.camera_m for _, seen in sorted(graph.sightings.items()) if seen.epoch == graph.place_cursor.epoch]
-    aligned = graph.alignment
-    source = aligned if graph.region_cursor.epoch >= 0 or graph.task is None else graph.task
-    return Scene(
-        robot=graph.robot,
-        stamp_ns=stamp_ns(graph),
-        environment=source.environment,
-        task=source.task,
-        prior_digest=aligned.prior_digest,
-        space=aligned.space,
-        labels=list(aligned.labels),
-        regions=[graph.regions[region] for region in sorted(graph.regions)],
-        place_ids=np.array(ids, np.int64),
-        positions_m=rows([place.position_m for place in places], 3, np.float32),
-        radii_m=np.array([place.radius_m for place in places], np.float32),
-        basis_points=np.array([place.basis_points for place in places], np.int16),
-        place_regions=np.array([belief.region for belief in beliefs], np.int64),
-        posteriors=rows([belief.posterior for belief in beliefs], len(aligned.labels), np.float16),
-        unknown=np.array([belief.unknown for belief in beliefs], np.float16),
-        edges=rows(edges, 2, np.int64),
-        clearances_m=np.array([graph.edges[edge] for edge in edges], np.float32),
-        trajectory=rows(cameras, 3, np.float32),
-        predicted_ids=np.array(
-            [place for place, belief in zip(ids, beliefs, strict=True) if belief.predicted], np.int64
-        ),
-        objects=[graph.objects[number] for number in sorted(graph.objects)],
-        origin_m=graph.origin_m,
-        revision=graph.revision,
-        nodes=sorted(graph.nodes.values(), key=rank),
-        foresight=graph.foresight,
-        markers=[graph.markers[key] for key in sorted(graph.markers)],
-        **_details(graph),
-    )
-
-
-def _details(graph: Graph) -> dict[str, np.ndarray]:
-    """Openings and ground as columns of the scene."""
-    openings = rows([graph.frontiers[place] for place in sorted(graph.frontiers)], 4, np.float32)
-    surfaces = [graph.surfaces[place] for place in sorted(graph.surfaces)]
-    return {
-        "frontier_ids": np.array(sorted(graph.frontiers), np.int64),
-        "frontier_directions": openings[:, :3],
-        "frontier_areas_m2": openings[:, 3],
-        "surface_ids": np.array(sorted(graph.surfaces), np.int64),
-        "ellipses": rows([surface[:3] for surface in surfaces], 3, np.float32),
-        "hull_counts": np.array([(len(surface) - 3) // 2 for surface in surfaces], np.int64),
-        "hulls_m": np.concatenate([np.zeros(0, np.float32), *(surface[3:] for surface in surfaces)]).reshape(-1, 2),
-    }
-
-
 def cursors(graph: Graph) -> tuple[Cursor, Cursor, Cursor]:
     """Where the writers of places, regions and objects stand."""
     return graph.place_cursor, graph.region_cursor, graph.object_cursor
@@ -334,19 +255,6 @@ def cursors(graph: Graph) -> tuple[Cursor, Cursor, Cursor]:
 def stamp_ns(graph: Graph) -> int:
     """When the newest delta was made."""
     return max(cursor.stamp_ns for cursor in cursors(graph))
-
-
-def revision_of(graph: Graph, store_epoch: int) -> SceneRevision:
-    """What the store announces after a delta."""
-    return SceneRevision(
-        robot=graph.robot,
-        epoch=store_epoch,
-        revision=graph.revision,
-        stamp_ns=stamp_ns(graph),
-        places=len(graph.places),
-        edges=len(graph.edges),
-        regions=len(graph.regions),
-    )
 
 
 def link(graph: Graph, edge: Edge, clearance_m: float) -> None:

@@ -50,6 +50,7 @@ class GraphImage(Message, frozen=True, kw_only=True):
     nodes: list[LevelNode] = []
     foresight: Foresight = Foresight()
     markers: list[SceneMarker] = []
+    merged_of: list[str] = []
 
 
 def image_of(graph: core.Graph) -> GraphImage:
@@ -91,6 +92,7 @@ def image_of(graph: core.Graph) -> GraphImage:
         nodes=list(graph.nodes.values()),
         foresight=graph.foresight,
         markers=list(graph.markers.values()),
+        merged_of=list(graph.merged_of),
     )
 
 
@@ -106,6 +108,7 @@ def graph_of(image: GraphImage) -> core.Graph:
     _restore_regions(graph, image)
     graph.objects = {entry.id: entry for entry in image.objects}
     graph.markers = {entry.key: entry for entry in image.markers}
+    graph.merged_of = tuple(image.merged_of)
     return graph
 
 

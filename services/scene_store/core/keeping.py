@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from prior_sg.services.scene_store.core import graph as core
+from prior_sg.services.scene_store.core.config import Config
 
 EVENT_WEIGHT = 512  # bytes that applying any event is worth, beside its own
 LEAST_WEIGHT = 65_536  # below it a snapshot does not pay
@@ -36,12 +36,12 @@ def due(weight: int, snapshot_bytes: int, *, waited: bool) -> bool:
     return weight > max(snapshot_bytes, LEAST_WEIGHT) * (HELD_BACK if waited else 1)
 
 
-def sampled(cfg: core.Config, newest_ns: int, stamp_ns: int) -> bool:
+def sampled(cfg: Config, newest_ns: int, stamp_ns: int) -> bool:
     """Whether a snapshot is due because the setting wants one every so often."""
     return cfg.history == "sampled" and abs(stamp_ns - newest_ns) >= cfg.history_every_s * NS_PER_S
 
 
-def thinned(cfg: core.Config, marks: Sequence[Mark], present: int) -> Thinned | None:
+def thinned(cfg: Config, marks: Sequence[Mark], present: int) -> Thinned | None:
     """What may go, given all snapshots in order and the present revision; None = nothing.
 
     The newest `history_last` revisions and the present keep their events, counted from the last snapshot before them.

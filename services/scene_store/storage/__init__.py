@@ -1,6 +1,6 @@
 """Where events, snapshots and the index over the present lie: SQLite or PostgreSQL, behind one class."""
 
-from prior_sg.services.scene_store.core import graph as core
+from prior_sg.services.scene_store.core.config import Config
 from prior_sg.services.scene_store.storage.tables import Storage
 
 POSTGRES = ("postgresql://", "postgres://")
@@ -11,7 +11,7 @@ def is_url(path: str) -> bool:
     return path.startswith(POSTGRES)
 
 
-def open_storage(cfg: core.Config, *, read_only: bool = False) -> Storage:
+def open_storage(cfg: Config, *, read_only: bool = False) -> Storage:
     """The storage that the setting `path` names. Raises StoreError, ExtraMissing."""
     if is_url(cfg.path):
         from prior_sg.services.scene_store.storage.postgres import Postgres

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from typing import Any, LiteralString, cast
 
 from prior_sg.services.runtime import extras
-from prior_sg.services.scene_store.core import graph as core
+from prior_sg.services.scene_store.core.config import Config
 from prior_sg.services.scene_store.storage.tables import (
     LAYOUT_VERSION,
     Found,
@@ -81,7 +81,7 @@ LAYOUT = (
 class Postgres(Storage):
     """One connection to a database. Raises StoreError, ExtraMissing."""
 
-    def __init__(self, cfg: core.Config, *, read_only: bool = False) -> None:
+    def __init__(self, cfg: Config, *, read_only: bool = False) -> None:
         self.location = _location(cfg.path)
         try:
             self.connection = psycopg.connect(cfg.path, autocommit=True, connect_timeout=CONNECT_S)
@@ -96,7 +96,7 @@ class Postgres(Storage):
             self.connection.close()
             raise
 
-    def _open(self, cfg: core.Config, read_only: bool) -> None:
+    def _open(self, cfg: Config, read_only: bool) -> None:
         durably = {"full": "on", "normal": "off"}[cfg.synchronous]
         for setting, value in (
             ("synchronous_commit", durably),

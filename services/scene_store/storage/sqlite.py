@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from prior_sg.services.scene_store.core import graph as core
+from prior_sg.services.scene_store.core.config import Config
 from prior_sg.services.scene_store.storage import former
 from prior_sg.services.scene_store.storage.tables import (
     LAYOUT_VERSION,
@@ -109,7 +109,7 @@ class Sqlite(Storage):
     layout is converted; to be only read, a copy of it in memory is.
     """
 
-    def __init__(self, cfg: core.Config, *, read_only: bool = False) -> None:
+    def __init__(self, cfg: Config, *, read_only: bool = False) -> None:
         self.location = cfg.path
         try:
             if cfg.path != ":memory:" and not read_only:
@@ -124,7 +124,7 @@ class Sqlite(Storage):
         except (sqlite3.Error, OSError) as error:
             raise unusable(cfg.path, error) from error
 
-    def _open(self, cfg: core.Config, read_only: bool) -> None:
+    def _open(self, cfg: Config, read_only: bool) -> None:
         run = self.connection.execute
         run(f"PRAGMA busy_timeout = {cfg.busy_timeout_ms}")
         empty, version = content(self.connection)

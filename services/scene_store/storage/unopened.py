@@ -9,7 +9,7 @@ import time
 from pathlib import Path
 from urllib.parse import quote
 
-from prior_sg.services.scene_store.core import graph as core
+from prior_sg.services.scene_store.core.config import Config
 from prior_sg.services.scene_store.storage import is_url, open_storage
 from prior_sg.services.scene_store.storage.sqlite import check_whole, content, unusable
 from prior_sg.services.scene_store.storage.tables import StoreError
@@ -22,7 +22,7 @@ LOCKS = {  # which bytes SQLite locks: (first, length) by what is added to the n
 LOOKS, PAUSE_S = 5, 0.1  # a store's own transactions take far less
 
 
-def check_storage(cfg: core.Config) -> None:
+def check_storage(cfg: Config) -> None:
     """Raises StoreError, ExtraMissing; a SQLite file that is not there yet is none of a fault."""
     if is_url(cfg.path):
         open_storage(cfg, read_only=True).close()

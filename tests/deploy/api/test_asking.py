@@ -12,6 +12,8 @@ from prior_sg.deploy.api.client import Client
 from prior_sg.deploy.api.scene import Scene
 from prior_sg.deploy.api.vectors import RecentVectors
 from prior_sg.deploy.cli.main import main
+from prior_sg.deploy.cli.query import _require_some
+from prior_sg.deploy.errors import UserError
 from prior_sg.schemas.codec import decode, encode
 from prior_sg.schemas.features import TextEmbeddings
 from prior_sg.schemas.members import MapMember
@@ -25,6 +27,7 @@ from prior_sg.services.scene_store.core.queries.index import Index
 from prior_sg.services.scene_store.core.queries.ranking import calibrated
 from tests.deploy.api.test_scene import message
 from tests.help.foreseen import foresight
+from tests.help.homes import marked_home
 from tests.help.world import prior
 
 ROBOT = "ada"
@@ -239,6 +242,28 @@ def test_the_command_says_what_is_made_of_what(capsys, tmp_path):
     assert "made of" not in asked(capsys, path, "region", "7")[1]
 
 
+def test_the_command_tells_where_markers_are(capsys, tmp_path):
+    path = tmp_path / "scene.json"
+    Scene(marked_home()).save(path)
+
+    def ask(*words):
+        status = main(["query", *words, "--scene", str(path)])
+        out, err = capsys.readouterr()
+        return status, " ".join((out or err).split())
+
+    status, out = ask("marker", "7", "--json")
+    (found,) = json.loads(out)["answer"]
+    assert status == 0 and found["marker"]["position_m"] == [4.45, 1.0, 1.5] and found["region"]["label"] == "kitchen"
+    assert "kitchen (region 3)" in ask("marker", "7")[1] and "bedroom" not in ask("marker", "7")[1]
+    assert "2 spots" in ask("marker")[1] and "kitchen (region 3)" in ask("marker")[1]
+    status, out = ask("marker", "8")
+    assert status == 1 and "there is no marker 8; the scene has marker 7 (apriltag_36h11)" in out
+    assert "name one number" in ask("marker", "seven")[1]
+    assert "through kitchen 3" in ask("route", "place:10", "marker:7")[1]
+    scene = prior_sg.Scene.read(path)
+    assert scene.route("place:10", scene.markers(7)[0].marker).found
+
+
 def test_the_command_tells_what_was_not_seen(capsys, tmp_path):
     scene = message(foresight=foresight(message(), 2, "hall"))
     path = tmp_path / "scene.json"
@@ -269,11 +294,37 @@ def test_a_sentence_is_any_other_question_and_what_stands_in_is_said(capsys, sav
     assert status == 0 and found["answer"][0]["label"] == "kitchen" and "word by word" in found["notes"][0]
 
 
+def test_a_robot_of_whom_nothing_is_stored_is_told():
+    hub, index = Hub(), Index(message(regions=[], objects=[]))
+    LocalBus(hub).serve(
+        SCENE_QUERY.key.format(robot="*"),
+        lambda request: request.reply(encode(reply(index, decode(SceneQuery, request.payload)))),
+    )
+    with Client(robot="adda", bus=LocalBus(hub)) as client, pytest.raises(UserError, match="of a robot 'adda'"):
+        _require_some(client)
+
+
+def test_why_nothing_answers_is_said(capsys, tmp_path):
+    bare = message(
+        task="", regions=[], objects=[], labels=[], posteriors=np.zeros((3, 0), np.float16), merged_of=["r1", "r2"]
+    )
+    Scene(bare).save(tmp_path / "scene.json")
+    status, out, _ = asked(capsys, tmp_path / "scene.json", "kitchen")
+    assert status == 0 and "follow the tasks of r1, r2, and none of them was given any" in " ".join(out.split())
+
+
 @pytest.mark.parametrize(
     ("words", "reason"),
     [
         (["near", "the", "window"], "put a sentence in quotes"),
-        (["region", "kitchen"], "name one number"),
+        (["region", "kitchen"], "such as `prior-sg query region 7`"),
+        (["object", "oven"], "such as `prior-sg query object 7`"),
+        (["marker", "seven"], "such as `prior-sg query marker 7`"),
+        (["region"], "name one number"),
+        (["near"], "say `near X Y Z`"),
+        (["level"], "name a level: zone"),
+        (["route"], "two ends"),
+        (["changed", "yesterday"], "ask the running store"),
         (["label", "kitchn"], "nearest labels are: kitchen"),
         (["changed", "3"], "ask the running store"),
         (["route", "kitchen"], "two ends"),

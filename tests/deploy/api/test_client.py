@@ -10,7 +10,7 @@ from prior_sg.deploy.api.client import MOST_CHANGES, MOST_PRIORS, Changes, Clien
 from prior_sg.schemas.codec import decode, encode
 from prior_sg.schemas.priors import PriorList, PriorRequest
 from prior_sg.schemas.scene import SceneRevision
-from prior_sg.schemas.topics import PRIORS, REGION_DELTA, SCENE_REVISION
+from prior_sg.schemas.topics import PRIORS, REGION_DELTA, SCENE_REVISION, alive_key
 from prior_sg.services.runtime.bus import Hub, LocalBus
 from tests.deploy.api.test_scene import message
 from tests.help.store import StandIn, delta
@@ -68,6 +68,20 @@ def test_a_client_keeps_few_priors():
     with Client(robot=ROBOT, bus=LocalBus(hub)) as client:
         assert [client.prior_of(digest) for digest in known] == list(known.values())
         assert len(client._priors) == MOST_PRIORS
+
+
+def test_a_merged_map_takes_no_task_and_no_poses_and_says_who_does():
+    system, client = joined(scene=message(merged_of=["r1", "r2"]))
+    system.bus.bus.announce(alive_key("scene_store", "s-1"))
+    of = "ada is the merged map of r1, r2"
+    with client:
+        with pytest.raises(prior_sg.TaskError, match=f"{of} and follows what they do: give the task to a robot"):
+            client.switch("sweep")
+        with pytest.raises(prior_sg.PosesError, match=f"{of} and follows what they do: give the poses to a robot"):
+            client.correct_poses({0: np.eye(4)})
+        with pytest.raises(prior_sg.NotInSceneError, match=f"{of}: why a place carries its label is known"):
+            client.explain(1)
+    assert not system.tasks and not system.poses
 
 
 def test_why_a_task_fails_is_told():

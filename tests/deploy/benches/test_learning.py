@@ -62,6 +62,20 @@ def test_exchanged_regions_keep_all_statements_but_others_say_them(prior):
     assert sorted(prior.adjacency.ravel()) == sorted(other.adjacency.ravel())
 
 
+def test_errors_of_a_prior_that_is_right_and_of_one_that_is_not(prior):
+    """Of 0.25 in each adjacency of different regions and nothing else; a right one has no gross errors to be told."""
+    met = prior.adjacency + 0.25
+    met[0, 1] = np.nan
+    right = learning.errors(prior, prior, prior, met)
+    assert right == pytest.approx({"containment_error": 0, "adjacency_error": 0.25, "existence_error": 0})
+    other = homes.exchanged(prior, 3, np.random.default_rng(1))
+    wrong = learning.errors(other, other, prior, met)
+    gap = np.abs(other.containment - prior.containment)
+    assert wrong["containment_error"] == pytest.approx(gap.mean())
+    assert wrong["containment_error_gross"] == pytest.approx(gap[gap >= learning.GROSS].mean())
+    assert learning.errors(prior, other, prior, met)["containment_error_gross"] == 0
+
+
 def test_a_home_seen_well_is_labelled_and_counted_as_it_is(prior):
     certain = msgspec.structs.replace(prior, containment=(prior.containment > 0.3).astype(np.float32))
     labels = np.array([0, 1, 2, 3, 4, 5, 6, 7, 8])

@@ -39,6 +39,24 @@ def test_what_a_measurement_would_ignore_is_refused(option, capsys):
     assert f"{option[0]} is of the measurements" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("asked", "sentence"),
+    [
+        (("learning", "--seeds", "0-20"), "say of which kind, such as --worlds home"),
+        (("learning", "--worlds", "home", "--seeds", "0-10"), "11 seeds are too few"),
+        (("foresight", "--seeds", "some"), "--seeds some names no seeds"),
+        (("levels", "--on", "world:home:3"), "home has no levels above regions"),
+    ],
+)
+def test_seeds_that_cannot_be_measured_on_are_refused(asked, sentence, capsys):
+    assert main.main(["bench", *asked]) != 0
+    assert sentence in " ".join(capsys.readouterr().err.split())
+
+
+def test_the_first_ten_seeds_are_explored():
+    assert learning_worlds.parted(range(40, 53)) == (range(40, 50), range(50, 53))
+
+
 def test_an_unknown_kind_of_world_is_refused(capsys):
     assert main.main(["bench", "learning", "--worlds", "igloo"]) != 0
     assert "igloo" in capsys.readouterr().err
@@ -51,5 +69,5 @@ def test_learning_in_homes_tells_its_figures_and_where_it_is(tmp_path):
     metrics, settings = learning_worlds.learning_worlds_bench("home", lines.append, seeds, folder=tmp_path)
     assert metrics["f1_s_gain"] == pytest.approx(metrics["f1_s_3"] - metrics["f1_s_0"]) and 0 < metrics["f1_s_0"] < 1
     assert {"f1_s_0", "f1_s_1", "f1_s_3", "f1_s_3_right"} <= set(metrics)
-    assert (settings["explored"], settings["tested"]) == (3, 2)
+    assert (settings["explored"], settings["tested"]) == ([0, 1, 2], [7, 8])
     assert "world:home:7: seen by simlike:0.4" in lines and lines[-1].startswith("home_right: F1_S ")

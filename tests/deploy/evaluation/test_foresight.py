@@ -138,6 +138,16 @@ def test_every_policy_finds_what_is_there(policy):
     assert 4 < walked_m < 40
 
 
+def test_who_is_told_nothing_goes_to_the_nearest():
+    quest = Quest(home_trial(), 1, node(3 * ROOM, ROOM // 2))
+    silent = msgspec.structs.replace(ForesightConfig(), told_labels=0, least_share=1.1)
+    told_m, silent_m, nearest_m = (
+        metres(quest, POLICIES[name], cfg)
+        for name, cfg in (("ours", ForesightConfig()), ("ours", silent), ("nearest", silent))
+    )
+    assert silent_m == nearest_m != told_m
+
+
 def moment(outcomes, widths_m=None, label=0, met=None, left=None):
     count = len(outcomes)
     widths_m = np.full(count, 0.9) if widths_m is None else widths_m

@@ -8,7 +8,7 @@ from prior_sg.deploy.benches.queries import synthetic_scene
 from prior_sg.deploy.evaluation.search import Found, Judge, calibration_error, figures
 from prior_sg.deploy.evaluation.search_questions import QUESTIONS, TextQuestion
 from prior_sg.deploy.truth import GroundTruth, TrueObject, TrueRegion
-from prior_sg.schemas.queries import Thing
+from prior_sg.schemas.answers import Thing
 
 SCENE = synthetic_scene(900, 0)  # four rooms of 7.5 m
 

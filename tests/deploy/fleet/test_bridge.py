@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from prior_sg.deploy.cli.fleet import transforms_of
+from prior_sg.deploy.cli.main import main
 from prior_sg.deploy.errors import UserError
 from prior_sg.deploy.evaluation.priors import library_prior
 from prior_sg.deploy.fleet.bridge import KEEP_NUMBERS, SERVICE
@@ -32,7 +33,7 @@ from prior_sg.schemas.topics import (
 from prior_sg.services.registry import BY_NAME
 from prior_sg.services.runtime.runner import Pipeline, Runner
 from prior_sg.services.runtime.service import Identity, ServiceError
-from prior_sg.services.scene_store.core.graph import Config as StoreConfig
+from prior_sg.services.scene_store.core.config import Config as StoreConfig
 from tests.help import houses
 
 MOVED = level(2.3, np.array((12.0, -7.0, 0.4)))
@@ -71,6 +72,46 @@ def first(**changes):
 
 def second(**changes):
     return houses.scene("r2", MOVED, rooms=houses.ROOMS[1:], **changes)
+
+
+def test_whose_map_it_will_be_is_told_before_anything_is_in_it_and_nothing_stored_is_lost(tmp_path):
+    store = StoreConfig(path=str(tmp_path / "scene.sqlite"))
+    fleet = Fleet(store=store)
+    fleet.tick()
+    assert fleet.scene().merged_of == ["r1", "r2"] and not len(fleet.scene().place_ids)
+    fleet.tell(first())
+    fleet.tick()
+    known = fleet.scene()
+    assert len(known.place_ids) and known.merged_of == ["r1", "r2"]
+    fleet.store.close()
+    again = Fleet(epoch=6, store=store)
+    again.tick()
+    assert again.scene().place_ids.tolist() == known.place_ids.tolist() and again.scene().merged_of == ["r1", "r2"]
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["r1", "--as", "r1"], "r1 is one of the robots: give the merged map another name"),
+        (["r1", "r2", "r1", "--as", "home"], "r1 is named twice: name each robot once"),
+        (["r1", "--as", "my/home"], "holds '/'"),
+    ],
+)
+def test_what_cannot_be_merged_is_said_before_a_router_is_looked_for(words, says, capsys):
+    assert main(["fleet", *words]) == 1
+    assert says in " ".join(capsys.readouterr().err.split())
+
+
+def test_another_task_of_a_robot_is_told_though_its_regions_stay():
+    fleet = Fleet()
+    fleet.tell(msgspec.structs.replace(first(), task="tidy up"))
+    fleet.tick()
+    assert fleet.scene().task == "tidy up"
+    (now,) = (one for one in houses.deltas(first()) if isinstance(one, RegionDelta))
+    now = msgspec.structs.replace(now, revision=1, task="serve drinks")
+    fleet.pipeline.publish(topic_of(RegionDelta), now)
+    fleet.tick()
+    assert fleet.scene().task == "serve drinks"
 
 
 def test_two_robots_make_one_map():

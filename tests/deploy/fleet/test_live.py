@@ -24,7 +24,7 @@ from prior_sg.services.runtime.keys import VARIABLE
 from prior_sg.services.runtime.service import Identity
 from prior_sg.services.runtime.zenoh_bus import ZenohBus
 from prior_sg.services.runtime.zenoh_router import open_router
-from prior_sg.services.scene_store.core.graph import Config as StoreConfig
+from prior_sg.services.scene_store.core.config import Config as StoreConfig
 from tests.help import houses
 from tests.help.fleet import beyond, until
 

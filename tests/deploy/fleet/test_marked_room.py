@@ -9,8 +9,9 @@ from prior_sg.deploy.fleet.core.finding.frames import apart, level
 from prior_sg.deploy.fleet.core.finding.marking import pose_of
 from prior_sg.schemas.frames import Intrinsics
 from prior_sg.schemas.places import PlaceDelta
+from prior_sg.schemas.queries import MarkersOf, RouteBetween, SceneQuery, Spot
 from prior_sg.schemas.status import Tick
-from prior_sg.schemas.topics import KEYFRAME
+from prior_sg.schemas.topics import KEYFRAME, SCENE_QUERY
 from prior_sg.services.feature_pyramid import service as pyramids
 from prior_sg.services.feature_pyramid.core.config import Config as PyramidConfig
 from prior_sg.services.feature_pyramid.core.markers import MarkersConfig
@@ -86,7 +87,11 @@ def test_two_robots_in_a_bare_room_find_together_by_a_paper_on_the_wall():
     assert gap_m < 0.15 and gap_rad < np.radians(4)
     (marker,) = fleet.scene().markers
     assert (marker.id, marker.doubt) == (7, "") and pose_of(marker) == pytest.approx(PAPER, abs=0.08)
+    assert marker.frames == sum(fleet.scene(robot).markers[0].frames for robot in ("r1", "r2"))
     assert len(fleet.scene().place_ids) > len(fleet.scene("r1").place_ids)
+    questions = [MarkersOf(id=7), RouteBetween(start=Spot(here=True), goal=Spot(what="marker", id=7))]
+    where, way = fleet.store.answer(SCENE_QUERY, SceneQuery(robot="home", questions=questions)).answers
+    assert [one.marker for one in where.markers] == [marker] and way.found and way.goal_gap_m < 1.5
 
 
 def test_without_looking_for_markers_they_stay_apart():

@@ -169,6 +169,25 @@ def test_a_marker_that_two_related_maps_have_elsewhere_is_doubted_in_the_merged_
     assert marker.doubt == "r1 and r2 have it 5.2 m from each other"
 
 
+def test_a_marker_that_two_related_maps_have_at_one_spot_is_one_with_the_keyframes_of_both():
+    fleet = Fleet(Config(robots=("r1", "r2"), transforms={"r1": (0, 0, 0, 0), "r2": (0, 0, 0, 0)}))
+    one, two = houses.scene(markers=[(7, HALL)]), houses.scene("r2", markers=[(7, HALL)])
+    fleet.tell(one)
+    fleet.tell(two)
+    fleet.tick()
+    (marker,) = fleet.scene().markers
+    assert marker.frames == one.markers[0].frames + two.markers[0].frames and not marker.doubt
+
+
+def test_a_marker_that_one_of_the_maps_doubts_is_doubted_and_the_map_is_named():
+    fleet = Fleet(Config(robots=("r1", "r2"), transforms={"r1": (0, 0, 0, 0), "r2": (0, 0, 0, 0)}))
+    fleet.tell(houses.scene(markers=[(7, HALL)]))
+    other = houses.scene("r2", markers=[(7, HALL)])
+    fleet.tell(msgspec.structs.replace(other, markers=[msgspec.structs.replace(other.markers[0], doubt="it moved")]))
+    fleet.tick()
+    assert [marker.doubt for marker in fleet.scene().markers] == ["in r2 it moved"]
+
+
 def test_a_marker_of_a_map_that_is_taken_out_is_doubted():
     fleet = Fleet()
     fleet.tell(houses.scene(markers=[(7, HALL)], **BARE))
@@ -179,5 +198,6 @@ def test_a_marker_of_a_map_that_is_taken_out_is_doubted():
 
 
 def test_markers_are_in_the_file_of_a_scene():
-    scene = houses.scene(markers=[(7, HALL)])
-    assert scene_of_json(scene_json(scene)).markers == scene.markers
+    scene = msgspec.structs.replace(houses.scene(markers=[(7, HALL)]), merged_of=["r1", "r2"])
+    found = scene_of_json(scene_json(scene))
+    assert found.markers == scene.markers and found.merged_of == scene.merged_of

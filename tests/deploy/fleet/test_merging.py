@@ -52,6 +52,37 @@ def test_what_both_saw_is_there_once():
     assert bed.members == [MapMember(robot=robot, id=own) for robot, own in zip(("r1", "r2"), beds, strict=True)]
 
 
+def aimed(robot, pose, task):
+    """A map that follows a task; of an empty one, none and no prior."""
+    aim = {"task": task, "environment": "home" if task else "", "prior_digest": task}
+    return msgspec.structs.replace(houses.scene(robot, pose), **aim)
+
+
+@pytest.mark.parametrize(
+    ("tasks", "told"),
+    [
+        (("tidy up", "tidy up"), "tidy up"),
+        (("tidy up", "serve drinks"), "tidy up (r1); serve drinks (r2)"),
+        (("tidy up", ""), "tidy up"),
+        (("", "serve drinks"), "serve drinks"),
+        (("", ""), ""),
+    ],
+)
+def test_a_merged_map_has_the_tasks_of_its_robots(tasks, told):
+    first, second = aimed("r1", np.eye(4), tasks[0]), aimed("r2", MOVED, tasks[1])
+    scene = merged("home", [Source(ONE, first, np.eye(4)), Source(TWO, second, inverse(MOVED))], Memory()).scene
+    assert scene.task == told
+    assert scene.environment == ("home" if told else "") and bool(scene.prior_digest) == bool(told)
+
+
+def test_of_two_sessions_of_a_robot_the_present_ones_task_counts_whatever_its_stamps():
+    former, now = aimed("r1", np.eye(4), "tidy up"), aimed("r1", MOVED, "serve drinks")
+    former = msgspec.structs.replace(former, stamp_ns=now.stamp_ns + 1)
+    sources = [Source(Name("r1", 1), now, inverse(MOVED)), Source(ONE, former, np.eye(4))]
+    scene = merged("home", sources, Memory()).scene
+    assert scene.task == "serve drinks"
+
+
 def test_every_region_of_a_robot_is_in_one_and_every_merged_one_has_members():
     """Also where a robot's region has only two places, or two of them share a merged one."""
     first, second = houses.scene(), houses.scene("r2", MOVED)

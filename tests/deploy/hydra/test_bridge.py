@@ -45,7 +45,7 @@ from prior_sg.services.runtime.client import BusClient
 from prior_sg.services.runtime.host.host import Host
 from prior_sg.services.runtime.runner import Pipeline, Runner
 from prior_sg.services.runtime.service import Identity, ServiceError
-from prior_sg.services.scene_store.core.graph import Config as StoreConfig
+from prior_sg.services.scene_store.core.config import Config as StoreConfig
 from tests.help.homes import keyframe, region
 from tests.help.hydra import Symbol, add_agent, add_object, hydra_graph, posed
 from tests.help.world import ROBOT, place_grid, prior, task, text, walk

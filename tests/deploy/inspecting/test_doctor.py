@@ -28,7 +28,7 @@ from prior_sg.services.runtime import zenoh_session
 from prior_sg.services.runtime.extras import release
 from prior_sg.services.runtime.keys import ABOUT_FILE, KEY_FILE, VARIABLE
 from prior_sg.services.runtime.zenoh_bus import ZenohBus
-from prior_sg.services.scene_store.core.graph import Config
+from prior_sg.services.scene_store.core.config import Config
 from prior_sg.services.scene_store.storage import open_storage
 from prior_sg.services.scene_store.storage.tables import LAYOUT_VERSION
 

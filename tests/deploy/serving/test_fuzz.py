@@ -15,7 +15,7 @@ from prior_sg.deploy.serving.gate import Entrance
 from tests.deploy.serving.test_http import opened
 
 EXAMPLES = int(os.environ.get("PSG_FUZZ_EXAMPLES", "2"))
-OPERATIONS = 24  # all but the stream, which has no end
+OPERATIONS = 26  # all but the stream, which has no end
 
 
 @pytest.mark.parametrize("mode", list(GenerationMode))

@@ -23,6 +23,7 @@ from prior_sg.schemas.codec import decode
 from prior_sg.schemas.frames import IngestState
 from prior_sg.schemas.scene import Scene
 from prior_sg.schemas.topics import INGEST_STATE
+from tests.help.homes import marked_home
 from tests.help.served import served
 from tests.help.store import StandIn
 
@@ -121,6 +122,21 @@ def test_questions_by_address(get):
     assert get(f"{V1}/missing")["answer"] == {"type": "missing", "labels": [], "openings": 0, "reason": ""}
     assert "no opening" in get(f"{V1}/unseen?label=room kind 3")["answer"]["reason"]
     assert "knows no region 'hall'" in get(f"{V1}/unseen?label=hall&from=1,1,1")["answer"]["reason"]
+
+
+def test_markers_by_number():
+    marked = replace(SCENE, markers=marked_home().markers)
+    with opened() as (store, app, _), client_of(app) as client:
+        store.store(replace(SCENE, markers=[]))
+        assert "no printed marker" in client.get(f"{V1}/markers").json()["answer"]["reason"]
+        store.store(marked)
+        assert [one["marker"]["id"] for one in client.get(f"{V1}/markers").json()["answer"]["markers"]] == [7, 9]
+        (found,) = client.get(f"{V1}/markers/7").json()["answer"]["markers"]
+        assert found["marker"]["position_m"] == [4.45, 1.0, 1.5] and found["region"]["label"]
+        missing = client.get(f"{V1}/markers/8")
+        assert missing.status_code == 404 and "there is no marker 8" in missing.json()["detail"]
+        assert client.get(f"{V1}/route?from=1,1,1&to=marker:7").json()["answer"]["found"]
+        assert "2 spots" in client.get(f"{V1}/route?from=1,1,1&to=marker:9").json()["answer"]["reason"]
 
 
 def test_routes(get):

@@ -21,6 +21,7 @@ from prior_sg.deploy.serving.planner_text import lean
 from prior_sg.deploy.serving.system import System
 from tests.deploy.serving.test_http import SCENE, TOKEN, relabel, renamed
 from tests.help.foreseen import foresight
+from tests.help.homes import marked_home
 from tests.help.served import served
 from tests.help.store import StandIn
 
@@ -86,6 +87,20 @@ def test_five_questions_about_a_scene():
     assert way["answers"][0]["goal"]["id"] == 2 and len(way["answers"][0]["waypoints_m"]) <= 41
     assert candidates["answers"][0]["beliefs"][0]["label"] == "room kind 1"
     assert changed["answers"][0]["renamed"][0]["thing"]["label"] == "nursery" and changed["revision"] == 1
+
+
+def test_printed_markers_are_told():
+    async def answers():
+        with opened() as (store, system):
+            store.store(msgspec.structs.replace(SCENE, markers=marked_home().markers))
+            async with Client(planner(system)) as client:
+                everything, _ = await called(client, "markers")
+                one, _ = await called(client, "markers", number=7)
+                return json.loads(everything)["answers"][0]["markers"], json.loads(one)["answers"][0]["markers"]
+
+    everything, one = asyncio.run(answers())
+    assert [found["marker"]["id"] for found in everything] == [7, 9] and [found["marker"]["id"] for found in one] == [7]
+    assert "doubt" in everything[1]["marker"] and "doubt" not in everything[0]["marker"]
 
 
 def test_what_has_not_been_seen_is_foretold():
@@ -247,4 +262,4 @@ def test_over_standard_input_and_output(endpoint):
             return len((await client.list_tools()).tools), *await called(client, "changes", since=0)
 
     count, text, refused = asyncio.run(asked())
-    assert count == 15 and refused and "is the service running" in text
+    assert count == 16 and refused and "is the service running" in text

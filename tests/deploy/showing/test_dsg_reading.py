@@ -9,6 +9,7 @@ from prior_sg.deploy.showing.dsg_reading import load_spark_dsg, scene_of_graph
 from prior_sg.schemas.codec import encode
 from tests.deploy.showing.test_export import changed, flat, with_details
 from tests.deploy.showing.test_formats import told
+from tests.help.examples import MARKER
 from tests.help.foreseen import foresight
 
 Symbol = spark_dsg.NodeSymbol
@@ -27,6 +28,8 @@ def with_opening():
         frontier_areas_m2=np.array([2.3], np.float32),
         predicted_ids=np.array([16, 19]),
         foresight=foresight(flat(), 0, "hall"),
+        markers=[MARKER],
+        merged_of=["r1", "r2"],
     )
 
 

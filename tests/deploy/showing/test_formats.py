@@ -20,6 +20,7 @@ from prior_sg.schemas.members import MapMember
 from prior_sg.schemas.objects import SceneObject
 from prior_sg.schemas.regions import Transition
 from tests.deploy.showing.test_export import changed, flat, flat_map, region, with_details
+from tests.help.homes import printed
 from tests.help.paths import ROOT
 
 HOSTILE = '</script><img src=x onerror=alert(1)>"&\x01\ud7ff'
@@ -40,7 +41,14 @@ def told():
     box = {"position_m": (1.0, 0.5, 0.25), "min_m": (0.5, 0.0, 0.0), "max_m": (1.5, 1.0, 0.5)}
     item = SceneObject(id=4, label=HOSTILE, probability=0.6, known=0.9, frames=3, members=kitchen.members, **box)
     labels = {"labels": ["hall", FORMULA, "office"], "regions": [kitchen, *flat().regions[1:2]]}
-    return changed(flat(), objects=[item], origin_m=(512_345.0, 5_403_210.0, 312.0), task=HOSTILE, **labels)
+    return changed(
+        flat(),
+        objects=[item],
+        markers=[printed(7, (1.0, 0.5, 1.5), (0.0, 1.0, 0.0))],
+        origin_m=(512_345.0, 5_403_210.0, 312.0),
+        task=HOSTILE,
+        **labels,
+    )
 
 
 def written(name, tmp_path, scene=None, **beside):
@@ -95,12 +103,13 @@ def test_geojson_says_what_its_metres_are_of(tmp_path):
     for feature in collection["features"]:
         layers.setdefault(feature["properties"]["layer"], []).append(feature)
     assert {name: len(found) for name, found in layers.items()} == {
-        "region": 1, "way": 1, "object": 1, "place": 5, "edge": 5, "trajectory": 1,
+        "region": 1, "way": 1, "object": 1, "marker": 1, "place": 5, "edge": 5, "trajectory": 1,
     }  # fmt: skip
     assert all(shape(feature["geometry"]).is_valid for feature in collection["features"])
     outline = shape(layers["region"][0]["geometry"])
     assert outline.area == pytest.approx(2.0) and outline.bounds == (512345.0, 5403210.5, 512347.0, 5403211.5)
     assert layers["place"][0]["geometry"]["coordinates"] == [512345.5, 5403211.0, 313.0]
+    assert layers["marker"][0]["properties"]["id"] == 7
     assert "crs" not in collection and "zone" in collection["coordinates"]
     named_system = json.loads(written("geojson", tmp_path, crs="epsg:32632").read_text())
     assert named_system["crs"]["properties"]["name"] == "urn:ogc:def:crs:EPSG::32632"
@@ -114,6 +123,7 @@ def test_csv_tables_hold_no_formula(tmp_path):
     counts = {name: len(rows) for name, rows in tables.items()}
     assert counts == {
         "places": 5, "regions": 2, "objects": 1, "edges": 5, "beliefs": 12, "ways": 1, "frontiers": 0, "trajectory": 2,
+        "markers": 1,
     }  # fmt: skip
     assert tables["places"][1]["x_m"] == "1.5" and tables["objects"][0]["label"] == HOSTILE
     assert tables["regions"][0]["label"] == f"'{FORMULA}"
@@ -137,7 +147,16 @@ def test_rerun_reads_the_timelines(tmp_path):
     assert [entry.application_id for entry in reader.recordings()] == ["prior-sg"]
     schema = str(reader.store().schema())
     assert "timeline:revision" in schema and "timeline:stamp" in schema
-    for entity in ("places", "edges", "objects", "regions/names", "regions/outlines", "trajectory", "frontiers"):
+    for entity in (
+        "places",
+        "edges",
+        "objects",
+        "regions/names",
+        "regions/outlines",
+        "trajectory",
+        "frontiers",
+        "markers",
+    ):
         assert f"/world/{entity}:" in schema, entity
     rows = {}
     for part in reader.store().stream().to_chunks():

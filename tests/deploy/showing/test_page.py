@@ -165,7 +165,7 @@ def test_a_log_tells_how_the_scene_came_about(log):
 
 
 def test_another_robot_of_a_log_is_not_there(log):
-    with pytest.raises(Exception, match="holds no places of robot2"):
+    with pytest.raises(Exception, match="holds no places of robot2; name one of robot1 with --robot"):
         read_material(log, "robot2")
 
 

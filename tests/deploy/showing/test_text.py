@@ -17,6 +17,7 @@ from prior_sg.schemas.members import MapMember
 from prior_sg.schemas.regions import Transition
 from tests.deploy.api.test_scene import EMPTY, message, region
 from tests.help.foreseen import foresight
+from tests.help.homes import marked_home
 
 replace = msgspec.structs.replace
 LARGE = synthetic_scene(4000, 800)
@@ -63,11 +64,25 @@ def test_a_merged_region_says_what_it_is_made_of():
     assert "ada #6, ada #7 and 2 more\n" in scene_text(scene)
 
 
+def test_printed_markers_are_told_with_region_and_doubt():
+    lines = [line for line in scene_text(marked_home()).splitlines() if line.startswith("Printed")]
+    assert lines == [
+        "Printed marker 7 (apriltag_36h11) at (4.5, 1.0, 1.5) in kitchen #3",
+        "Printed marker 9 (apriltag_36h11) at (8.0, 1.0, 1.5) in bedroom #7, in doubt: it has been seen at 2 spots, "
+        "up to 4.0 m from each other",
+    ]
+
+
 def test_what_is_expected_is_told_as_such():
     scene = msgspec.structs.replace(house(), foresight=foresight(house(), 1, "hall", 0.6))
     assert "Expected, not seen: hall p 0.60, most likely p 0.60 beyond (2.5, 0.0, 1.0)\n" in scene_text(scene)
     faint = msgspec.structs.replace(house(), foresight=foresight(house(), 1, "hall", 0.1))
     assert "Expected" not in scene_text(faint)
+
+
+def test_a_merged_map_without_a_task_says_whose_it_is():
+    bare = msgspec.structs.replace(EMPTY, merged_of=["r1", "r2"])
+    assert scene_text(bare).startswith("Merged map of r1, r2: give a task to a robot.\n")
 
 
 def test_without_task_and_regions():

@@ -26,7 +26,7 @@ from prior_sg.deploy.viewing.recorded import camera_of
 from prior_sg.services.images import depth_of
 from prior_sg.services.runtime.bus import BusError
 from tests.deploy.viewing.test_recorded import log as recorded_log
-from tests.help.homes import home, keyframe, region
+from tests.help.homes import home, keyframe, marked_home, region
 
 log = recorded_log
 SCHEMAS = {
@@ -184,6 +184,17 @@ def test_what_a_region_is_said_to_be_is_told_though_it_looks_the_same(tmp_path):
     updates = [update for _, update in told(tmp_path / "a.mcap")[1]["/map/regions"]]
     facts = [{pair.key: pair.value for pair in update.entities[0].metadata} for update in updates]
     assert [fact["unknown"] for fact in facts] == ["0.0", "0.5"]
+
+
+def test_a_marker_is_one_entity_that_says_what_it_is(tmp_path):
+    save(Material(marked_home()), tmp_path / "a.mcap", "foxglove")
+    _, update = told(tmp_path / "a.mcap")[1]["/map/markers"][-1]
+    found = {entity.id: {pair.key: pair.value for pair in entity.metadata} for entity in update.entities}
+    assert sorted(found) == ["markers/7/in_apriltag_36h11", "markers/9/in_apriltag_36h11"]
+    assert (
+        found["markers/7/in_apriltag_36h11"]["doubt"] == "none"
+        and "2 spots" in found["markers/9/in_apriltag_36h11"]["doubt"]
+    )
 
 
 def test_a_file_that_cannot_be_written_is_one_sentence(capsys):

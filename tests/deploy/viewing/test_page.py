@@ -7,13 +7,15 @@ from collections.abc import Callable, Iterator
 import msgspec
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from prior_sg.deploy.cli.main import main
 from prior_sg.deploy.viewing.held import Held
 from prior_sg.deploy.viewing.page import Options, Page
-from prior_sg.deploy.viewing.picking import Picked
+from prior_sg.deploy.viewing.picking import Picked, PickedMarker
 from prior_sg.deploy.viewing.stage import pose_for
-from tests.help.homes import home, joined_home, two_floors
+from prior_sg.schemas.markers import MarkerKey
+from tests.help.homes import home, joined_home, marked_home, two_floors
 
 CHROMIUM = shutil.which("chromium") or ""
 SOFTWARE = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-background-networking")
@@ -81,6 +83,77 @@ def test_ways_to_and_from_what_was_clicked(shown: tuple[Held, Page]) -> None:
     until(lambda: "where the robot is" in page.panel.text("way") and "/way/line" in page.stage.picture)
     asked.arrive()
     until(lambda: page.panel.text("way") == "")
+
+
+def test_what_is_known_of_a_marker_is_told_when_it_is_clicked(shown: tuple[Held, Page]) -> None:
+    source, page = shown
+    source.put(marked_home())
+    until(lambda: "/markers/7/in_apriltag_36h11/name" in page.stage.picture)
+    assert page.stage.is_on("markers")
+    page._want(picked=PickedMarker(MarkerKey("apriltag_36h11", 9)))
+    until(lambda: "marker 9" in page.panel.text("selected"))
+    told = page.panel.text("selected")
+    for part in (
+        "apriltag_36h11",
+        "in bedroom (region 7)",
+        "x 8.00, y 1.00",
+        "16.0 cm",
+        "5 keyframes",
+        "in doubt: it has",
+    ):
+        assert part in told
+    page._want(picked=PickedMarker(MarkerKey("apriltag_36h11", 7)))
+    page.panel.asked.picked()
+    until(lambda: "Way to marker 7" in page.panel.text("way"))
+    assert "no doubt" in page.panel.text("selected")
+    source.put(joined_home())
+    until(lambda: "not there at this time" in page.panel.text("selected"))
+
+
+def test_why_a_place_of_a_merged_map_carries_its_label_is_known_of_its_robots(shown: tuple[Held, Page]) -> None:
+    source, page = shown
+    merged = joined_home(merged_of=["robot1", "robot2"], robot="home")
+    source.put(merged)
+    until(lambda: "merged map of robot1, robot2" in page.panel.text("headline"))
+    picked = Picked(place=12, region=3, itself=True)
+    page._want(picked=picked)
+    page._explain(merged, picked)
+    until(lambda: "known of a robot&#x27;s own map (--robot robot1)" in page.panel.text("selected"))
+
+
+@pytest.mark.skipif(not CHROMIUM, reason="Chromium is not installed")
+def test_a_click_in_the_browser_on_a_marker_tells_of_it(shown: tuple[Held, Page]) -> None:
+    sync_api = pytest.importorskip("playwright.sync_api")
+    source, page = shown
+    source.put(marked_home())
+    with sync_api.sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=CHROMIUM, args=list(SOFTWARE))
+        tab = browser.new_page(viewport={"width": 900, "height": 500})
+        tab.set_default_timeout(30_000)
+        tab.goto(page.address)
+        tab.get_by_text("serve drinks", exact=True).wait_for()
+        (viewer,) = page.server.get_clients().values()
+
+        def tells() -> bool:
+            """The eye may still turn, or the marker be on its way."""
+            tab.mouse.click(*pixel_of(viewer.camera, marked_home().markers[0].position_m))
+            time.sleep(0.5)
+            return "marker 7" in page.panel.text("selected")
+
+        until(tells, 60.0)
+        tab.get_by_text("seen in 5 keyframes", exact=False).wait_for()
+        tab.get_by_role("tab", name="Layers").click()
+        tab.get_by_label("Printed markers").uncheck()
+        until(lambda: not page.stage.is_on("markers"), 60.0)
+        browser.close()
+
+
+def pixel_of(camera, point_m: tuple) -> tuple[float, float]:
+    """Where a point of the world lies in a viewer's window."""
+    turn = Rotation.from_quat(np.roll(camera.wxyz, -1)).as_matrix()
+    x, y, z = turn.T @ (np.array(point_m) - camera.position)
+    focal_px = camera.image_height / 2 / np.tan(camera.fov / 2)
+    return float(camera.image_width / 2 + focal_px * x / z), float(camera.image_height / 2 + focal_px * y / z)
 
 
 def test_one_floor_is_shown_instead_of_all(shown: tuple[Held, Page]) -> None:

@@ -5,16 +5,16 @@ import pytest
 from prior_sg.deploy.showing.colors import PALETTE, LabelColors
 from prior_sg.deploy.viewing import drawing
 from prior_sg.deploy.viewing.cloud import Cloud, points_of
-from prior_sg.deploy.viewing.drawing import BLOCK, Lit, Painter
+from prior_sg.deploy.viewing.drawing import BLOCK, Lit, Painter, marker_root
 from prior_sg.deploy.viewing.footprint import Footprint, footprints
-from prior_sg.deploy.viewing.picking import pick, typical_place
+from prior_sg.deploy.viewing.picking import PickedMarker, pick, typical_place
 from prior_sg.deploy.viewing.search import find
 from prior_sg.deploy.viewing.shapes import Mesh, difference
 from prior_sg.deploy.viewing.sources import Likeness
-from prior_sg.deploy.viewing.words import headline
+from prior_sg.deploy.viewing.words import headline, legend
 from prior_sg.services.scene_store.core.queries.index import Index
 from tests.help.foreseen import foresight
-from tests.help.homes import home, keyframe, region
+from tests.help.homes import home, keyframe, marked_home, region
 
 
 def area_m2(ground: Footprint) -> float:
@@ -177,6 +177,47 @@ def test_without_dots_a_click_means_the_region() -> None:
     scene = home()
     picked = pick(scene, footprints(scene), np.array((2.0, 1.0, 9.0)), np.array((0.0, 0.0, -1.0)), dots=False)
     assert picked is not None and not picked.itself and typical_place(scene, picked.region) in (12, 13)
+
+
+def test_printed_markers_are_sheets_with_a_name_and_those_in_doubt_are_outlines() -> None:
+    picture = Painter().draw(marked_home())
+    sure, doubted = ("/markers/7/in_apriltag_36h11", "/markers/9/in_apriltag_36h11")
+    parts = {name for name in picture if name.startswith("/markers/")}
+    assert parts == {f"{sure}/{part}" for part in ("sheet", "outline", "name")} | {
+        f"{doubted}/{part}" for part in ("outline", "name")
+    }
+    corners_m = picture[f"{sure}/sheet"].vertices_m
+    assert corners_m[:, 0] == pytest.approx(4.45) and np.ptp(corners_m[:, 1:], axis=0) == pytest.approx((0.16, 0.16))
+    assert picture[f"{sure}/name"].text == "marker 7" and "in doubt" in picture[f"{doubted}/name"].text
+    hostile = msgspec.structs.replace(marked_home().markers[0], dictionary="a/../b<")
+    assert marker_root(hostile) == "/markers/7/in_a____b_"
+
+
+@pytest.mark.parametrize(
+    ("off_m", "markers", "number"), [(0.0, True, 7), (0.07, True, 7), (0.3, True, None), (0.0, False, None)]
+)
+def test_a_click_on_a_marker_means_it_while_it_is_shown(off_m: float, markers: bool, number: int | None) -> None:
+    scene = marked_home()
+    eye, at = np.array((1.0, 1.0, 4.0)), np.array((4.45, 1.0 + off_m, 1.5))
+    picked = pick(scene, footprints(scene), eye, at - eye, dots=False, markers=markers)
+    assert (picked.key.id if isinstance(picked, PickedMarker) else None) == number
+
+
+def test_the_name_of_a_marker_finds_it_and_what_is_doubtful_is_said() -> None:
+    index = Index(marked_home())
+    assert [(hit.what, hit.id) for hit in find(index, " Marker 7").hits] == [("marker", 7)]
+    assert "in doubt" in find(index, "marker #9").said and "no marker 8" in find(index, "marker 8").said
+    assert find(index, "marker 7 is beside the bed").hits[0].label == "bed", "a sentence is a sentence"
+
+
+def test_a_merged_map_without_a_task_says_whose_it_is_and_what_to_do() -> None:
+    bare = home(task="", regions=[], robot="home", merged_of=["robot1", "robot2"])
+    told = headline(bare, "live")
+    assert "merged map of robot1, robot2: give a task to a robot" in told and "no task yet" not in told
+    assert "a task of robot1 or robot2" in legend(bare, {})
+    assert "home, merged map of robot1, robot2" in headline(home(robot="home", merged_of=["robot1", "robot2"]), "live")
+    assert "no task: residential home as it is" in headline(home(task=""), "live")
+    assert "no task yet" in headline(home(task="", regions=[]), "live") and "merged" not in headline(home(), "live")
 
 
 def test_points_lie_where_the_depth_says_and_are_sent_once() -> None:

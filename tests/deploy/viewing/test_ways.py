@@ -5,7 +5,7 @@ from prior_sg.deploy.viewing import ways, words
 from prior_sg.deploy.viewing.ways import Trip
 from prior_sg.schemas.queries import Spot
 from prior_sg.services.scene_store.core.queries.index import Index
-from tests.help.homes import joined_home, region
+from tests.help.homes import joined_home, marked_home, region
 
 BED, FAR_CORNER = Spot(what="object", id=2), Spot(what="place", id=10)
 LINE, INK = (255, 0, 0), (0, 0, 0)
@@ -37,6 +37,16 @@ def test_the_line_goes_over_the_places_and_dashes_over_what_nobody_has_checked()
 def test_a_way_within_one_place_has_ends_and_no_line() -> None:
     drawn = ways.picture(ways.way(joined(), Trip(FAR_CORNER, FAR_CORNER)), LINE, INK)
     assert "/way/ends" in drawn and "/way/line" not in drawn
+
+
+def test_a_way_to_a_marker_is_called_so_and_ends_at_it() -> None:
+    index = Index(marked_home())
+    way = ways.way(index, Trip(Spot(what="marker", id=7), FAR_CORNER))
+    assert "Way to marker 7" in words.way_story(way) and way.goal_m == (4.45, 1.0, 1.5)
+    back = ways.way(index, Trip(FAR_CORNER, Spot(what="marker", id=7)))
+    assert "from marker 7" in words.way_story(back)
+    doubted = words.way_story(ways.way(index, Trip(Spot(what="marker", id=9), FAR_CORNER)))
+    assert "No way to marker 9" in doubted and "2 spots" in doubted
 
 
 def test_the_panel_tells_length_room_and_what_is_passed() -> None:

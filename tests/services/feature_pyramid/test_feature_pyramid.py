@@ -462,7 +462,7 @@ def test_a_keyframe_that_the_map_refuses_is_not_encoded_and_the_next_one_is(work
     before = worker.losses.count(NOT_ENCODED)
     pyramid = only(service.step(worker, msgspec.structs.replace(frame, **changes), CFG))
     assert len(pyramid.depths_m) == 0 and worker.losses.count(NOT_ENCODED) == before + 1
-    assert reason in caplog.records[-1].reason
+    assert reason in caplog.records[-1].why
     assert len(only(service.step(worker, frame, CFG)).depths_m) > 0 and worker.losses.count(NOT_ENCODED) == before + 1
 
 

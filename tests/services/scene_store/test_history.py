@@ -14,7 +14,8 @@ from prior_sg.schemas.status import Tick
 from prior_sg.schemas.topics import HISTORY
 from prior_sg.services.runtime.config import ConfigError, resolve
 from prior_sg.services.scene_store.core import graph as core
-from prior_sg.services.scene_store.core import keeping
+from prior_sg.services.scene_store.core import keeping, telling
+from prior_sg.services.scene_store.core.config import Config
 from prior_sg.services.scene_store.core.image import graph_of, image_of
 from prior_sg.services.scene_store.database import Database
 from prior_sg.services.scene_store.storage.tables import StoreAway, StoreError
@@ -100,7 +101,7 @@ def test_a_graph_is_its_image(seed, cut):
     graph = store.state.robots[ROBOT].graph if store.state.robots else core.Graph(ROBOT)
     again = graph_of(image_of(graph))
     assert encode(image_of(again)) == encode(image_of(graph))
-    assert encode(core.scene(again)) == encode(core.scene(graph))
+    assert encode(telling.scene(again)) == encode(telling.scene(graph))
     for name in ("places", "edges", "neighbours", "sightings", "regions", "objects", "alignment", "task", "origin_m"):
         if name != "neighbours":
             assert getattr(again, name) == getattr(graph, name)
@@ -177,7 +178,7 @@ MARKS = [keeping.Mark(sequence=10 * i, revision=10 * i - 1, session=1, stamp_ns=
     ],
 )
 def test_what_goes(settings, present, expected):
-    found = keeping.thinned(core.Config(**settings), MARKS, present)
+    found = keeping.thinned(Config(**settings), MARKS, present)
     if expected is not None and expected.snapshots == MARKS[:5]:
         expected = keeping.Thinned(70, [10, 20, 30, 40, 50])
     assert found == expected
@@ -312,10 +313,10 @@ def test_absurd_labels_end_no_store(place):
 def test_a_password_stays_out_of_settings_and_messages():
     for url in ("postgresql://me:secret@host/db", "postgres://host/db?user=me&password=secret"):
         with pytest.raises(ConfigError, match="PGPASSWORD") as caught:
-            resolve(core.Config, "scene_store", {"scene_store": {"path": url}})
+            resolve(Config, "scene_store", {"scene_store": {"path": url}})
         assert "secret" not in str(caught.value)
     with pytest.raises(StoreError, match="cannot be reached") as caught:
-        Database(core.Config(path="postgresql://me@127.0.0.1:1/db"))
+        Database(Config(path="postgresql://me@127.0.0.1:1/db"))
     assert "postgresql://127.0.0.1:1/db" in str(caught.value) and "\n" not in str(caught.value)
 
 
@@ -339,9 +340,9 @@ def test_an_event_of_no_kind_is_told(tmp_path):
 def test_only_one_store_writes_to_a_server(postgres):
     url = new_database(postgres)
     with pytest.raises(StoreError, match="holds no scenes"):
-        Database(core.Config(path=url), read_only=True)
+        Database(Config(path=url), read_only=True)
     store = Store(url)
     with pytest.raises(StoreError, match="written by another scene_store"):
-        Database(core.Config(path=url, busy_timeout_ms=50))
+        Database(Config(path=url, busy_timeout_ms=50))
     store.feed(place_delta(0, [(1, 0, 0, 0, 1)]))
     assert content(store.reopened().scene()) and msgspec.structs.asdict(store.cfg)["path"] == url

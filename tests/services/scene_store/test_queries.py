@@ -16,7 +16,7 @@ from prior_sg.schemas.regions import NO_REGION
 from prior_sg.schemas.topics import SCENE_QUERY
 from prior_sg.services.runtime.runner import Runner
 from prior_sg.services.scene_store import service
-from prior_sg.services.scene_store.core import graph
+from prior_sg.services.scene_store.core import graph, telling
 from prior_sg.services.scene_store.core.queries.answering import answer, reply
 from prior_sg.services.scene_store.core.queries.index import Index
 from tests.help.examples import QUESTIONS
@@ -314,7 +314,7 @@ def test_words_stand_in_for_an_embedding_and_it_is_said():
 
 
 def test_the_store_answers_over_its_revision_and_keeps_what_it_made_of_it():
-    runner = Runner(service.SERVICE, service.core.Config(path=":memory:"), wire=True)
+    runner = Runner(service.SERVICE, service.Config(path=":memory:"), wire=True)
     asked = q.SceneQuery(robot="spot", questions=[q.WordsInUse(), q.Nearest(point_m=(0.0, 0.0, 0.0), what="place")])
     assert runner.answer(SCENE_QUERY, asked).revision == -1
     runner.feed(place_delta(0, [(1, 0, 0, 1, 0.5), (2, 3, 0, 1, 0.5)]))
@@ -328,7 +328,7 @@ def test_the_store_answers_over_its_revision_and_keeps_what_it_made_of_it():
 
 
 def test_a_task_is_in_the_answers_at_once_though_it_is_no_revision():
-    runner = Runner(service.SERVICE, service.core.Config(path=":memory:"), wire=True)
+    runner = Runner(service.SERVICE, service.Config(path=":memory:"), wire=True)
     runner.feed(place_delta(0, [(1, 0, 0, 1, 0.5)]))
     asked = q.SceneQuery(robot="spot", questions=[q.WordsInUse()])
     tasks = []
@@ -340,7 +340,7 @@ def test_a_task_is_in_the_answers_at_once_though_it_is_no_revision():
 
 
 def test_every_kind_of_question_about_an_empty_scene_has_an_answer():
-    empty = Index(graph.scene(graph.Graph("r")))
+    empty = Index(telling.scene(graph.Graph("r")))
     answers = reply(empty, q.SceneQuery(robot="r", questions=QUESTIONS)).answers
     for question, found in zip(QUESTIONS, answers, strict=True):
         assert isinstance(question, q.WordsInUse) or found.reason or not found.things, question

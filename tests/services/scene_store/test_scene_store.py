@@ -32,6 +32,8 @@ from prior_sg.services.runtime.runner import Runner
 from prior_sg.services.runtime.service import Ask, Identity
 from prior_sg.services.scene_store import service
 from prior_sg.services.scene_store.core import graph as core
+from prior_sg.services.scene_store.core import telling
+from prior_sg.services.scene_store.core.config import Config
 from prior_sg.services.scene_store.database import Database
 from prior_sg.services.scene_store.storage.sqlite import APPLICATION_ID
 from prior_sg.services.scene_store.storage.tables import StoreError
@@ -102,7 +104,7 @@ class Store:
     """A store driven by hand, on a file or in memory; it survives a killed process, not a power cut."""
 
     def __init__(self, path=":memory:", **settings):
-        self.cfg = core.Config(path=str(path), **{"synchronous": "normal", **settings})
+        self.cfg = Config(path=str(path), **{"synchronous": "normal", **settings})
         self.runner = Runner(service.SERVICE, self.cfg, IDENTITY, wire=True)
         self.state = self.runner.state
 
@@ -525,9 +527,9 @@ def test_a_file_of_an_older_layout_that_is_only_read_stays_as_it_is(tmp_path, la
     missing = ("DROP TABLE place_details", "DROP TABLE objects") if layout == 1 else ()
     write_layout_5(path, *OLDER.get(layout, ()), *missing, f"PRAGMA user_version = {layout}")
     before = path.read_bytes()
-    reader = Database(core.Config(path=str(path)), read_only=True)
+    reader = Database(Config(path=str(path)), read_only=True)
     expected = decode(Scene, SCENE_OF_LAYOUT_5.read_bytes())
-    assert core.scene(reader.at(ROBOT)).place_ids.tolist() == expected.place_ids.tolist()
+    assert telling.scene(reader.at(ROBOT)).place_ids.tolist() == expected.place_ids.tolist()
     with pytest.raises(StoreError):
         reader.put_task(core.Graph(ROBOT), Task(robot=ROBOT, stamp_ns=1, environment="e", task="t"))
     reader.close()
@@ -633,20 +635,20 @@ def test_a_failed_commit_leaves_the_file_as_it_was(tmp_path):
     with pytest.raises(StoreError, match="disk full"):
         store.feed(place_delta(1, [(2, 0, 0, 0, 1)], [(1, 2, 0.5)]))
     database = Database(store.cfg)
-    assert encode(core.scene(database.graphs()[ROBOT])) == before
+    assert encode(telling.scene(database.graphs()[ROBOT])) == before
 
 
 def test_a_stored_robot_whose_name_cannot_be_used_is_left_out(tmp_path, caplog):
     """Files of earlier versions may hold some; the others go on."""
     path = str(tmp_path / "scene.sqlite")
-    database = Database(core.Config(path=path))
+    database = Database(Config(path=path))
     database.storage.robot_key("x//y")
     database.storage.robot_key(b"bytes")
     task = Task(robot="good", stamp_ns=1, environment="e", task="'; DROP TABLE robots;--")
     graph = core.Graph("good", task=task)
     database.put_task(graph, task)
     database.close()
-    database = Database(core.Config(path=path))
+    database = Database(Config(path=path))
     with caplog.at_level("WARNING"):
         graphs = database.graphs()
     database.close()

@@ -95,3 +95,18 @@ def test_what_is_missing_is_told_with_the_openings_it_may_be_behind():
     assert [one.label for one in found.labels] == [LABEL] and found.openings == 2
     bare = msgspec.structs.replace(SCENE, task="")
     assert "none was given" in answer(Index(bare), q.WhatIsMissing()).reason
+
+
+@pytest.mark.parametrize("question", [q.WhatIsMissing(), q.WhereToLook(label=LABEL)])
+def test_of_a_merged_map_it_says_whom_to_ask(question):
+    merged = msgspec.structs.replace(SCENE, robot="home", merged_of=["r1", "r2"])
+    reason = answer(Index(merged), question).reason
+    assert reason == (
+        "home is the merged map of r1, r2: what has not been seen is known of a robot's own map (--robot r1)"
+    )
+
+
+def test_what_a_merged_map_without_a_task_waits_for_is_said():
+    bare = msgspec.structs.replace(SCENE, task="", regions=[], labels=[], merged_of=["r1", "r2"])
+    told = answer(Index(bare), q.ById(what="region", id=1)).reason
+    assert told.endswith("regions and names follow the tasks of r1, r2, and none of them was given any")

@@ -222,6 +222,24 @@ def test_only_what_changes_visibly_is_news():
     assert [differs(now, msgspec.structs.replace(now, openings=[one]), CFG) for one in moved] == [False, True]
 
 
+def test_an_opening_tells_every_label_that_it_is_among_the_best_for():
+    """Searches would pass it by; what is likelier elsewhere is told where it is among the likeliest of an opening."""
+    graph, places = a_map()
+    openings = openings_of(graph, places, opened((10, (0, 1, 0), 2.0), (40, (0, -1, 0), 2.0)), CFG)
+    state_of = {7: region(7, "hall"), 8: region(8, "bath")}
+
+    def told(**fields):
+        cfg = msgspec.structs.replace(CFG, told_labels=1, **fields)
+        openings_told = foresight(openings, state_of, home(), cfg).openings
+        assert all(one.labels == sorted(one.labels, key=lambda entry: -entry.within) for one in openings_told)
+        return [len(one.labels) for one in openings_told]
+
+    assert told(least_share=0.01) == [4, 4]
+    assert told(least_share=0.5) != [4, 4] and sum(told(least_share=0.5)) >= 4
+    assert told(least_share=1.1) == [1, 1]
+    assert told(least_share=1.1, least_within=1.0) == [0, 0]
+
+
 def region(number, label, neighbours=(), **fields):
     usual = {"place_count": 9, "probability": 0.9, "position_m": (0, 0, 0), "area_m2": 9.0}
     return Region(id=number, label=label, neighbour_ids=list(neighbours), **(usual | fields))

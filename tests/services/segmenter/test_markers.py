@@ -14,6 +14,7 @@ from prior_sg.services.geometry import inverse, pose_from_quaternion
 from prior_sg.services.runtime.runner import Runner
 from prior_sg.services.runtime.service import Identity
 from prior_sg.services.scene_store.core import graph as scenes
+from prior_sg.services.scene_store.core import telling
 from prior_sg.services.scene_store.core.image import graph_of, image_of
 from prior_sg.services.segmenter.core.config import Config
 from prior_sg.services.segmenter.core.objects.markers import MarkerConfig, MarkerMap, located
@@ -128,12 +129,12 @@ def test_markers_are_told_without_any_prior_and_again_only_when_they_move():
     (delta,) = run.feed(TICK)
     assert [marker.key for marker in delta.markers] == [KEY] and delta.revision == 0 and not delta.objects
     assert run.feed(sighting(4, HUNG, shift_m=(0.005, 0, 0)), TICK) == []
-    told = scenes.scene(run.graph).markers
-    assert told == delta.markers == scenes.scene(graph_of(image_of(run.graph))).markers
+    told = telling.scene(run.graph).markers
+    assert told == delta.markers == telling.scene(graph_of(image_of(run.graph))).markers
     snapshot = run.runner.answer(OBJECT_SNAPSHOT, SnapshotRequest(robot=ROBOT))
     late = scenes.Graph(ROBOT)
     scenes.apply_objects(late, snapshot)
-    assert scenes.scene(late).markers == told
+    assert telling.scene(late).markers == told
 
 
 def test_a_corrected_pose_moves_the_marker_and_ends_the_doubt():

@@ -22,6 +22,8 @@ from prior_sg.deploy.showing.colors import label_colors
 from prior_sg.deploy.showing.formats.page.steps import steps_of
 from prior_sg.deploy.showing.material import Material, Moment
 from prior_sg.deploy.showing.top_view import FURNITURE_SHARE, WALL_SHARE, layers_of
+from prior_sg.schemas.markers import SceneMarker
+from prior_sg.schemas.members import headline
 from prior_sg.schemas.places import VoxelMap
 from prior_sg.schemas.scene import Scene
 from prior_sg.schemas.status import Loss
@@ -73,7 +75,7 @@ def _data(material: Material) -> dict[str, Any]:
     colors = [label_colors(moment.scene) for moment in moments]
     counts = f"{len(scene.regions)} regions, {len(scene.place_ids)} places, {len(scene.objects)} objects"
     return {
-        "task": scene.task,
+        "task": headline(scene.task, scene.merged_of, scene.plain),
         "about": " · ".join(text for text in (scene.environment, scene.robot, counts) if text),
         "colors": {label: list(color) for known in colors for label, color in known.items()},
         "grid": _grid(scene, material.voxels),
@@ -148,10 +150,16 @@ def _tables(material: Material) -> list[tuple[str, list[tuple[str, str | None]]]
     ]
     return [
         ("Scores against the ground truth", list(scores)),
+        ("Printed markers", [(str(marker.key), _marker(marker)) for marker in scene.markers]),
         ("What could not be used", list(losses)),
         ("Settings", settings),
         ("About this scene", list(about)),
     ]
+
+
+def _marker(marker: SceneMarker) -> str:
+    where = ", ".join(f"{value:.2f}" for value in marker.position_m)
+    return f"{where} m, from {marker.frames} keyframes{f', in doubt: {marker.doubt}' if marker.doubt else ''}"
 
 
 def _losses(material: Material) -> list[str]:

@@ -446,7 +446,7 @@ function controls() {
   byId("timeline").hidden = data.steps.length < 2;
 }
 async function start() {
-  byId("task").textContent = data.task || "no task yet";
+  byId("task").textContent = data.task;
   byId("about").textContent = data.about;
   byId("notes").textContent = data.notes.join(" ");
   for (const [title, rows] of data.tables) table(title, rows);

@@ -266,4 +266,4 @@ class Newcomers:
         try:
             self._found.append(again())
         except SourceError as error:
-            log.info("what has come is no camera yet", extra={"reason": str(error)})
+            log.info("what has come is no camera yet", extra={"why": str(error)})

@@ -2,16 +2,16 @@
 
 from collections.abc import Callable
 
+from prior_sg.schemas.answers import Answer, Difference
 from prior_sg.schemas.queries import (
-    Answer,
     AnswersTo,
     BeliefsOf,
     ById,
     ByLabel,
     ChangedSince,
-    Difference,
     InBox,
     InRadius,
+    MarkersOf,
     Nearest,
     NeighboursOf,
     NodesOf,
@@ -30,6 +30,7 @@ from prior_sg.services.scene_store.core.queries import (
     changes,
     labels,
     levels,
+    markers,
     ranking,
     routes,
     spatial,
@@ -84,6 +85,8 @@ def answer(index: Index, question: Question, older: Older = no_history) -> Answe
             return ranking.ranking(index, question)
         case NodesOf():
             return levels.nodes(index, question)
+        case MarkersOf():
+            return markers.markers(index, question)
         case WhereToLook():
             return unseen.outlook(index, question)
         case WhatIsMissing():

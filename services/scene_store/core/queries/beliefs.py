@@ -4,18 +4,8 @@ from collections import Counter
 
 import numpy as np
 
-from prior_sg.schemas.queries import (
-    BeliefsOf,
-    ById,
-    Details,
-    LabelBelief,
-    Neighbour,
-    Neighbourhood,
-    NeighboursOf,
-    PlaceDetails,
-    RegionBeliefs,
-    Words,
-)
+from prior_sg.schemas.answers import Details, LabelBelief, Neighbour, Neighbourhood, PlaceDetails, RegionBeliefs, Words
+from prior_sg.schemas.queries import BeliefsOf, ById, NeighboursOf
 from prior_sg.services.scene_store.core.queries.index import Index
 from prior_sg.services.scene_store.core.queries.labels import not_there
 from prior_sg.services.scene_store.core.queries.things import thing
@@ -73,6 +63,7 @@ def words(index: Index) -> Words:
         labels=list(scene.labels),
         regions=dict(sorted(Counter(region.label for region in scene.regions).items())),
         objects=dict(sorted(Counter(item.label for item in scene.objects if item.label).items())),
+        merged_of=list(scene.merged_of),
     )
 
 

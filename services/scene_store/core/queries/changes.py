@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from prior_sg.schemas.queries import Difference, Renamed, Thing, What
+from prior_sg.schemas.answers import Difference, Renamed, Thing, What
 from prior_sg.services.scene_store.core.queries.index import Index
 from prior_sg.services.scene_store.core.queries.labels import REGIONS_AND_OBJECTS
 from prior_sg.services.scene_store.core.queries.things import thing

@@ -6,9 +6,9 @@ from functools import cached_property
 import numpy as np
 import scipy
 
+from prior_sg.schemas.answers import What
 from prior_sg.schemas.names import same
 from prior_sg.schemas.objects import SceneObject
-from prior_sg.schemas.queries import What
 from prior_sg.schemas.regions import Region
 from prior_sg.schemas.scene import Scene
 

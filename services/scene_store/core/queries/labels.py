@@ -4,13 +4,14 @@ import difflib
 
 import numpy as np
 
+from prior_sg.schemas.answers import Things, What
 from prior_sg.schemas.names import same
-from prior_sg.schemas.queries import ByLabel, ObjectsInRegions, Things, What
+from prior_sg.schemas.queries import ByLabel, ObjectsInRegions
+from prior_sg.schemas.scene import Scene
 from prior_sg.services.scene_store.core.queries.index import Index
 from prior_sg.services.scene_store.core.queries.things import thing, things
 
 MOST_HINTS, MOST_IDS = 3, 30
-AFTER_A_TASK = "regions and names follow a task, and none was given"
 ALIKE = 0.5  # of `difflib`, from which a label is worth naming
 REGIONS_AND_OBJECTS: tuple[What, ...] = ("region", "object")
 PLURAL = {"place": "places", "region": "regions", "object": "objects"}
@@ -56,7 +57,7 @@ def nothing_called(index: Index, what: What | None, label: str) -> Things | None
     hints = nearest_labels(label, known)
     named = " or ".join(kinds(what)) if what != "place" else "region"
     if not known:
-        reason = f"no {named} has a label yet" + ("" if index.scene.task else f": {AFTER_A_TASK}")
+        reason = f"no {named} has a label yet" + ("" if index.scene.task else f": {after_a_task(index.scene)}")
     else:
         shown = ", ".join(hints or known[: 2 * MOST_HINTS])
         reason = f"no {named} is labelled {label!r}; {'the nearest labels are' if hints else 'there are'}: {shown}"
@@ -67,12 +68,21 @@ def not_there(index: Index, what: What, number: int) -> str:
     """That there is no such id, and which there are, in one sentence."""
     ids = index.ids(what).tolist()
     if not ids:
-        held = f"no {PLURAL[what]}" + ("" if what == "place" or index.scene.task else f" yet: {AFTER_A_TASK}")
+        held = f"no {PLURAL[what]}" + (
+            "" if what == "place" or index.scene.task else f" yet: {after_a_task(index.scene)}"
+        )
     elif len(ids) <= MOST_IDS:
         held = f"{PLURAL[what]} {', '.join(map(str, ids))}"
     else:
         held = f"{len(ids)} {PLURAL[what]} with ids from {ids[0]} to {ids[-1]}"
     return f"there is no {what} {number}; the scene has {held}"
+
+
+def after_a_task(scene: Scene) -> str:
+    """What regions and names wait for."""
+    if scene.merged_of:
+        return f"regions and names follow the tasks of {', '.join(scene.merged_of)}, and none of them was given any"
+    return "regions and names follow a task, and none was given"
 
 
 def nearest_labels(label: str, known: list[str]) -> list[str]:

@@ -1,8 +1,9 @@
 """Nodes of the levels above regions (pure)."""
 
+from prior_sg.schemas.answers import Nodes, NodeWithRegions
 from prior_sg.schemas.levels import LEVELS, LevelNode, regions_in
 from prior_sg.schemas.names import same
-from prior_sg.schemas.queries import Nodes, NodesOf, NodeWithRegions
+from prior_sg.schemas.queries import NodesOf
 from prior_sg.services.scene_store.core.queries.index import Index
 from prior_sg.services.scene_store.core.queries.labels import nearest_labels, not_there
 from prior_sg.services.scene_store.core.queries.things import thing

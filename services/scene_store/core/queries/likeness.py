@@ -14,8 +14,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from prior_sg.schemas.answers import Words
 from prior_sg.schemas.priors import Prior
-from prior_sg.schemas.queries import Words
 
 SPREAD = 0.05  # by so much cosine similarity less, a label or object is e times less probable
 OBJECTS_SAY = 0.5  # of the objects that the text is about, in what is believed of a region's label

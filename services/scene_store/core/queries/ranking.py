@@ -14,8 +14,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from prior_sg.schemas.answers import Ranking, What
 from prior_sg.schemas.names import same
-from prior_sg.schemas.queries import AnswersTo, Ranking, What
+from prior_sg.schemas.queries import AnswersTo
 from prior_sg.services.scene_store.core.queries.index import Index
 from prior_sg.services.scene_store.core.queries.labels import nothing_called
 from prior_sg.services.scene_store.core.queries.things import thing

@@ -6,9 +6,12 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 
-from prior_sg.schemas.queries import Point, Route, RouteBetween, Spot, Thing, What
+from prior_sg.schemas.answers import Point, Route, Thing, What
+from prior_sg.schemas.markers import SceneMarker
+from prior_sg.schemas.queries import RouteBetween, Spot
 from prior_sg.services.scene_store.core.queries.index import Index, Ways
 from prior_sg.services.scene_store.core.queries.labels import REGIONS_AND_OBJECTS, kinds, not_there, nothing_called
+from prior_sg.services.scene_store.core.queries.markers import gaps_of, nothing_numbered, rows_before
 from prior_sg.services.scene_store.core.queries.spatial import distances_of
 from prior_sg.services.scene_store.core.queries.things import thing
 
@@ -107,8 +110,10 @@ def _ends(index: Index, spot: Spot, ways: Ways, side: str, clearance_m: float) -
     if point_m is not None:
         reach_m = distances_of(index, "place", point_m)
         found = _around(reach_m, np.arange(len(reach_m)), ways, None, index.scene.radii_m)
+    elif spot.what == "marker":
+        found = [end for marker in _printed(index, spot, side) for end in _of_marker(index, marker, ways)]
     else:
-        found = [end for what, row in _meant(index, spot, side) for end in _of_thing(index, what, row, ways)]
+        found = [end for what, row in _meant(index, spot, spot.what, side) for end in _of_thing(index, what, row, ways)]
     if not found:
         room = f" with {clearance_m:g} m of room" if clearance_m > 0 else ""
         raise NoSuchSpot(f"no place{room} is there where the {side} is")
@@ -123,21 +128,40 @@ def _here(index: Index, side: str) -> Point:
     return x, y, z
 
 
-def _meant(index: Index, spot: Spot, side: str) -> list[tuple[What, int]]:
-    """Kind and row of what an end names. Raises NoSuchSpot."""
+def _printed(index: Index, spot: Spot, side: str) -> list[SceneMarker]:
+    """The markers of a number; only those that stand at one spot. Raises NoSuchSpot."""
+    if spot.id is None:
+        raise NoSuchSpot(f"the {side} is a marker without a number: write marker:7")
+    found = [one for one in index.scene.markers if one.id == spot.id]
+    if not found:
+        raise NoSuchSpot(f"the {side}: {nothing_numbered(index.scene, spot.id)}")
+    sure = [one for one in found if not one.doubt]
+    if not sure:
+        raise NoSuchSpot(f"the {side}: nobody knows where {found[0].key} is, for {found[0].doubt}")
+    return sure
+
+
+def _of_marker(index: Index, marker: SceneMarker, ways: Ways) -> list[End]:
+    """Places that stand for a marker: from where it can be seen."""
+    rows = rows_before(index, marker)
+    return _around(gaps_of(index, marker, rows), rows, ways, None, index.scene.radii_m[rows])
+
+
+def _meant(index: Index, spot: Spot, kind: What | None, side: str) -> list[tuple[What, int]]:
+    """Kind and row of what an end names, of a kind where it is said. Raises NoSuchSpot."""
     if spot.id is not None:
-        if spot.what is None:
-            raise NoSuchSpot(f"the {side} is a number: say whether it is a place, a region or an object")
-        row = index.row(spot.what, spot.id)
+        if kind is None:
+            raise NoSuchSpot(f"the {side} is a number: say whether it is a place, a region, an object or a marker")
+        row = index.row(kind, spot.id)
         if row is None:
-            raise NoSuchSpot(f"the {side}: {not_there(index, spot.what, spot.id)}")
-        return [(spot.what, row)]
+            raise NoSuchSpot(f"the {side}: {not_there(index, kind, spot.id)}")
+        return [(kind, row)]
     if not spot.label:
         raise NoSuchSpot(f"the {side} names nothing: give a point, an id, a label or `here`")
-    for what in REGIONS_AND_OBJECTS if spot.what is None else kinds(spot.what):
+    for what in REGIONS_AND_OBJECTS if kind is None else kinds(kind):
         if len(rows := index.labelled(what, spot.label)):
             return [(what, row) for row in rows.tolist()]
-    unknown = nothing_called(index, spot.what, spot.label)
+    unknown = nothing_called(index, kind, spot.label)
     raise NoSuchSpot(f"the {side}: {unknown.reason}" if unknown else f"the {side} {spot.label!r} has no places")
 
 

@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from prior_sg.schemas.queries import InBox, InRadius, Nearest, Point, Thing, Things, What
+from prior_sg.schemas.answers import Point, Thing, Things, What
+from prior_sg.schemas.queries import InBox, InRadius, Nearest
 from prior_sg.services.scene_store.core.queries.index import Index
 from prior_sg.services.scene_store.core.queries.labels import chosen_rows, kinds, nothing_called
 from prior_sg.services.scene_store.core.queries.things import things

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable
 
-from prior_sg.schemas.queries import Thing, What
+from prior_sg.schemas.answers import Thing, What
 from prior_sg.schemas.regions import NO_REGION
 from prior_sg.services.scene_store.core.queries.index import Index
 

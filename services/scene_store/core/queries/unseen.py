@@ -2,12 +2,15 @@
 
 import numpy as np
 
+from prior_sg.schemas.answers import Missing, Outlook, Prospect
 from prior_sg.schemas.foresight import Foresight, Opening
+from prior_sg.schemas.members import only_of_robots
 from prior_sg.schemas.names import same
-from prior_sg.schemas.queries import Missing, Outlook, Prospect, RouteBetween, Spot, WhatIsMissing, WhereToLook
+from prior_sg.schemas.queries import RouteBetween, Spot, WhatIsMissing, WhereToLook
+from prior_sg.schemas.scene import Scene
 from prior_sg.services.exploring import chances_per_metre, expected_metres
 from prior_sg.services.scene_store.core.queries.index import Index
-from prior_sg.services.scene_store.core.queries.labels import AFTER_A_TASK, nearest_labels
+from prior_sg.services.scene_store.core.queries.labels import after_a_task, nearest_labels
 from prior_sg.services.scene_store.core.queries.routes import NoSuchSpot, lengths_from, route
 from prior_sg.services.scene_store.core.queries.things import things
 
@@ -16,6 +19,8 @@ DIGITS = 2
 
 def outlook(index: Index, question: WhereToLook) -> Outlook:
     """Openings behind which a region of the label may be, the best to begin with first, and the way to the first."""
+    if index.scene.merged_of:
+        return Outlook(label=question.label, reason=_of_robots(index.scene))
     foresight, label = index.scene.foresight, _known(index, question.label)
     if not label:
         return Outlook(label=question.label, reason=_unknown(index, question.label))
@@ -42,9 +47,15 @@ def outlook(index: Index, question: WhereToLook) -> Outlook:
 
 def missing(index: Index, question: WhatIsMissing) -> Missing:
     """What is probably behind the openings."""
+    if index.scene.merged_of:
+        return Missing(reason=_of_robots(index.scene))
     foresight = index.scene.foresight
-    reason = "" if foresight.openings or index.scene.task else f"nothing is expected yet: {AFTER_A_TASK}"
+    reason = "" if foresight.openings or index.scene.task else f"nothing is expected yet: {after_a_task(index.scene)}"
     return Missing(labels=foresight.missing[: question.limit], openings=len(foresight.openings), reason=reason)
+
+
+def _of_robots(scene: Scene) -> str:
+    return only_of_robots(scene.robot, scene.merged_of, "what has not been seen")
 
 
 def _prospects(
@@ -76,6 +87,6 @@ def _known(index: Index, label: str) -> str:
 
 def _unknown(index: Index, label: str) -> str:
     if not index.scene.labels:
-        return f"no region is expected yet: {AFTER_A_TASK}"
+        return f"no region is expected yet: {after_a_task(index.scene)}"
     near = nearest_labels(label, index.scene.labels)
     return f"the task knows no region {label!r}; it knows {', '.join(near or index.scene.labels)}"

@@ -21,10 +21,10 @@ def foresight(openings: Openings, regions: Mapping[int, Region], prior: Prior, c
     names = [region.name for region in prior.regions]
     found = found_in(regions, prior, cfg)
     foreseen = beyond(views_of(openings, regions, cfg), expected(prior, found, cfg), cfg)
-    missing = foreseen.missing
+    chances, missing = told_chances(foreseen.within, cfg), foreseen.missing
     return Foresight(
         openings=[
-            _opening(openings, row, foreseen=foreseen, prior=prior, found=found, cfg=cfg)
+            _opening(openings, row, foreseen=foreseen, chances=chances, prior=prior, found=found)
             for row in range(len(openings.place_ids))
         ],
         missing=[
@@ -35,6 +35,14 @@ def foresight(openings: Openings, regions: Mapping[int, Region], prior: Prior, c
         look_m=cfg.look_m,
         elsewhere_m=cfg.elsewhere_m,
     )
+
+
+def told_chances(within: np.ndarray, cfg: ForesightConfig) -> np.ndarray:
+    """Chances (opening, label) of what begins behind openings as they are told, 0 = not told: of each opening its most
+    probable labels, and all that it is among the best openings for."""
+    ranks = np.argsort(np.argsort(-within, axis=1, kind="stable"), axis=1)
+    likely = (ranks < cfg.told_labels) & (within >= cfg.least_within)
+    return np.where(likely | (within >= cfg.least_share * within.sum(axis=0)), np.round(within, DIGITS), 0.0)
 
 
 def found_in(regions: Mapping[int, Region], prior: Prior, cfg: ForesightConfig) -> Found:
@@ -65,11 +73,10 @@ def _figures(one: Foresight) -> dict[tuple[int, str], float]:
 
 
 def _opening(
-    openings: Openings, row: int, *, foreseen: Beyond, prior: Prior, found: Found, cfg: ForesightConfig
+    openings: Openings, row: int, *, foreseen: Beyond, chances: np.ndarray, prior: Prior, found: Found
 ) -> Opening:
     here = int(openings.beliefs[row].argmax())
-    within = foreseen.within[row]
-    likely = np.argsort(-within, kind="stable")[: cfg.told_labels].tolist()
+    by_chance = np.argsort(-foreseen.within[row], kind="stable").tolist()
     return Opening(
         place_id=int(openings.place_ids[row]),
         position_m=_point(openings.positions_m[row]),
@@ -81,14 +88,14 @@ def _opening(
             ForeseenLabel(
                 label=prior.regions[label].name,
                 next=_short(foreseen.next[row, label]),
-                within=_short(within[label]),
+                within=float(chances[row, label]),
                 adjacency=_short(prior.adjacency[here, label]),
                 existence=_short(prior.regions[label].existence),
                 found=int(found.regions[label]),
                 met=int(found.borders[here, label]),
             )
-            for label in likely
-            if within[label] >= cfg.least_within
+            for label in by_chance
+            if chances[row, label] > 0
         ],
     )
 
