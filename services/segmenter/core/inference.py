@@ -16,13 +16,14 @@ from prior_sg.services.segmenter.core.appearance.label_bias import label_bias
 from prior_sg.services.segmenter.core.config import Config
 from prior_sg.services.segmenter.core.energy import posteriors
 from prior_sg.services.segmenter.core.energy.mrf import Field
-from prior_sg.services.segmenter.core.energy.region_cost import consolidated
+from prior_sg.services.segmenter.core.energy.region_cost import passes
 from prior_sg.services.segmenter.core.evidence.kernel import Frame
 from prior_sg.services.segmenter.core.experts import REGISTRY, Vote
 from prior_sg.services.segmenter.core.experts.contents import words_of_contents
 from prior_sg.services.segmenter.core.experts.context import Context, ObjectView, standardised
 from prior_sg.services.segmenter.core.map import inclination
-from prior_sg.services.segmenter.core.map.received import with_neighbours
+from prior_sg.services.segmenter.core.map.received import realigned, with_neighbours
+from prior_sg.services.segmenter.core.map.table import UNLABELLED
 from prior_sg.services.segmenter.core.regions.contents import held_around
 from prior_sg.services.segmenter.core.state import State
 
@@ -273,7 +274,8 @@ def field_of(state: State) -> Field:
 def settle(state: State, cfg: Config, *, hurried: bool) -> None:
     """Better labels around the places whose costs changed, within the budget where `hurried`; otherwise until no swap
     on the whole field gains. Regions that do not pay for themselves then become part of a neighbour."""
-    places, solver = state.map.places, state.labelling.solver
+    places, labelling = state.map.places, state.labelling
+    solver = labelling.solver
     limited = hurried and cfg.budget_ms > 0
     budget = Budget(cfg.budget_ms / cfg.look_ms if limited else np.inf)
     rows = np.arange(len(places.labels))
@@ -288,11 +290,14 @@ def settle(state: State, cfg: Config, *, hurried: bool) -> None:
     )
     if not limited:
         labels = solver.drain(budget.expired)
-    given_away = places.labels != places.cut_labels
-    changed = places.unsettled | given_away | (labels != places.cut_labels)
+    former = labelling.passes if same_rows else [realigned(one, places.solved, UNLABELLED) for one in labelling.passes]
     places.cut_labels, places.solved = labels, rows
-    labels = consolidated(field_of(state), labels, cfg.region_cost, changed)
-    places.unbelieved |= with_neighbours(state.map.graph, labels != places.labels)
+    changed = np.flatnonzero(places.unsettled)
+    labelling.passes = passes(field_of(state), labels, cfg.region_cost, former, changed=changed, ties=state.map.ties)
+    labels = labelling.passes[-1].copy()
+    relabelled = labels != places.labels
+    places.unbelieved |= with_neighbours(state.map.graph, relabelled)
+    places.unparted |= relabelled
     places.labels = labels
     places.unsettled[:] = False
 

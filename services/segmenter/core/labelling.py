@@ -22,6 +22,7 @@ class Labelling:
     compared: int = 0  # places whose similarity was computed, or that left, since the bias was
     contents_count: bool = False  # what regions hold has a say
     looks_left: int = 0  # into what regions hold, before that rests until something changes
+    passes: list[np.ndarray] = field(default_factory=list)  # (place,) each, of consolidating on the solver's rows
     dirty: bool = False  # something changed since the last solution
 
     def map_changed(self, left: int, touched: bool) -> None:
@@ -34,7 +35,7 @@ class Labelling:
     def start_afresh(self, labels: int, places: int, contents_count: bool) -> None:
         """A prior with so many labels has come into force on a map of so many places."""
         self.contents_count = contents_count
-        self.bias, self.compared, self.adaptation = np.zeros(labels), places, Adaptation()
+        self.bias, self.compared, self.adaptation, self.passes = np.zeros(labels), places, Adaptation(), []
         self.look_into_regions()
 
     def forget_appearance(self) -> None:

@@ -281,6 +281,7 @@ def _tell_all(state: State, cfg: Config) -> Iterator[RegionDelta | ObjectDelta]:
     legacy, state.catching_up.legacy = state.catching_up.legacy, None
     assert legacy is not None
     state.map.places.regions = legacy.regions_of(state.map.graph.ids)
+    state.map.places.unparted[:] = True
     state.regions.inherit(legacy.regions, legacy.next_region_id)
     state.layers.inherit(legacy.nodes, legacy.next_node_ids)
     state.objects.inherit(legacy.objects, legacy.next_object_id, cfg.tracking)

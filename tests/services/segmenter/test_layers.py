@@ -235,7 +235,7 @@ def test_nearest_regions_of_pieces_are_found_as_by_looking_at_all_pairs():
             if between.min() <= 1.0:
                 first, second = np.unravel_index(between.argmin(), between.shape)
                 wanted.append(sorted((int(rows[first]), int(rows[second]))))
-        assert near_regions(graph, rows, edges, count, 1.0).tolist() == sorted(wanted)
+        assert near_regions(graph, rows, np.arange(count), edges, 1.0).tolist() == sorted(wanted)
 
 
 def test_a_successor_goes_on_with_the_ids():

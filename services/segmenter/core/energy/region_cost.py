@@ -7,88 +7,161 @@ instead of per label): a region takes the label of a neighbour, and becomes part
 less.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from prior_sg.services.compiled import compiled
 from prior_sg.services.segmenter.core.energy.mrf import Field
-from prior_sg.services.segmenter.core.regions.components import numbered
+from prior_sg.services.segmenter.core.map.arcs import Arcs, arcs_of, spread
+
+MOST_CHANGED = 0.1  # of the places; with more, to go over former passes again takes longer than to begin anew
 
 
-def consolidated(field: Field, labels: np.ndarray, cost: float, changed: np.ndarray | None = None) -> np.ndarray:
+def consolidated(field: Field, labels: np.ndarray, cost: float) -> np.ndarray:
     """Labels (place,) in which no region gains less than `cost` by its own label against its best neighbour's.
 
-    Regions are taken by what they gain, least first, and never two that touch in one pass. A pass weighs those that
-    were relabelled by the one before, and their neighbours: the others have been found to pay for themselves. So does
-    the first with `changed` (place,): where costs, edges or labels are others than at the last call, and where that
-    gave a region away; None = anywhere.
+    Regions are taken by what they gain, least first, and never two that touch in one pass; passes go on until one
+    changes nothing.
     """
-    labels = labels.copy()
+    return passes(field, labels, cost)[-1]
+
+
+def passes(
+    field: Field,
+    labels: np.ndarray,
+    cost: float,
+    former: Sequence[np.ndarray] = (),
+    *,
+    changed: np.ndarray | None = None,
+    ties: Arcs | None = None,
+) -> list[np.ndarray]:
+    """Labels (place,) before the first pass of `consolidated` and after each that changed any.
+
+    What a pass makes of a region follows from the region and what it touches. So `former`, what was returned last on
+    these rows, is gone over again where a place has other costs, weights or edges now (rows `changed`), or another
+    label than it had before the same pass. It is changed in place. `ties` are the field's edges as arcs, where the
+    caller has them.
+    """
     if cost <= 0 or not len(field.edges):
-        return labels
-    relabelled = np.ones(len(labels), dtype=bool) if changed is None else changed
-    while relabelled.any():
-        before = labels.copy()
-        _pass(labels, numbered(labels, field.edges), relabelled, *field, cost)
-        relabelled = labels != before
-    return labels
+        return [labels.copy()]
+    near = arcs_of(len(labels), field.edges, field.weights) if ties is None else ties
+    given = np.arange(len(labels)) if changed is None else changed
+    if former and len(given) <= MOST_CHANGED * len(labels):
+        rows = np.union1d(given, np.flatnonzero(labels != former[0]))
+    else:
+        rows, former = np.arange(len(labels)), ()
+    after, region_of = [labels.copy(), *former[1:]], np.full(len(labels), -1)
+    for number in range(1, len(after)):
+        differs = _pass(after[number - 1], rows, near, region_of, field, cost, after[number])
+        rows = np.union1d(given, differs)
+    while len(rows):  # the last pass changed nothing but there
+        after.append(after[-1].copy())
+        rows = _pass(after[-2], rows, near, region_of, field, cost, after[-1])
+    while len(after) > 1 and np.array_equal(after[-1], after[-2]):
+        after.pop()
+    return after
 
 
 @compiled()
-def _pass(labels, region_of, relabelled, unary, edges, weights, pairwise, cost):  # noqa: ANN001, ANN202, PLR0917
-    """Weigh the regions that hold a relabelled place or touch one that does, and relabel some of them."""
-    regions, count = region_of.max() + 1, unary.shape[1]
-    label_of = np.zeros(regions, np.int64)
-    renewed, weighed = np.zeros(regions, np.bool_), np.zeros(regions, np.bool_)
-    for place in range(len(labels)):
-        label_of[region_of[place]] = labels[place]
-        if relabelled[place]:
-            renewed[region_of[place]] = weighed[region_of[place]] = True
-    for edge in range(len(edges)):
-        one, other = region_of[edges[edge, 0]], region_of[edges[edge, 1]]
-        if renewed[one] or renewed[other]:
-            weighed[one] = weighed[other] = True
-    costs = np.zeros((regions, count))  # of the region under each label while all others keep theirs
-    for place in range(len(labels)):
-        region = region_of[place]
-        if weighed[region]:
-            for label in range(count):
-                costs[region, label] += unary[place, label]
-    beside = np.zeros((regions, count), np.bool_)
-    starts = np.zeros(regions + 1, np.int64)
-    for edge in range(len(edges)):
-        one, other = region_of[edges[edge, 0]], region_of[edges[edge, 1]]
-        if one == other or not (weighed[one] or weighed[other]):
+def _pass(labels, rows, near, region_of, field, cost, after):  # noqa: ANN001, ANN202, PLR0917
+    """Put into `after` what one pass makes of `labels` around the places `rows`; returns the places (n,) where that is
+    something else than what was there. `region_of` (place,) is scratch, all -1 before and after.
+
+    Weighed are the regions that hold any of `rows`, those that touch these, and on from these and from whatever gains
+    too little, all that it touches: who gives way may keep its neighbour from it.
+    """
+    starts, neighbours = near.starts, near.neighbours
+    members, count = np.empty(len(labels), np.int64), 0  # of region after region; its number is where it begins
+    for row in rows:
+        count = spread(row, labels, starts, neighbours, region_of, members, count)
+    for index in range(count):
+        count = _touched(members[index], labels, starts, neighbours, region_of, members, count)
+    certain, begin = count, 0
+    gains, best, given = np.empty(len(labels)), np.empty(len(labels), np.int64), np.empty(len(labels), np.int64)
+    settled = np.zeros(len(labels), np.bool_)
+    poor = [np.int64(0) for _ in range(0)]
+    while begin < count:
+        end = begin
+        while end < count and region_of[members[end]] == begin:
+            end += 1
+        inside = members[begin:end]
+        inside.sort()
+        given[begin] = labels[inside[0]]
+        gains[begin], best[begin] = _gain(inside, labels, near, field)
+        if gains[begin] < cost:
+            poor.append(np.int64(begin))
+        if begin < certain or gains[begin] < cost:
+            for place in inside:
+                count = _touched(place, labels, starts, neighbours, region_of, members, count)
+        begin = end
+    _give(np.array(poor, np.int64), gains, best, given, settled, members[:count], labels, near, region_of)
+    differs, found = np.empty(count, np.int64), 0
+    for place in members[:count]:
+        if after[place] != given[region_of[place]]:
+            after[place] = given[region_of[place]]
+            differs[found] = place
+            found += 1
+        region_of[place] = -1
+    return differs[:found].copy()
+
+
+@compiled()
+def _touched(place, labels, starts, neighbours, region_of, members, count):  # noqa: ANN001, ANN202, PLR0917
+    """`spread` from all neighbours of a place, unless every place of the map has a number."""
+    if count == len(members):
+        return count
+    for arc in range(starts[place], starts[place + 1]):
+        count = spread(neighbours[arc], labels, starts, neighbours, region_of, members, count)
+    return count
+
+
+@compiled()
+def _gain(inside, labels, near, field):  # noqa: ANN001, ANN202
+    """What the region of the places `inside` (ascending) gains against its best neighbour's label, and that label.
+
+    Sums run in the order of places and edges: they are the same wherever the search for regions began.
+    """
+    own, starts, neighbours, numbers = labels[inside[0]], near.starts, near.neighbours, near.edges
+    unary, weights, pairwise = field.unary, field.weights, field.pairwise
+    costs, beside = np.zeros(unary.shape[1]), np.zeros(unary.shape[1], np.bool_)
+    arcs, count = 0, 0
+    for place in inside:
+        arcs += starts[place + 1] - starts[place]
+    across, others = np.empty(arcs, np.int64), np.empty(arcs, np.int64)
+    for place in inside:
+        for label in range(len(costs)):
+            costs[label] += unary[place, label]
+        for arc in range(starts[place], starts[place + 1]):
+            if labels[neighbours[arc]] != own:
+                across[count], others[count] = numbers[arc], labels[neighbours[arc]]
+                count += 1
+    for at in np.argsort(across[:count]):
+        beside[others[at]] = True
+        for label in range(len(costs)):
+            costs[label] += weights[across[at]] * pairwise[label, others[at]]
+    gain, best = np.inf, own
+    for label in range(len(costs)):
+        if beside[label] and costs[label] - costs[own] < gain:
+            gain, best = costs[label] - costs[own], label
+    return gain, best
+
+
+@compiled()
+def _give(poor, gains, best, given, settled, members, labels, near, region_of):  # noqa: ANN001, ANN202, PLR0917
+    """Give away the regions `poor`, least gain first and of equals that with the first place, none beside another."""
+    starts, neighbours = near.starts, near.neighbours
+    order = poor[np.argsort(members[poor])]
+    for region in order[np.argsort(gains[order], kind="mergesort")]:
+        free, index = not settled[region], region
+        while index < len(members) and region_of[members[index]] == region:
+            for arc in range(starts[members[index]], starts[members[index] + 1]):
+                other = neighbours[arc]
+                free = free and (region_of[other] == region or given[region_of[other]] == labels[other])
+            index += 1
+        if not free:
             continue
-        for here, there in ((one, other), (other, one)):
-            beside[here, label_of[there]] = True
-            starts[here + 1] += 1
-            for label in range(count):
-                costs[here, label] += weights[edge] * pairwise[label, label_of[there]]
-    for region in range(regions):
-        starts[region + 1] += starts[region]
-    neighbours, fill = np.empty(starts[-1], np.int64), starts[:-1].copy()
-    for edge in range(len(edges)):
-        one, other = region_of[edges[edge, 0]], region_of[edges[edge, 1]]
-        if one != other and (weighed[one] or weighed[other]):
-            neighbours[fill[one]], neighbours[fill[other]] = other, one
-            fill[one] += 1
-            fill[other] += 1
-    gains, best = np.full(regions, np.inf), np.zeros(regions, np.int64)
-    for region in range(regions):
-        for label in range(count):
-            gain = costs[region, label] - costs[region, label_of[region]]
-            if weighed[region] and beside[region, label] and gain < gains[region]:
-                gains[region], best[region] = gain, label
-    settled, given = np.zeros(regions, np.bool_), label_of.copy()
-    for region in np.argsort(gains, kind="mergesort"):
-        if gains[region] >= cost:
-            break
-        free = not settled[region]
-        for at in range(starts[region], starts[region + 1]):
-            free = free and given[neighbours[at]] == label_of[neighbours[at]]
-        if free:
-            given[region] = best[region]
-            for at in range(starts[region], starts[region + 1]):
-                settled[neighbours[at]] = True
-    for place in range(len(labels)):
-        labels[place] = given[region_of[place]]
+        given[region] = best[region]
+        for place in members[region:index]:
+            for arc in range(starts[place], starts[place + 1]):
+                settled[region_of[neighbours[arc]]] = True

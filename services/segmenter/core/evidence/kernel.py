@@ -110,7 +110,7 @@ def in_frustum(camera_from_world, tangents, positions_m, min_depth_m, max_depth_
     found = np.empty(len(positions_m), np.int64)
     count = 0
     for row in range(len(positions_m)):
-        if _is_inside(camera_from_world, tangents, positions_m[row], min_depth_m, max_depth_m):
+        if _is_inside(camera_from_world, tangents, positions_m, row, min_depth_m, max_depth_m):
             found[count] = row
             count += 1
     return found[:count].copy()
@@ -119,11 +119,20 @@ def in_frustum(camera_from_world, tangents, positions_m, min_depth_m, max_depth_
 @compiled()
 def frustums_with_any(cameras_from_world, tangents, positions_m, min_depth_m, max_depth_m):  # noqa: ANN001, ANN201
     """Which frustums, ascending, hold any of the positions, as `in_frustum` tells."""
-    found = np.empty(len(cameras_from_world), np.int64)
-    count = 0
+    found, count = np.empty(len(cameras_from_world), np.int64), 0
+    middle_m, radius_m = _ball(positions_m)
     for camera in range(len(cameras_from_world)):
+        pose, bounds = cameras_from_world[camera], tangents[camera]
+        across, along = max(-bounds[0], bounds[1]), max(-bounds[2], bounds[3])
+        reach_m = max_depth_m * np.sqrt(1.0 + across * across + along * along) + radius_m + 1e-3
+        apart_m2 = 0.0
+        for axis in range(3):
+            x, y, z = pose[axis, 0] * middle_m[0], pose[axis, 1] * middle_m[1], pose[axis, 2] * middle_m[2]
+            apart_m2 += (x + y + z + pose[axis, 3]) ** 2
+        if apart_m2 > reach_m * reach_m:  # too far for any
+            continue
         for row in range(len(positions_m)):
-            if _is_inside(cameras_from_world[camera], tangents[camera], positions_m[row], min_depth_m, max_depth_m):
+            if _is_inside(pose, bounds, positions_m, row, min_depth_m, max_depth_m):
                 found[count] = camera
                 count += 1
                 break
@@ -131,9 +140,20 @@ def frustums_with_any(cameras_from_world, tangents, positions_m, min_depth_m, ma
 
 
 @compiled()
-def _is_inside(pose, tangents, point_m, min_depth_m, max_depth_m):  # noqa: ANN001, ANN202
+def _ball(positions_m):  # noqa: ANN001, ANN202
+    """Middle and radius of a ball around all positions."""
+    middle_m, square_m2 = np.zeros(3), 0.0
+    for axis in range(3):
+        low_m, high_m = positions_m[:, axis].min(), positions_m[:, axis].max()
+        middle_m[axis] = 0.5 * (low_m + high_m)
+        square_m2 += (0.5 * (high_m - low_m)) ** 2
+    return middle_m, np.sqrt(square_m2)
+
+
+@compiled()
+def _is_inside(pose, tangents, positions_m, row, min_depth_m, max_depth_m):  # noqa: ANN001, ANN202, PLR0917
     slack_m = 1e-6
-    u, v, w = point_m
+    u, v, w = positions_m[row, 0], positions_m[row, 1], positions_m[row, 2]
     z_m = pose[2, 0] * u + pose[2, 1] * v + pose[2, 2] * w + pose[2, 3]
     if z_m < min_depth_m - slack_m or z_m > max_depth_m + slack_m:
         return False

@@ -13,9 +13,9 @@ import numpy as np
 from prior_sg.schemas.levels import LEVELS, NO_NODE, LevelName, LevelNode, regions_in
 from prior_sg.schemas.regions import NO_REGION, Region
 from prior_sg.services.segmenter.core.layers.alignment import Members
-from prior_sg.services.segmenter.core.layers.pieces import near_regions
+from prior_sg.services.segmenter.core.layers.pieces import near_regions, numbers_of
 from prior_sg.services.segmenter.core.layers.stacking import Layer, LayersConfig, LevelInForce, layers_of
-from prior_sg.services.segmenter.core.layers.storeys import Storeys
+from prior_sg.services.segmenter.core.layers.storeys import Storeys, floors_differ
 from prior_sg.services.segmenter.core.map.received import ReceivedGraph
 from prior_sg.services.segmenter.core.map.table import Places
 from prior_sg.services.segmenter.core.regions.components import track
@@ -25,12 +25,35 @@ MOST_COUNTED = 1000  # places of a region, where its weight for an id is counted
 
 
 class Held(NamedTuple):
-    """What a region holds."""
+    """What regions hold, in the order of their ids, and which ways lead between them."""
 
-    belief: np.ndarray  # (label,) mean over its places
-    ground_m2: np.ndarray  # (storey,) of its places
-    others: np.ndarray  # (other,) ids, ascending, of regions of higher id that ways lead to
-    ways: np.ndarray  # (other,) how wide these are together, as `alignment.Members` counts
+    ids: np.ndarray  # (region,) ascending
+    beliefs: np.ndarray  # (region, label) mean over its places
+    ground_m2: np.ndarray  # (region, storey) of its places
+    contacts: np.ndarray  # (contact, 2) ids, smaller first, sorted; a region's own are those in which it is first
+    ways: np.ndarray  # (contact,) how wide these are together, as `alignment.Members` counts
+
+    @classmethod
+    def none(cls) -> "Held":
+        """Of no regions."""
+        nobody = np.zeros(0, np.int64)
+        return cls(nobody, np.zeros((0, 1)), np.zeros((0, 1)), nobody.reshape(0, 2), np.zeros(0))
+
+    def without(self, ids: np.ndarray) -> "Held":
+        """Those of other regions."""
+        stays, leads = ~np.isin(self.ids, ids), ~np.isin(self.contacts[:, 0], ids)
+        kept = self.ids[stays], self.beliefs[stays], self.ground_m2[stays]
+        return Held(*kept, self.contacts[leads], self.ways[leads])
+
+    def joined(self, other: "Held") -> "Held":
+        """Those of both, which have no region in common."""
+        if not (len(self.ids) and len(other.ids)):
+            return self if len(self.ids) else other
+        ids, beliefs, ground_m2, contacts, ways = (
+            np.concatenate((one, two)) for one, two in zip(self, other, strict=True)
+        )
+        order, sorted_ = np.argsort(ids), np.lexsort(contacts.T[::-1])
+        return Held(ids[order], beliefs[order], ground_m2[order], contacts[sorted_], ways[sorted_])
 
 
 @dataclass
@@ -40,7 +63,7 @@ class LayerMap:
     next_ids: dict[LevelName, int] = field(default_factory=dict)
     known: dict[NodeKey, LevelNode] = field(default_factory=dict)
     node_of: dict[LevelName, dict[int, int]] = field(default_factory=dict)  # node id by region id
-    held: dict[int, Held] = field(default_factory=dict)  # by region id
+    held: Held = field(default_factory=Held.none)
     floors_m: np.ndarray = field(default_factory=lambda: np.zeros(0))  # (storey,) that `held` counts by
 
     def inherit(self, nodes: list[LevelNode], next_ids: Mapping[LevelName, int]) -> None:
@@ -65,16 +88,16 @@ class LayerMap:
         """Find all levels of these regions, of which only `changed` hold other places or beliefs than before; None =
         all may."""
         listed = [region for _, region in sorted(regions.items()) if region.place_count]
-        several = max(len(storeys.floors_m), len(self.floors_m)) > 1
-        if changed is None or (several and not np.array_equal(storeys.floors_m, self.floors_m)):
-            self.held = {}
+        if changed is None or floors_differ(storeys.floors_m, self.floors_m):
+            self.held = Held.none()
         self.floors_m = storeys.floors_m
-        self.forget(changed or frozenset())
-        asked = [region for region in listed if region.id not in self.held]
-        self.held |= _held(asked, places, storeys, cfg.alignment.way_m)
-        self.held = {region.id: self.held[region.id] for region in listed}
-        members = _members(listed, list(self.held.values()), graph, places, cfg)
-        layers = layers_of(members, _storeys(self.held), levels, cfg.alignment)
+        gone = set(self.held.ids.tolist()) - {region.id for region in listed}
+        self.forget(gone | (changed or frozenset()))
+        known = set(self.held.ids.tolist())
+        news = _held([one for one in listed if one.id not in known], places, storeys, cfg.alignment.way_m)
+        self.held = self.held.joined(news)
+        members = _members(listed, self.held, graph, places, cfg)
+        layers = layers_of(members, self.held.ground_m2.argmax(axis=1), levels, cfg.alignment)
         counts = np.minimum([region.place_count for region in listed], MOST_COUNTED).astype(np.int64)
         former, self.node_of, ids = self.node_of, {}, {}
         for layer in layers:
@@ -89,7 +112,7 @@ class LayerMap:
 
     def forget(self, regions: Set[int]) -> None:
         """These regions have changed, though no level was found again."""
-        self.held = {number: one for number, one in self.held.items() if number not in regions}
+        self.held = self.held.without(np.array([*regions], np.int64))
 
     @property
     def zones(self) -> dict[int, str]:
@@ -97,72 +120,50 @@ class LayerMap:
         return {region: self.known["zone", node].label for region, node in self.node_of.get("zone", {}).items()}
 
 
-def _held(regions: list[Region], places: Places, storeys: Storeys, way_m: float) -> dict[int, Held]:
-    """What each of the regions holds, by id."""
-    ids = [region.id for region in regions]
-    numbers, count = _numbers(ids, places), max(len(storeys.floors_m), 1)
+def _held(regions: list[Region], places: Places, storeys: Storeys, way_m: float) -> Held:
+    """What each of the regions, in the order of their ids, holds."""
+    ids = np.array([region.id for region in regions], np.int64)
+    numbers, count = numbers_of(ids, places.regions), max(len(storeys.floors_m), 1)
     rows = np.flatnonzero(numbers[places.regions] >= 0)
     of_region = numbers[places.regions[rows]]
-    beliefs = _means(places.posteriors[rows].astype(np.float64), of_region, len(ids))
     cells = of_region * count + storeys.of_place[rows]
-    ground_m2 = np.bincount(cells, storeys.weights_m2[rows], minlength=len(ids) * count).reshape(-1, count)
-    return {
-        region.id: Held(belief, ground, *_ways(region, way_m))
-        for region, belief, ground in zip(regions, beliefs, ground_m2, strict=True)
-    }
+    ground_m2 = np.bincount(cells, storeys.weights_m2[rows], minlength=len(ids) * count)
+    ways = [(region.id, other, width) for region in regions for other, width in _ways(region, way_m)]
+    return Held(
+        ids=ids,
+        beliefs=_means(places.posteriors[rows].astype(np.float64), of_region, len(ids)),
+        ground_m2=ground_m2.reshape(-1, count),
+        contacts=np.array([way[:2] for way in ways], np.int64).reshape(-1, 2),
+        ways=np.array([width for _, _, width in ways], np.float64),
+    )
 
 
-def _ways(region: Region, way_m: float) -> tuple[np.ndarray, np.ndarray]:
-    """The regions of higher id that ways lead to, and how wide these are together."""
+def _ways(region: Region, way_m: float) -> list[tuple[int, float]]:
+    """The regions of higher id that ways lead to, ascending, and how wide these are together."""
     found: dict[int, float] = {}
     for way in region.transitions:
         if region.id < way.region:
             found[way.region] = found.get(way.region, 0.0) + min(way.clearance_m / way_m, 1.0)
-    others = sorted(found)
-    return np.array(others, np.int64), np.array([found[other] for other in others])
+    return sorted(found.items())
 
 
-def _members(
-    regions: list[Region], held: list[Held], graph: ReceivedGraph, places: Places, cfg: LayersConfig
-) -> Members:
+def _members(regions: list[Region], held: Held, graph: ReceivedGraph, places: Places, cfg: LayersConfig) -> Members:
     """Regions as members of the level above: mean beliefs of their places, and the ways between them."""
-    others = np.concatenate([np.zeros(0, np.int64), *(one.others for one in held)])
-    ways = np.concatenate([np.zeros(0), *(one.ways for one in held)])
-    here = np.repeat(np.arange(len(regions)), [len(one.others) for one in held])
-    ids = np.array([region.id for region in regions], np.int64)
-    there = np.searchsorted(ids, others)
-    listed = np.isin(others, ids)
-    known = np.stack((here[listed], there[listed]), axis=1)
-    near = near_regions(graph, _rows(regions, places), known, len(regions), cfg.join_m)
+    listed = np.isin(held.contacts[:, 1], held.ids)
+    known = np.searchsorted(held.ids, held.contacts[listed])
+    near = near_regions(graph, places.regions, held.ids, known, cfg.join_m)
     return Members(
         areas_m2=np.array([region.area_m2 for region in regions]),
-        beliefs=np.array([one.belief for one in held]).reshape(len(regions), places.posteriors.shape[1]),
+        beliefs=held.beliefs,
         edges=np.concatenate((known, near)),
-        ways=np.concatenate((ways[listed], np.zeros(len(near)))),
+        ways=np.concatenate((held.ways[listed], np.zeros(len(near)))),
     )
-
-
-def _rows(regions: list[Region], places: Places) -> np.ndarray:
-    """Row (place,) of the region of each place, -1 = none of these."""
-    return _numbers([region.id for region in regions], places)[places.regions]
-
-
-def _numbers(ids: list[int], places: Places) -> np.ndarray:
-    """Where each region (region id,) comes in `ids`, -1 = not; the last entry is that of no region."""
-    numbers = np.full(max(int(places.regions.max(initial=-1)), max(ids, default=-1)) + 2, -1)
-    numbers[ids] = np.arange(len(ids))
-    return numbers
 
 
 def _means(values: np.ndarray, rows: np.ndarray, count: int) -> np.ndarray:
     """Mean (row, column) of the values (place, column) of each row."""
     sums = np.stack([np.bincount(rows, column, minlength=count) for column in values.T], axis=1)
     return sums / np.maximum(np.bincount(rows, minlength=count), 1)[:, None]
-
-
-def _storeys(held: Mapping[int, Held]) -> np.ndarray:
-    """The storey (region,) that most ground of each region is on; the lower of equals."""
-    return np.array([one.ground_m2.argmax() for one in held.values()], np.int64)
 
 
 def _nodes(regions: list[Region], layers: list[Layer], ids: dict[LevelName, np.ndarray]) -> list[LevelNode]:

@@ -52,6 +52,10 @@ class Storeys(NamedTuple):
     between: np.ndarray  # (place,) between two floors
     weights_m2: np.ndarray  # (place,) ground that it covers
 
+    def at(self, rows: np.ndarray) -> "Storeys":
+        """The same floors, and the places `rows` alone."""
+        return Storeys(self.floors_m, *(column[rows] for column in self[1:]))
+
 
 def storeys_of(graph: ReceivedGraph, cfg: StoreyConfig) -> Storeys:
     """The storeys of a map."""
@@ -61,6 +65,11 @@ def storeys_of(graph: ReceivedGraph, cfg: StoreyConfig) -> Storeys:
     floors_m = floors_of(bottoms_m, weights_m2, cfg)
     storey, grounded, between = _standing(bottoms_m, floors_m, cfg.tolerance_m, cfg.clutter_m)
     return Storeys(floors_m, storey, grounded, between, weights_m2)
+
+
+def floors_differ(one_m: np.ndarray, other_m: np.ndarray) -> bool:
+    """Whether two maps, of which one has several storeys, have floors at other heights."""
+    return max(len(one_m), len(other_m)) > 1 and not np.array_equal(one_m, other_m)
 
 
 @compiled()

@@ -136,3 +136,50 @@ def ball(centers, reach, starts, neighbours, inside):  # noqa: ANN001, ANN201
     for index in range(count):
         inside[found[index]] = False
     return np.sort(found[:count])
+
+
+@compiled()
+def spread(row, labels, starts, neighbours, number_of, members, count):  # noqa: ANN001, ANN201, PLR0917
+    """Number all places that chains of places with the label of `row` join to it, unless it has a number already.
+
+    They are put into `members` from `count` on, which is also their number; returns how many are there now. `number_of`
+    (place,) is -1 where there is none yet.
+    """
+    if number_of[row] >= 0:
+        return count
+    number, index = count, count
+    number_of[row], members[count] = number, row
+    count += 1
+    while index < count:
+        place = members[index]
+        for arc in range(starts[place], starts[place + 1]):
+            other = neighbours[arc]
+            if number_of[other] < 0 and labels[other] == labels[place]:
+                number_of[other], members[count] = number, other
+                count += 1
+        index += 1
+    return count
+
+
+@compiled()
+def joined(labels, near, rows):  # noqa: ANN001, ANN201
+    """Places (n,), ascending, that chains of places with one label join to any of `rows` or of their neighbours, and
+    the edges (m, 2) between those of one label, as numbers into them."""
+    starts, neighbours = near.starts, near.neighbours
+    number_of, members, count = np.full(len(labels), -1), np.empty(len(labels), np.int64), 0
+    for row in rows:
+        count = spread(row, labels, starts, neighbours, number_of, members, count)
+        for arc in range(starts[row], starts[row + 1]):
+            count = spread(neighbours[arc], labels, starts, neighbours, number_of, members, count)
+    places, arcs = np.sort(members[:count]), 0
+    for number in range(count):
+        number_of[places[number]] = number
+        arcs += starts[places[number] + 1] - starts[places[number]]
+    edges, found = np.empty((arcs, 2), np.int64), 0
+    for number in range(count):
+        for arc in range(starts[places[number]], starts[places[number] + 1]):
+            other = neighbours[arc]
+            if other > places[number] and labels[other] == labels[places[number]]:
+                edges[found, 0], edges[found, 1] = number, number_of[other]
+                found += 1
+    return places, edges[:found]

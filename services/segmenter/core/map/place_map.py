@@ -66,6 +66,8 @@ class PlaceMap:
         self.places = places.realigned(step)
         self.places.reshaped |= inclination.disturbed(before, step, cfg.geometry.neighbourhood_m)
         self.places.unsettled |= around
+        self.places.unparted |= around
+        self.places.unparted[step.upserted] = True
         self.places.unshared |= around
         self.places.unbelieved |= around
         self.places.doubtful |= step.moved

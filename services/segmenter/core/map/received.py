@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from prior_sg.schemas.places import PlaceDelta
+from prior_sg.services.compiled import compiled
 from prior_sg.services.segmenter.core.map.arcs import Arcs, arcs_from, arcs_of, edges_between, grown
 
 
@@ -37,8 +38,7 @@ class ReceivedGraph:
     @cached_property
     def lengths_m(self) -> np.ndarray:
         """Length (edge,) of each edge."""
-        first, second = self.edges.T
-        return np.linalg.norm(self.positions_m[first] - self.positions_m[second], axis=1)
+        return _lengths_m(self.positions_m, self.edges)
 
     @cached_property
     def arcs(self) -> Arcs:
@@ -82,19 +82,20 @@ def apply(graph: ReceivedGraph, delta: PlaceDelta, replaces: bool) -> Step:
     previous = np.flatnonzero(kept)
     new = upserted[known < 0]
     at = np.searchsorted(graph.ids[previous], new)
-    previous = np.insert(previous, at, -1)
+    ids = inserted(graph.ids[previous], at, new)
+    previous = inserted(previous, at, np.full(len(new), -1))
     old = previous >= 0
     after = ReceivedGraph(
-        ids=np.insert(graph.ids[kept], at, new),
-        positions_m=np.insert(graph.positions_m[kept], at, 0.0, axis=0),
-        radii_m=np.insert(graph.radii_m[kept], at, 0.0),
+        ids=ids,
+        positions_m=realigned(graph.positions_m, previous, 0.0),
+        radii_m=realigned(graph.radii_m, previous, 0.0),
         on_ground=len(delta.surface_ids) > 0 or (graph.on_ground and not replaces),
     )
     rows = after.rows(upserted)
     moved = ~old
     moved[rows] |= (after.positions_m[rows] != delta.positions_m[first]).any(axis=1)
     after.positions_m[rows], after.radii_m[rows] = delta.positions_m[first], delta.radii_m[first]
-    ends = _join_edges(graph, after, delta, merged, replaces)
+    ends = _join_edges(graph, after, delta, merged, previous=previous, replaces=replaces)
     touched = moved.copy()
     touched[ends] = True
     return Step(after, previous, moved, touched, upserted=rows, removed=np.flatnonzero(~kept))
@@ -144,24 +145,33 @@ def with_neighbours(graph: ReceivedGraph, mask: np.ndarray) -> np.ndarray:
 
 
 def _join_edges(
-    graph: ReceivedGraph, after: ReceivedGraph, delta: PlaceDelta, merged: list[tuple[int, int]], replaces: bool
+    graph: ReceivedGraph,
+    after: ReceivedGraph,
+    delta: PlaceDelta,
+    merged: list[tuple[int, int]],
+    *,
+    previous: np.ndarray,
+    replaces: bool,
 ) -> np.ndarray:
-    """Fill in the edges of `after`, and return the rows of `after` at their changed ends.
+    """Fill in the edges of `after`, and return the rows of `after` at their changed ends; `previous` as in `Step`.
 
     Where several say something of one pair, the delta wins, then the edge that was there, then one inherited by
     merging.
     """
     count = max(len(after.ids), 1)
-    row_after = after.rows(graph.ids)
-    stays = np.full(len(graph.edges), not replaces)
-    stays[_edge_numbers(graph, delta.removed_edges)] = False
-    stays &= ~_mark(graph, delta.removed_ids)[graph.edges].any(axis=1)
-    handed = stays & _mark(graph, np.array([pair[0] for pair in merged], dtype=np.int64))[graph.edges].any(axis=1)
+    row_after, old = np.full(len(graph.ids), -1), np.flatnonzero(previous >= 0)
+    row_after[previous[old]] = old
+    untouched = np.full(len(graph.edges), not replaces)
+    untouched[_edges_at(graph, delta.removed_ids)] = False
+    untouched[_edge_numbers(graph, delta.removed_edges)] = False
+    handed = _edges_at(graph, np.array([pair[0] for pair in merged], dtype=np.int64))
+    handed = handed[untouched[handed]]
+    untouched[handed] = False
     inherited = graph.ids[graph.edges[handed]]
     for gone, into in merged:
         inherited[inherited == gone] = into
-    untouched = stays & ~handed
-    pairs, clearances_m = row_after[graph.edges[untouched]], graph.clearances_m[untouched]
+    kept = np.flatnonzero(untouched)
+    pairs, clearances_m = np.take(row_after, np.take(graph.edges, kept, axis=0)), np.take(graph.clearances_m, kept)
     keys = pairs[:, 0] * count + pairs[:, 1]  # ascending: rows keep their order
     told = after.rows(np.concatenate((delta.edges, inherited)).reshape(-1)).reshape(-1, 2)
     told_m = np.concatenate((delta.clearances_m, graph.clearances_m[handed]))
@@ -174,26 +184,49 @@ def _join_edges(
     there = at < len(keys)
     there[there] = keys[at[there]] == told_keys[there]
     clearances_m[at[there & from_delta]] = told_m[there & from_delta]
-    after.edges = np.insert(pairs, at[~there], told[~there], axis=0)
-    after.clearances_m = np.insert(clearances_m, at[~there], told_m[~there])
-    ends = np.concatenate((told.reshape(-1), row_after[graph.edges[~untouched]].reshape(-1)))
+    after.edges = inserted(pairs, at[~there], told[~there])
+    after.clearances_m = inserted(clearances_m, at[~there], told_m[~there])
+    ends = np.concatenate((told.reshape(-1), row_after[graph.edges[np.flatnonzero(~untouched)]].reshape(-1)))
     return ends[ends >= 0]
 
 
-def _mark(graph: ReceivedGraph, place_ids: np.ndarray) -> np.ndarray:
-    """Mask (place,) of these places."""
-    mask, rows = np.zeros(len(graph.ids), dtype=bool), graph.rows(place_ids)
-    mask[rows[rows >= 0]] = True
-    return mask
+def realigned(column: np.ndarray, previous: np.ndarray, fill: float | bool) -> np.ndarray:
+    """A column on other rows: `previous` is the former row of each, -1 = new, which gets `fill`."""
+    if not len(column):
+        return np.full((len(previous), *column.shape[1:]), fill, dtype=column.dtype)
+    after = np.take(column, previous, axis=0, mode="clip")
+    after[np.flatnonzero(previous < 0)] = fill
+    return after
+
+
+def inserted(column: np.ndarray, at: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """The column with `values` (n,) put in before its rows `at` (n,), ascending, as `np.insert` does, but in blocks."""
+    places, first = np.unique(at, return_index=True)
+    kept, new = np.split(column, places), np.split(values, first)  # before the first of `values` is nothing
+    return np.concatenate([piece for pair in zip(new, kept, strict=True) for piece in pair])
+
+
+def _edges_at(graph: ReceivedGraph, place_ids: np.ndarray) -> np.ndarray:
+    """Numbers (n,), ascending, of the edges of these places."""
+    rows = graph.rows(place_ids)
+    return np.unique(graph.arcs.edges[arcs_from(graph.arcs, rows[rows >= 0])])
 
 
 def _edge_numbers(graph: ReceivedGraph, pairs: np.ndarray) -> np.ndarray:
     """Which edges join these pairs (n, 2) of place ids, in any order; pairs without an edge are left out."""
-    if not (len(pairs) and len(graph.edges)):
-        return np.zeros(0, dtype=np.int64)
-    count = len(graph.ids)
     rows = graph.rows(pairs.reshape(-1)).reshape(-1, 2)
-    rows = np.sort(rows[(rows >= 0).all(axis=1)], axis=1)
-    keys, wanted = graph.edges[:, 0] * count + graph.edges[:, 1], rows[:, 0] * count + rows[:, 1]
-    at = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
-    return at[keys[at] == wanted]
+    numbers = edges_between(graph.arcs, rows[(rows >= 0).all(axis=1)])
+    return numbers[numbers >= 0]
+
+
+@compiled()
+def _lengths_m(positions_m, edges):  # noqa: ANN001, ANN202
+    """Length (edge,) of each edge, as `np.linalg.norm` adds it up."""
+    lengths_m = np.empty(len(edges))
+    for edge in range(len(edges)):
+        one, other = edges[edge, 0], edges[edge, 1]
+        x_m = positions_m[one, 0] - positions_m[other, 0]
+        y_m = positions_m[one, 1] - positions_m[other, 1]
+        z_m = positions_m[one, 2] - positions_m[other, 2]
+        lengths_m[edge] = np.sqrt(x_m * x_m + y_m * y_m + z_m * z_m)
+    return lengths_m

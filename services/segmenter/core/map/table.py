@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from prior_sg.schemas.regions import NO_REGION
-from prior_sg.services.segmenter.core.map.received import Step
+from prior_sg.services.segmenter.core.map.received import Step, realigned
 
 UNLABELLED = -1
 
@@ -30,10 +30,11 @@ _FILLS: dict[str, tuple[float | bool, str]] = {  # what a new place gets, and th
     "reshaped": (True, "bool"),
     "doubtful": (True, "bool"),
     "unsettled": (True, "bool"),
+    "unparted": (True, "bool"),
     "unbelieved": (True, "bool"),
 }
 _PER_LABEL = ("own_similarity", "similarity", "correction", "contents", "unary", "posteriors")
-_AFTER_A_SWITCH = ("stale", "unshared", "doubtful", "unsettled", "unbelieved")
+_AFTER_A_SWITCH = ("stale", "unshared", "doubtful", "unsettled", "unparted", "unbelieved")
 
 
 @dataclass
@@ -60,6 +61,7 @@ class Places:
     reshaped: np.ndarray  # graph changed nearby: find the local surface again
     doubtful: np.ndarray  # what an expert looks at changed: ask the experts again
     unsettled: np.ndarray  # costs changed: look for a better label
+    unparted: np.ndarray  # its label, its edges or where it stands changed: find the regions around it again
     unbelieved: np.ndarray  # costs or a neighbour's label changed: find the posterior again
 
     def looks(self, rows: np.ndarray) -> np.ndarray:
@@ -75,10 +77,7 @@ class Places:
         """The same on the rows of the next graph."""
         if step.same_rows:
             return self
-        old = step.previous >= 0
-        columns = {
-            name: _realigned(getattr(self, name), step.previous, old, fill) for name, (fill, _) in _FILLS.items()
-        }
+        columns = {name: realigned(getattr(self, name), step.previous, fill) for name, (fill, _) in _FILLS.items()}
         return Places(**columns)
 
     def relabelled(self, count: int) -> "Places":
@@ -87,11 +86,3 @@ class Places:
         columns |= {name: np.zeros((rows, count), _FILLS[name][1]) for name in _PER_LABEL}
         columns |= {name: np.ones(rows, dtype=bool) for name in _AFTER_A_SWITCH}
         return Places(**(columns | {name: np.full(rows, UNLABELLED) for name in ("labels", "cut_labels")}))
-
-
-def _realigned(column: np.ndarray, previous: np.ndarray, old: np.ndarray, fill: float | bool) -> np.ndarray:
-    if not len(column):
-        return np.full((len(previous), *column.shape[1:]), fill, dtype=column.dtype)
-    after = column[np.maximum(previous, 0)]
-    after[~old] = fill
-    return after

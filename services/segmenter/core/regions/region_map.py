@@ -5,9 +5,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from prior_sg.schemas.regions import Region, RegionEvent
-from prior_sg.services.segmenter.core.layers.storeys import StoreyConfig, Storeys, split, storeys_of
+from prior_sg.services.segmenter.core.layers.storeys import StoreyConfig, Storeys, floors_differ, split, storeys_of
+from prior_sg.services.segmenter.core.map.arcs import arcs_from, joined
 from prior_sg.services.segmenter.core.map.place_map import MapChange, PlaceMap
-from prior_sg.services.segmenter.core.map.received import with_neighbours
 from prior_sg.services.segmenter.core.regions import components
 from prior_sg.services.segmenter.core.regions.ledger import Ledger
 
@@ -26,6 +26,7 @@ class RegionMap:
     def inherit(self, regions: list[Region], next_id: int) -> None:
         """These regions were known before this process; nothing has been told yet."""
         self.known = {region.id: region for region in regions}
+        self.reformed.update(self.known)
         self.next_id = max(self.next_id, next_id)
         self.ledger = Ledger()
 
@@ -41,23 +42,31 @@ class RegionMap:
         self.reformed.update(place_map.places.regions[change.step.upserted].tolist())
 
     def partition(self, place_map: PlaceMap, names: list[str], cfg: StoreyConfig) -> list[RegionEvent]:
-        """Regions of the labels as they are, with ids that last; returns what became of whom."""
-        places, graph, previous = place_map.places, place_map.graph, place_map.places.regions
+        """Regions of the labels as they are, with ids that last; returns what became of whom.
+
+        A region is found again with all that its label joins it to, where any of that was marked, or is beside a mark.
+        Whatever gains or loses a place is among these, and nobody else has places of theirs.
+        """
+        places, graph, before = place_map.places, place_map.graph, self.storeys
         self.storeys = storeys_of(graph, cfg)
-        component = split(components.numbered(places.labels, graph.edges), graph.edges, self.storeys, cfg)
-        places.regions, self.next_id = components.track(component, previous, self.next_id)
-        moved = places.regions != previous
-        places.unbelieved |= moved  # so that followers learn the region of places far from the change
-        beside = with_neighbours(graph, moved)  # lists of neighbours name a region that came, went or grew
-        self.disturbed.update(previous[moved].tolist(), places.regions[beside].tolist())
-        self.reformed.update(previous[moved].tolist(), places.regions[moved].tolist())
+        if before is not None and floors_differ(before.floors_m, self.storeys.floors_m):
+            places.unparted[:] = True
+        rows, edges = joined(places.labels, graph.arcs, np.flatnonzero(places.unparted))
+        places.unparted[:] = False
+        component = split(components.numbered(places.labels[rows], edges), edges, self.storeys.at(rows), cfg)
+        former = places.regions[rows]
+        now, self.next_id = components.track(component, former, self.next_id)
+        places.regions[rows] = now
+        moved = now != former
+        places.unbelieved[rows[moved]] = True  # so that followers learn the region of places far from the change
+        beside = graph.arcs.neighbours[arcs_from(graph.arcs, rows[moved])]  # they list a region that came, went or grew
+        self.reformed.update(former[moved].tolist(), now[moved].tolist())
+        self.disturbed.update(former[moved].tolist(), now[moved].tolist(), places.regions[beside].tolist())
         first = components.first_rows(component)
-        numbers, label_rows = places.regions[first].tolist(), places.labels[first].tolist()
-        labels = {region: names[label] for region, label in zip(numbers, label_rows, strict=True)}
-        before = {region.id: region.label for region in self.known.values()}
-        if not moved.any() and labels == before:
-            return []
-        return components.events(previous, places.regions, before, labels)
+        label_rows = places.labels[rows[first]].tolist()
+        labels = {region: names[label] for region, label in zip(now[first].tolist(), label_rows, strict=True)}
+        others = {*former.tolist(), *labels, *self.reformed} & self.known.keys()
+        return components.events(former, now, {region: self.known[region].label for region in others}, labels)
 
     def wanted(self, everything: bool) -> np.ndarray:
         """Mask (region id,) of those to be described again; the last entry is that of no region."""
