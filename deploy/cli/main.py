@@ -69,6 +69,8 @@ def main(argv: list[str] | None = None) -> int:
     """Exit status of the command; faults of the user or the system are one sentence on standard error."""
     from prior_sg.deploy.interrupts import EXIT_INTERRUPTED, remembered
 
+    # As services of `up` have it: products are small, and threads spin for each other and change last bits of sums.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
         with remembered():
             return _told(argv)
