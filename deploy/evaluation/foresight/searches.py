@@ -48,7 +48,7 @@ def ours(sight: Sight) -> int:
     origins = one.origins(sight.explorer, sight.frontiers, sight.seen_m2)
     foreseen = beyond(one.views(sight.explorer, sight.frontiers, origins, sight.seen_m2, cfg), expectation, cfg)
     ways_m = sight.frontiers.steps * CELL_M / STRAIGHT
-    return int(chances_per_metre(ways_m, foreseen.within[:, sight.quest.goal], cfg.look_m).argmax())
+    return int(chances_per_metre(ways_m, foreseen.toward[:, sight.quest.goal], cfg.look_m).argmax())
 
 
 POLICIES: dict[str, Policy] = {

@@ -99,6 +99,7 @@ class Moment:
     met: np.ndarray  # (opening, label) bool: such a region, not found yet, begins within REACH_M
     left: np.ndarray  # (label,) bool: one more region of it is to be found
     led: np.ndarray | None = None  # (opening,) bool: something unseen to stand on is behind; None = behind all
+    ways: tuple[np.ndarray, np.ndarray] | None = None  # (label,) and (label,), as `ways_left` tells; None = not asked
 
 
 @lru_cache(32)
@@ -161,9 +162,28 @@ def moments(one: Trial) -> Iterator[Moment]:
             outcomes[kept],
             met,
             np.bincount(one.labels[new], minlength=count) > 0,
+            ways=ways_left(
+                explorer, [frontiers.nodes[at] for at in kept.tolist()], np.where(new, one.labels, -1), count
+            ),
         )
         at = int(frontiers.steps.argmin())
         go(explorer, before, frontiers, at)
+
+
+def ways_left(
+    explorer: Explorer, openings: list[np.ndarray], labels: np.ndarray, count: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """The opening (label,) through which one comes to the nearest region of each of `count` labels that is left, -1 =
+    through none, and the unseen way from there in metres (label,). `labels` (region,) are those of regions that are
+    left, -1 of others; `openings` are the nodes of each."""
+    toward, deep_m = np.full(count, -1), np.full(count, np.inf)
+    if not openings:
+        return toward, deep_m
+    through, ways_m = explorer.toward(openings)
+    for region in np.flatnonzero((labels >= 0) & (through >= 0)).tolist():
+        if ways_m[region] < deep_m[labels[region]]:
+            toward[labels[region]], deep_m[labels[region]] = through[region], ways_m[region]
+    return toward, deep_m
 
 
 def go(explorer: Explorer, before: np.ndarray, frontiers: Frontiers, at: int) -> None:

@@ -87,6 +87,30 @@ def test_a_corridor_leads_to_more_than_a_room_at_its_end():
     assert corridor[3] > 2 * end[3]
 
 
+@pytest.mark.parametrize("seed", range(6))
+def test_what_is_left_is_come_to_through_one_opening(seed):
+    the_prior, the_found, many = random_case(seed)
+    result = foreseen(the_prior, the_found, many)
+    np.testing.assert_allclose(result.toward.sum(axis=0), 1.0)
+    assert (result.toward > 0).all()
+
+
+def test_what_leads_deep_counts_more_for_a_search_than_for_what_begins_behind():
+    """Of two openings behind which a bath begins alike, one is of a region that touches many."""
+    two = Views(np.eye(4)[[0, 0]], np.full(2, 0.9), np.full(2, 8.0), around(2, touching=np.array([1.0, 9.0])))
+    cfg = msgspec.structs.replace(CFG, within_touching=0.0)
+    result = foreseen(home(), found(), two, cfg)
+    assert result.within[0, 1] == result.within[1, 1] and result.toward[1, 1] > 2 * result.toward[0, 1]
+
+
+def test_nobody_comes_to_anything_through_a_shadow():
+    the_prior, the_found = home(), found()
+    signs = looking([1.2, 1.2], [0, 0.6], [0.9, 0.1])
+    result = foreseen(the_prior, the_found, signs)
+    chance = leads(signs, CFG)
+    np.testing.assert_allclose(result.toward[0] / result.toward[1], chance[0] / chance[1])
+
+
 def test_many_openings_do_not_make_sure_what_one_does_not():
     """Openings of one map lead to the same rooms: fourteen make a third bath likelier, not certain."""
     many = Views(np.tile(np.eye(4)[0], (14, 1)), np.full(14, 0.9), np.full(14, 8.0), around(14))

@@ -82,6 +82,7 @@ def _opening(
                 label=prior.regions[label].name,
                 next=_short(foreseen.next[row, label]),
                 within=_short(within[label]),
+                toward=_short(foreseen.toward[row, label]),
                 adjacency=_short(prior.adjacency[here, label]),
                 existence=_short(prior.regions[label].existence),
                 found=int(found.regions[label]),
