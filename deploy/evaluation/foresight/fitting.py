@@ -17,6 +17,7 @@ from scipy.special import expit, log_softmax
 
 from prior_sg.deploy.evaluation.datasets import named_worlds
 from prior_sg.deploy.evaluation.foresight.mapped import ENCODER, mapped
+from prior_sg.deploy.evaluation.foresight.searches import searched
 from prior_sg.deploy.evaluation.foresight.trials import SAME, Moment, moments, trial
 from prior_sg.deploy.evaluation.perception import CACHE, Cache, Perceiver
 from prior_sg.deploy.evaluation.worlds import KINDS
@@ -38,6 +39,7 @@ from prior_sg.services.segmenter.core.foresight.expectation import expected, fea
 
 TUNED = range(0, 30)  # seeds that constants are chosen on
 RIDGE = 1e-2  # of the mean log-likelihood, around what is thought without worlds:
+SEARCHES = 4  # of each world
 TOWARD_RIDGE = 3e-3
 LOOSE = 1e-4  # the same of chances by opening and label, which are thousands of events a world
 THOUGHT = (1.0, 1.0, -1.0, -1.0, 0.0, 0.5, 0.5)  # weights of another region's label
@@ -75,7 +77,7 @@ def fitted(walks: Sequence[Walk], cfg: ForesightConfig = ForesightConfig()) -> F
     adjacency, existence, again, once, often, count, met = np.round(other, 2).tolist()
     *by_width, by_area, by_spread = np.round(same, 2).tolist()
     return msgspec.structs.replace(
-        _with_missing(walks, fitted_toward(walks, fitted_within(walks, cfg))),
+        _with_missing(walks, fitted_within(walks, cfg)),
         same_by_width=tuple(by_width),
         same_by_area=by_area,
         same_by_spread=by_spread,
@@ -97,7 +99,8 @@ def fitted_within(walks: Sequence[Walk], cfg: ForesightConfig) -> ForesightConfi
 
 
 def fitted_toward(walks: Sequence[Walk], cfg: ForesightConfig) -> ForesightConfig:
-    """The settings with the best weights of which opening leads to a region that is left, given what begins behind."""
+    """The settings with the best weights of which opening leads to a region that is left, given what begins behind;
+    `walks` are searches, for exploring comes to other openings."""
     rows = [_ways(*walk, cfg) for walk in walks]
     toward = _least(_toward_loss, [one for one in rows if one], toward_weights(cfg), TOWARD_RIDGE)
     return msgspec.structs.replace(cfg, **dict(zip(TOWARD, np.round(toward, 2).tolist(), strict=True)))
@@ -229,14 +232,14 @@ def main() -> None:
     kept = parser.add_mutually_exclusive_group()
     kept.add_argument("--keep", action="store_true", help="what explorers alone tell stays as it is set")
     kept.add_argument("--within", action="store_true", help="only what begins behind openings is fitted")
-    kept.add_argument("--toward", action="store_true", help="only which opening leads to what is left is fitted")
+    kept.add_argument("--toward", action="store_true", help="only which opening leads to what is left, by searches")
     given = parser.parse_args()
-    walks = []
+    walks, cfg = [], ForesightConfig()
     for kind in given.kinds.split(","):
         for seed in TUNED[: given.seeds]:
             one = trial(kind, seed)
-            walks.append((list(moments(one)), one.prior))
-    cfg = ForesightConfig()
+            walked = searched(one, SEARCHES, cfg) if given.toward else moments(one)
+            walks.append((list(walked), one.prior))
     if not given.keep:
         fit = fitted_within if given.within else fitted_toward if given.toward else fitted
         cfg = fit(walks, cfg)

@@ -232,8 +232,7 @@ def test_fitting_finds_the_weights_that_made_the_events():
         outcomes = [int(rng.choice(4, p=row)) - 1 for row in given]
         said = beyond(bare.views, expected(the_prior, bare.found, true), true)
         met, left = drawn.random(said.within.shape) < said.within, drawn.random(3) < said.missing
-        ways = (np.where(left, drawn.integers(4, size=3), -1), np.ones(3))
-        walk.append(replace(bare, outcomes=np.array(outcomes), met=met, left=left, ways=ways))
+        walk.append(replace(bare, outcomes=np.array(outcomes), met=met, left=left))
     found = fitted([(walk, the_prior)], cfg)
     chain, wanted = (
         expected(the_prior, Found(np.array([1.0, 0, 1]), np.zeros((3, 3))), one).next for one in (found, true)

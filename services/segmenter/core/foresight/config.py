@@ -61,18 +61,18 @@ class ForesightConfig(msgspec.Struct, frozen=True, kw_only=True):
     within_at_border: float = -0.6  # by log P(ri <-> rj), as near as a way into another region is
 
     # That the nearest region of a label, if one is left, is come to through an opening, and no other one: log-odds.
-    toward_within: float = 0.97  # by log of the chance that such a region begins within REACH_M
-    toward_adjacency: float = 0.34  # by log P(ri <-> rj)
-    toward_again: float = 0.29  # by the belief that the region it opens from has that label
-    toward_border_adjacency: float = 0.13  # by log P(ri <-> rj), as near as a way into another region is
-    toward_spread: float = -0.59  # by log of the mean number of other regions that touch one of its label
-    toward_touching: float = 1.03  # by log(1 + regions that touch the one it opens from)
-    toward_same: float = -0.18  # by the logit that the same region goes on
-    toward_width: float = 0.35  # by log of the opening's width / m
-    toward_area: float = -0.18  # by log(1 + seen area of the region it opens from / m2)
-    toward_nearby: float = 0.15  # by log(1 + other regions around it)
-    toward_storey: float = -0.53  # by log(1 + seen area of its storey / m2)
-    toward_at_border: float = 0.37  # as near as a way into another region is
+    toward_within: float = 1.11  # by log of the chance that such a region begins within REACH_M
+    toward_adjacency: float = 0.63  # by log P(ri <-> rj)
+    toward_again: float = 0.73  # by the belief that the region it opens from has that label
+    toward_border_adjacency: float = -0.01  # by log P(ri <-> rj), as near as a way into another region is
+    toward_spread: float = -1.15  # by log of the mean number of other regions that touch one of its label
+    toward_touching: float = 1.63  # by log(1 + regions that touch the one it opens from)
+    toward_same: float = -0.2  # by the logit that the same region goes on
+    toward_width: float = 0.53  # by log of the opening's width / m
+    toward_area: float = -0.46  # by log(1 + seen area of the region it opens from / m2)
+    toward_nearby: float = -0.52  # by log(1 + other regions around it)
+    toward_storey: float = -0.52  # by log(1 + seen area of its storey / m2)
+    toward_at_border: float = 0.43  # as near as a way into another region is
 
     # That one more region of a label is behind any of the openings: logit.
     missing_bias: float = 0.5
