@@ -69,6 +69,7 @@ def test_what_leads_to_it_comes_before_what_it_begins_behind():
     deep, shallow = opening(60, 0.1, toward=0.9), opening(300, 0.95, toward=0.1)
     found = ask(index_of(deep, shallow))
     assert [one.probability for one in found.prospects] == [0.1, 0.95]
+    assert [one.probability for one in ask(index_of(opening(60, 0.0, toward=0.9))).prospects] == [0.0]
     old = ask(index_of(opening(60, 0.1), opening(300, 0.95)))
     assert [one.probability for one in old.prospects] == [0.95, 0.1]
 

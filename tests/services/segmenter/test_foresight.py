@@ -246,6 +246,21 @@ def test_only_what_changes_visibly_is_news():
     assert [differs(now, msgspec.structs.replace(now, openings=[one]), CFG) for one in moved] == [False, True]
 
 
+def test_an_opening_tells_all_labels_that_it_leads_to():
+    """Searches would pass it by; what it hardly leads to is told where it is among the likeliest."""
+    graph, places = a_map()
+    openings = openings_of(graph, places, opened((10, (0, 1, 0), 2.0), (40, (0, -1, 0), 2.0)), CFG)
+    state_of = {7: region(7, "hall"), 8: region(8, "bath")}
+
+    def told(**fields):
+        cfg = msgspec.structs.replace(CFG, told_labels=1, **fields)
+        return [len(one.labels) for one in foresight(openings, state_of, home(), cfg).openings]
+
+    assert told(least_toward=0.01) == [4, 4]
+    assert told(least_toward=1.1) == [1, 1]
+    assert told(least_toward=1.1, least_within=1.0) == [0, 0]
+
+
 def region(number, label, neighbours=(), **fields):
     usual = {"place_count": 9, "probability": 0.9, "position_m": (0, 0, 0), "area_m2": 9.0}
     return Region(id=number, label=label, neighbour_ids=list(neighbours), **(usual | fields))

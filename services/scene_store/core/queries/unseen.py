@@ -52,7 +52,7 @@ def _prospects(
     entries = [_entry(opening, label) for opening in held]
     chances = np.array([entry.within if entry else 0.0 for entry in entries])
     toward = np.array([entry.toward if entry else 0.0 for entry in entries])
-    likely = np.flatnonzero((chances > 0) & np.isfinite(ways_m))
+    likely = np.flatnonzero(((chances > 0) | (toward > 0)) & np.isfinite(ways_m))
     ways_m, points_m, chances, toward = ways_m[likely], points_m[likely], chances[likely], toward[likely]
     metres = expected_metres(ways_m, points_m, chances, foresight.look_m, foresight.elsewhere_m)
     worth = chances_per_metre(ways_m, toward if toward.any() else chances, foresight.look_m)

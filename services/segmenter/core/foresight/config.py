@@ -84,6 +84,9 @@ class ForesightConfig(msgspec.Struct, frozen=True, kw_only=True):
     look_m: float = 1.0  # walked behind an opening to see what is there
     elsewhere_m: float = 40.0  # to what lies behind none of the openings
     told_change: float = 0.05  # smaller changes of a probability are no news
-    told_labels: int = 8  # of each opening, the most probable
+    told_labels: int = 8  # of each opening, the most probable ...
+    least_toward: float = (
+        0.01  # ... and all that it leads to with at least so much: a search would pass it by otherwise
+    )
     least_told: float = 0.02  # of what is missing
     least_within: float = 0.001  # behind one opening: most lead nowhere, and the best of them is still where to look

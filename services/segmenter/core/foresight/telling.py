@@ -68,8 +68,11 @@ def _opening(
     openings: Openings, row: int, *, foreseen: Beyond, prior: Prior, found: Found, cfg: ForesightConfig
 ) -> Opening:
     here = int(openings.beliefs[row].argmax())
-    within = foreseen.within[row]
-    likely = np.argsort(-within, kind="stable")[: cfg.told_labels].tolist()
+    within, toward = foreseen.within[row], foreseen.toward[row]
+    by_chance = np.argsort(-within, kind="stable")
+    likely = within >= cfg.least_within
+    likely[by_chance[cfg.told_labels :]] = False
+    told = by_chance[(likely | (toward >= cfg.least_toward))[by_chance]].tolist()
     return Opening(
         place_id=int(openings.place_ids[row]),
         position_m=_point(openings.positions_m[row]),
@@ -82,14 +85,13 @@ def _opening(
                 label=prior.regions[label].name,
                 next=_short(foreseen.next[row, label]),
                 within=_short(within[label]),
-                toward=_short(foreseen.toward[row, label]),
+                toward=_short(toward[label]),
                 adjacency=_short(prior.adjacency[here, label]),
                 existence=_short(prior.regions[label].existence),
                 found=int(found.regions[label]),
                 met=int(found.borders[here, label]),
             )
-            for label in likely
-            if within[label] >= cfg.least_within
+            for label in told
         ],
     )
 
