@@ -12,6 +12,7 @@ class ForeseenLabel(Part, frozen=True, kw_only=True):
     label: str
     next: float  # probability that the very next region behind the opening is another one, with this label
     within: float  # that such a region begins within REACH_M behind the opening
+    toward: float = 0.0  # that the nearest such region, if one is left, is come to through it; 0 throughout = not told
     adjacency: float = 0.0  # why: P(ri <-> rj) of the prior with the label of the region that the opening belongs to
     existence: float = 0.0  # P(r | E0)
     found: int = 0  # regions of this label that the map holds

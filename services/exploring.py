@@ -33,6 +33,7 @@ def expected_metres(
 
 def chances_per_metre(distances_m: np.ndarray, chances: np.ndarray, look_m: float) -> np.ndarray:
     """What to choose an opening by (opening,), largest first: its chance over the metres to it and `look_m` behind it.
+    Best is the chance that it leads to the thing at all, however deep (`ForeseenLabel.toward`).
 
     To think further ahead, by the expected metres of whole orders, made searches of generated worlds no shorter
     (docs/evaluation.md).

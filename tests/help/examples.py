@@ -199,7 +199,7 @@ FORESIGHT = foresight.Foresight(
             same=0.25,
             labels=[
                 foresight.ForeseenLabel(
-                    label="hall", next=0.5, within=0.75, adjacency=0.875, existence=0.25, found=1, met=2
+                    label="hall", next=0.5, within=0.75, toward=0.625, adjacency=0.875, existence=0.25, found=1, met=2
                 )
             ],
         )

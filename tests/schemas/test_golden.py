@@ -70,6 +70,13 @@ def test_what_was_written_before_the_store_kept_history_means_the_present(name, 
     assert decode(type(message), msgpack.packb(fields)) == msgspec.structs.replace(message, **defaults)
 
 
+def test_what_was_foreseen_before_it_was_told_what_openings_lead_to_tells_none():
+    foresight = next(example for example in EXAMPLES if by_name(example) == "Scene").foresight
+    fields = msgspec.to_builtins(foresight)
+    assert fields["openings"][0]["labels"][0].pop("toward") > 0
+    assert msgspec.convert(fields, Foresight).openings[0].labels[0].toward == 0
+
+
 @pytest.mark.parametrize(("name", "default"), [("RegionDelta", None), ("Scene", Foresight())])
 def test_what_was_written_before_anything_was_foreseen_foresees_nothing(name, default):
     message = next(example for example in EXAMPLES if by_name(example) == name)

@@ -139,6 +139,21 @@ class Explorer:
         counts = np.bincount(held[held != NO_REGION], minlength=len(plan.labels))
         return np.flatnonzero(counts * CELL_M**2 >= MET_M2)
 
+    def toward(self, frontiers: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        """The frontier (region,) that one comes to each true region through with the least unseen way, and that way in
+        metres (region,); -1 and inf = through none."""
+        plan = self.plan
+        count = len(plan.labels)
+        through, ways_m = np.full(count, -1), np.full(count, np.inf)
+        nodes = np.concatenate(frontiers)
+        numbers = np.repeat(np.arange(len(frontiers)), [len(one) for one in frontiers])
+        depth, nearest = loops.flooded(plan.heights, plan.clearance, self.known, nodes, numbers, plan.step)
+        reached = np.flatnonzero((depth >= 0) & (plan.regions != NO_REGION))
+        reached = reached[np.argsort(depth[reached], kind="stable")]
+        regions, first = np.unique(plan.regions[reached], return_index=True)
+        through[regions], ways_m[regions] = nearest[reached[first]], depth[reached[first]] * CELL_M
+        return through, ways_m
+
     def walk(self, before: np.ndarray, target: int, until: np.ndarray) -> None:
         """Walk towards a node, looking around on the way, until there or until nothing is unseen beside `until`."""
         way = [target]

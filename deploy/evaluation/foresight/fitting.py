@@ -17,15 +17,20 @@ from scipy.special import expit, log_softmax
 
 from prior_sg.deploy.evaluation.datasets import named_worlds
 from prior_sg.deploy.evaluation.foresight.mapped import ENCODER, mapped
+from prior_sg.deploy.evaluation.foresight.searches import searched
 from prior_sg.deploy.evaluation.foresight.trials import SAME, Moment, moments, trial
 from prior_sg.deploy.evaluation.perception import CACHE, Cache, Perceiver
 from prior_sg.deploy.evaluation.worlds import KINDS
 from prior_sg.schemas.priors import Prior
 from prior_sg.services.segmenter.core.foresight.beyond import (
     beyond,
+    leads,
     missing_features,
     missing_weights,
     same_features,
+    same_weights,
+    toward_features,
+    toward_weights,
     within_features,
     within_weights,
 )
@@ -34,9 +39,13 @@ from prior_sg.services.segmenter.core.foresight.expectation import expected, fea
 
 TUNED = range(0, 30)  # seeds that constants are chosen on
 RIDGE = 1e-2  # of the mean log-likelihood, around what is thought without worlds:
+SEARCHES = 4  # of each world
+TOWARD_RIDGE = 3e-3
 LOOSE = 1e-4  # the same of chances by opening and label, which are thousands of events a world
 THOUGHT = (1.0, 1.0, -1.0, -1.0, 0.0, 0.5, 0.5)  # weights of another region's label
 WITHIN = [name for name in ForesightConfig.__struct_fields__ if name.startswith("within_")]
+TOWARD = [name for name in ForesightConfig.__struct_fields__ if name.startswith("toward_")]
+FADING_M = 8.0  # unseen way over which what is come to counts less by e: searches seldom get that far
 LEADS = [name for name in ForesightConfig.__struct_fields__ if name.startswith("leads_")]
 MISSING = [name for name in ForesightConfig.__struct_fields__ if name.startswith("missing_")]
 Walk = tuple[Sequence[Moment], Prior]
@@ -50,6 +59,14 @@ class Rows(NamedTuple):
     goes_on: np.ndarray  # (event,) bool
     other: np.ndarray  # (event of another region, label, feature)
     came: np.ndarray  # (event of another region,) label
+
+
+class Way(NamedTuple):
+    """The openings of one moment, for labels that are left."""
+
+    rows: np.ndarray  # (opening, label, feature)
+    came: np.ndarray  # (label,) the opening that one comes to it through
+    counts: np.ndarray  # (label,) how much it counts
 
 
 def fitted(walks: Sequence[Walk], cfg: ForesightConfig = ForesightConfig()) -> ForesightConfig:
@@ -79,6 +96,14 @@ def fitted_within(walks: Sequence[Walk], cfg: ForesightConfig) -> ForesightConfi
     rows = [_within(*walk, cfg) for walk in walks if any(len(moment.outcomes) for moment in walk[0])]
     within = _least(lambda weights, one: _loss(weights, *one), rows, within_weights(cfg), LOOSE)
     return msgspec.structs.replace(cfg, **dict(zip(WITHIN, np.round(within, 2).tolist(), strict=True)))
+
+
+def fitted_toward(walks: Sequence[Walk], cfg: ForesightConfig) -> ForesightConfig:
+    """The settings with the best weights of which opening leads to a region that is left, given what begins behind;
+    `walks` are searches, for exploring comes to other openings."""
+    rows = [_ways(*walk, cfg) for walk in walks]
+    toward = _least(_toward_loss, [one for one in rows if one], toward_weights(cfg), TOWARD_RIDGE)
+    return msgspec.structs.replace(cfg, **dict(zip(TOWARD, np.round(toward, 2).tolist(), strict=True)))
 
 
 def fitted_to_maps(maps: Sequence[Walk], walks: Sequence[Walk], cfg: ForesightConfig) -> ForesightConfig:
@@ -121,6 +146,23 @@ def _within(walk: Sequence[Moment], prior: Prior, cfg: ForesightConfig) -> tuple
     )
 
 
+def _ways(walk: Sequence[Moment], prior: Prior, cfg: ForesightConfig) -> list[Way]:
+    """What the model reads of the openings of each moment, for labels that are left."""
+    found = []
+    for moment in walk:
+        if moment.ways is None or len(moment.outcomes) < 2:
+            continue
+        through, deep_m = moment.ways
+        labels = np.flatnonzero(through >= 0)
+        if len(labels):
+            chain, views = expected(prior, moment.found, cfg), moment.views
+            within = expit(within_features(views, chain, leads(views, cfg).sum()) @ within_weights(cfg))
+            goes_on = same_features(views, chain.spread, cfg) @ same_weights(cfg)
+            rows = toward_features(views, chain, within, goes_on)[:, labels]
+            found.append(Way(rows, through[labels], np.exp(-deep_m[labels] / FADING_M)))
+    return found
+
+
 def _signs(walk: Sequence[Moment]) -> tuple[np.ndarray, np.ndarray]:
     """What a map's openings look like (event, feature), and whether they led anywhere (event,)."""
     told = [(one.views.signs, one.led) for one in walk if one.views.signs is not None and one.led is not None]
@@ -143,6 +185,18 @@ def _loss(weights: np.ndarray, rows: np.ndarray, true: np.ndarray) -> tuple[floa
     sign = np.where(true, 1.0, -1.0)
     logit = sign * (rows @ weights)
     return float(np.logaddexp(0, -logit).mean()), -((sign * expit(-logit)) @ rows) / len(logit)
+
+
+def _toward_loss(weights: np.ndarray, ways: Sequence[Way]) -> tuple[float, np.ndarray]:
+    """Mean negative log-likelihood of the openings of one world that led to what was left, and its gradient."""
+    total, slope, whole = 0.0, np.zeros(len(weights)), 0.0
+    for way in ways:
+        logs, at = log_softmax(way.rows @ weights, axis=0), np.arange(len(way.came))
+        off = np.einsum("ol,olf->lf", np.exp(logs), way.rows) - way.rows[way.came, at]
+        total -= float(way.counts @ logs[way.came, at])
+        slope += way.counts @ off
+        whole += float(way.counts.sum())
+    return total / whole, slope / whole
 
 
 def _other_loss(weights: np.ndarray, one: Rows) -> tuple[float, np.ndarray]:
@@ -178,15 +232,17 @@ def main() -> None:
     kept = parser.add_mutually_exclusive_group()
     kept.add_argument("--keep", action="store_true", help="what explorers alone tell stays as it is set")
     kept.add_argument("--within", action="store_true", help="only what begins behind openings is fitted")
+    kept.add_argument("--toward", action="store_true", help="only which opening leads to what is left, by searches")
     given = parser.parse_args()
-    walks = []
+    walks, cfg = [], ForesightConfig()
     for kind in given.kinds.split(","):
         for seed in TUNED[: given.seeds]:
             one = trial(kind, seed)
-            walks.append((list(moments(one)), one.prior))
-    cfg = ForesightConfig()
+            walked = searched(one, SEARCHES, cfg) if given.toward else moments(one)
+            walks.append((list(walked), one.prior))
     if not given.keep:
-        cfg = (fitted_within if given.within else fitted)(walks, cfg)
+        fit = fitted_within if given.within else fitted_toward if given.toward else fitted
+        cfg = fit(walks, cfg)
     names = [name for text in given.maps for name in named_worlds(text)]
     perceiver = Perceiver({}, Cache(CACHE), lambda *_: None, ENCODER)
     maps = [mapped(name.kind, name.seed, perceiver) for name in names]

@@ -182,6 +182,37 @@ def grouped(heights, edge, limit):  # noqa: ANN001, ANN201
 
 
 @compiled()
+def flooded(heights, clearance, known, nodes, numbers, limit):  # noqa: ANN001, ANN201, PLR0917
+    """How many cells (node,) one comes through unseen nodes from the nearest of these, and that one's number (node,).
+
+    Both are -1 where nodes were seen or nobody comes to them.
+    """
+    ny, levels = heights.shape[1], heights.shape[2]
+    depth = np.full(heights.size, -1, np.int32)
+    nearest = np.full(heights.size, -1, np.int64)
+    front, far = list(nodes), 0
+    nearest[nodes] = numbers
+    while len(front) > 0:
+        far += 1
+        following = [0 for _ in range(0)]
+        for here in front:
+            cell, level = here // levels, here % levels
+            i, j = cell // ny, cell % ny
+            for a, b in ((i - 1, j), (i + 1, j), (i, j - 1), (i, j + 1)):
+                other = _step(heights, a, b, heights[i, j, level], limit)
+                if other == NONE or clearance[a, b, other] < 2:
+                    continue
+                there = (a * ny + b) * levels + other
+                if not known[there] and depth[there] < 0:
+                    depth[there] = far
+                    nearest[there] = nearest[here]
+                    following.append(there)
+        front = following
+    nearest[nodes] = -1
+    return depth, nearest
+
+
+@compiled()
 def beyond(heights, clearance, known, nodes, depth, limit):  # noqa: ANN001, ANN201, PLR0917
     """Unseen nodes that one comes to from these through unseen ones, at most `depth` cells away."""
     ny, levels = heights.shape[1], heights.shape[2]

@@ -99,6 +99,7 @@ class Moment:
     met: np.ndarray  # (opening, label) bool: such a region, not found yet, begins within REACH_M
     left: np.ndarray  # (label,) bool: one more region of it is to be found
     led: np.ndarray | None = None  # (opening,) bool: something unseen to stand on is behind; None = behind all
+    ways: tuple[np.ndarray, np.ndarray] | None = None  # (label,) and (label,), as `ways_left` tells; None = not asked
 
 
 @lru_cache(32)
@@ -136,34 +137,56 @@ def trial(kind: str, seed: int, errors: float = ERRORS) -> Trial:
 def moments(one: Trial) -> Iterator[Moment]:
     """An exploration, always to the nearest frontier, until nothing is left."""
     explorer = Explorer(one.plan, int(one.random(1).choice(one.starts)))
-    walkable = np.isin(np.arange(len(one.labels)), one.plan.regions[one.starts])
     for _ in range(MOST_DECISIONS):
         cost, before = explorer.reach()
         frontiers = explorer.frontiers(cost)
         if not len(frontiers.targets):
             return
-        seen_m2 = explorer.seen_m2()
-        revealed = np.array([explorer.revealed(nodes) for nodes in frontiers.nodes], np.int64)
-        known = revealed != NO_REGION
-        origins = one.origins(explorer, frontiers, seen_m2)
-        outcomes = np.where(revealed == origins, SAME, np.where(known, one.labels[revealed], SAME))
-        kept = np.flatnonzero(known & (one.labels[np.maximum(revealed, 0)] >= 0))
-        views = one.views(explorer, frontiers, origins, seen_m2)
-        count = len(one.prior.regions)
-        new = (seen_m2 < FOUND_M2) & (one.labels >= 0) & walkable
-        met = np.zeros((len(kept), count), bool)
-        for row, at in enumerate(kept.tolist()):
-            regions = explorer.met(frontiers.nodes[at])
-            met[row, one.labels[regions[new[regions]]]] = True
-        yield Moment(
-            Views(views.beliefs[kept], views.widths_m[kept], views.areas_m2[kept], views.around.of(kept)),
-            one.found(explorer, seen_m2),
-            outcomes[kept],
-            met,
-            np.bincount(one.labels[new], minlength=count) > 0,
-        )
-        at = int(frontiers.steps.argmin())
-        go(explorer, before, frontiers, at)
+        yield moment_of(one, explorer, frontiers)
+        go(explorer, before, frontiers, int(frontiers.steps.argmin()))
+
+
+def moment_of(one: Trial, explorer: Explorer, frontiers: Frontiers) -> Moment:
+    """What the frontiers of a moment reveal."""
+    seen_m2 = explorer.seen_m2()
+    revealed = np.array([explorer.revealed(nodes) for nodes in frontiers.nodes], np.int64)
+    known = revealed != NO_REGION
+    origins = one.origins(explorer, frontiers, seen_m2)
+    outcomes = np.where(revealed == origins, SAME, np.where(known, one.labels[revealed], SAME))
+    kept = np.flatnonzero(known & (one.labels[np.maximum(revealed, 0)] >= 0))
+    views = one.views(explorer, frontiers, origins, seen_m2)
+    count = len(one.prior.regions)
+    walkable = np.isin(np.arange(len(one.labels)), one.plan.regions[one.starts])
+    new = (seen_m2 < FOUND_M2) & (one.labels >= 0) & walkable
+    openings = [frontiers.nodes[at] for at in kept.tolist()]
+    met = np.zeros((len(kept), count), bool)
+    for row, nodes in enumerate(openings):
+        regions = explorer.met(nodes)
+        met[row, one.labels[regions[new[regions]]]] = True
+    return Moment(
+        Views(views.beliefs[kept], views.widths_m[kept], views.areas_m2[kept], views.around.of(kept)),
+        one.found(explorer, seen_m2),
+        outcomes[kept],
+        met,
+        np.bincount(one.labels[new], minlength=count) > 0,
+        ways=ways_left(explorer, openings, np.where(new, one.labels, -1), count),
+    )
+
+
+def ways_left(
+    explorer: Explorer, openings: list[np.ndarray], labels: np.ndarray, count: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """The opening (label,) through which one comes to the nearest region of each of `count` labels that is left, -1 =
+    through none, and the unseen way from there in metres (label,). `labels` (region,) are those of regions that are
+    left, -1 of others; `openings` are the nodes of each."""
+    toward, deep_m = np.full(count, -1), np.full(count, np.inf)
+    if not openings:
+        return toward, deep_m
+    through, ways_m = explorer.toward(openings)
+    for region in np.flatnonzero((labels >= 0) & (through >= 0)).tolist():
+        if ways_m[region] < deep_m[labels[region]]:
+            toward[labels[region]], deep_m[labels[region]] = through[region], ways_m[region]
+    return toward, deep_m
 
 
 def go(explorer: Explorer, before: np.ndarray, frontiers: Frontiers, at: int) -> None:

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from prior_sg.deploy.evaluation.foresight.explorer import Explorer, Plan, crossings
-from prior_sg.deploy.evaluation.foresight.fitting import fitted, fitted_to_maps, fitted_within
+from prior_sg.deploy.evaluation.foresight.fitting import fitted, fitted_to_maps, fitted_toward, fitted_within
 from prior_sg.deploy.evaluation.foresight.loops import FAR
 from prior_sg.deploy.evaluation.foresight.mapped import behind, covered, ground_of
 from prior_sg.deploy.evaluation.foresight.predictors import PREDICTORS
 from prior_sg.deploy.evaluation.foresight.scores import chance_figures, figures, judge, search_figures
 from prior_sg.deploy.evaluation.foresight.searches import POLICIES, Quest, metres
-from prior_sg.deploy.evaluation.foresight.trials import SAME, Moment, Trial, go
+from prior_sg.deploy.evaluation.foresight.trials import SAME, Moment, Trial, go, ways_left
 from prior_sg.deploy.evaluation.worlds.ways import CELL_M, LEVELS, ways_of
 from prior_sg.services.segmenter.core.foresight.around import fading
 from prior_sg.services.segmenter.core.foresight.beyond import Views, beyond, leads, leads_features
@@ -140,7 +140,7 @@ def test_every_policy_finds_what_is_there(policy):
 
 def test_who_is_told_nothing_goes_to_the_nearest():
     quest = Quest(home_trial(), 1, node(3 * ROOM, ROOM // 2))
-    silent = msgspec.structs.replace(ForesightConfig(), told_labels=0, least_share=1.1)
+    silent = msgspec.structs.replace(ForesightConfig(), told_labels=0, least_toward=1.1)
     told_m, silent_m, nearest_m = (
         metres(quest, POLICIES[name], cfg)
         for name, cfg in (("ours", ForesightConfig()), ("ours", silent), ("nearest", silent))
@@ -179,6 +179,40 @@ def test_scores_of_a_uniform_predictor():
 def test_savings_are_paired():
     found = search_figures({"ours": [1.0, 4.0], "nearest": [2.0, 8.0]})
     assert found["saved_against_nearest"] == pytest.approx(0.5) and found["ours_m"] == 2.5
+
+
+def test_fitting_finds_which_opening_leads_to_what_is_left():
+    """Ways drawn from the model with known weights give these back; what lies deep counts less."""
+    rng, cfg = np.random.default_rng(6), ForesightConfig()
+    true = msgspec.structs.replace(cfg, toward_width=cfg.toward_width + 1.0, toward_touching=cfg.toward_touching - 1.0)
+    the_prior, walk = home_trial().prior, []
+    for _ in range(800):
+        bare = moment([0] * 4, rng.choice([0.9, 5.0], 4))
+        views = replace(bare.views, around=around(4, touching=rng.integers(0, 4, 4)))
+        said = beyond(views, expected(the_prior, bare.found, true), true).toward
+        through = np.array([rng.choice(4, p=column) for column in said.T])
+        walk.append(replace(bare, views=views, ways=(through, np.ones(3))))
+    found = fitted_toward([(walk, the_prior)], cfg)
+    said, wanted = (beyond(views, expected(the_prior, bare.found, one), one).toward for one in (found, true))
+    np.testing.assert_allclose(said, wanted, atol=0.06)
+    deep = [replace(one, ways=(3 - one.ways[0], np.full(3, 80.0))) for one in walk]
+    near = fitted_toward([([*walk, *deep], the_prior)], cfg)
+    assert near.toward_width == pytest.approx(found.toward_width, abs=0.05)
+    for name in cfg.__struct_fields__:
+        assert name.startswith("toward_") or getattr(found, name) == getattr(cfg, name)
+
+
+def test_one_comes_to_what_is_left_through_the_door_that_is_before_it():
+    explorer = Explorer(PLAN, HALL)
+    explorer.known |= PLAN.regions == 0
+    frontiers = explorer.frontiers(explorer.reach()[0])
+    east = frontiers.centers_m[:, 0] > PLAN.position_m(np.array([HALL]))[0, 0]
+    through, deep_m = ways_left(explorer, frontiers.nodes, np.array([-1, 1, 2]), 3)
+    assert through[0] == -1 and not east[through[1]] and east[through[2]]
+    assert np.isinf(deep_m[0]) and (deep_m[1:] < 0.5).all()
+    explorer.known |= PLAN.regions == 1  # of the same label, what is farther is come to when the nearer was seen
+    through, _ = ways_left(explorer, [frontiers.nodes[int(east.argmax())]], np.array([-1, 1, 1]), 3)
+    assert through.tolist() == [-1, 0, -1]
 
 
 def test_fitting_finds_the_weights_that_made_the_events():

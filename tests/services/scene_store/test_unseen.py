@@ -14,7 +14,7 @@ SCENE = synthetic_scene(600, 50)
 LABEL, OTHER = SCENE.labels[:2]
 
 
-def opening(row, within):
+def opening(row, within, toward=0.0):
     x, y, z = SCENE.positions_m[row].tolist()
     return Opening(
         place_id=int(SCENE.place_ids[row]),
@@ -23,7 +23,7 @@ def opening(row, within):
         width_m=0.9,
         region=int(SCENE.place_regions[row]),
         same=0.1,
-        labels=[ForeseenLabel(label=LABEL, next=within / 2, within=within)],
+        labels=[ForeseenLabel(label=LABEL, next=within / 2, within=within, toward=toward)],
     )
 
 
@@ -62,6 +62,16 @@ def test_a_surer_one_is_worth_a_walk_and_the_route_is_the_shortest_way():
     assert found.route.place_ids == way.place_ids
     assert best.way_m == pytest.approx(way.length_m, abs=0.01)
     assert ask(index_of(opening(60, 0.02), opening(300, 0.95)), limit=1).prospects == [best]
+
+
+def test_what_leads_to_it_comes_before_what_it_begins_behind():
+    """Behind a stair there is a whole storey; what was told before stairs were thought of goes by what begins there."""
+    deep, shallow = opening(60, 0.1, toward=0.9), opening(300, 0.95, toward=0.1)
+    found = ask(index_of(deep, shallow))
+    assert [one.probability for one in found.prospects] == [0.1, 0.95]
+    assert [one.probability for one in ask(index_of(opening(60, 0.0, toward=0.9))).prospects] == [0.0]
+    old = ask(index_of(opening(60, 0.1), opening(300, 0.95)))
+    assert [one.probability for one in old.prospects] == [0.95, 0.1]
 
 
 @pytest.mark.parametrize(

@@ -87,6 +87,30 @@ def test_a_corridor_leads_to_more_than_a_room_at_its_end():
     assert corridor[3] > 2 * end[3]
 
 
+@pytest.mark.parametrize("seed", range(6))
+def test_what_is_left_is_come_to_through_one_opening(seed):
+    the_prior, the_found, many = random_case(seed)
+    result = foreseen(the_prior, the_found, many)
+    np.testing.assert_allclose(result.toward.sum(axis=0), 1.0)
+    assert (result.toward > 0).all()
+
+
+def test_what_leads_deep_counts_more_for_a_search_than_for_what_begins_behind():
+    """Of two openings behind which a bath begins alike, one is of a region that touches many."""
+    two = Views(np.eye(4)[[0, 0]], np.full(2, 0.9), np.full(2, 8.0), around(2, touching=np.array([1.0, 9.0])))
+    cfg = msgspec.structs.replace(CFG, within_touching=0.0)
+    result = foreseen(home(), found(), two, cfg)
+    assert result.within[0, 1] == result.within[1, 1] and result.toward[1, 1] > 2 * result.toward[0, 1]
+
+
+def test_nobody_comes_to_anything_through_a_shadow():
+    the_prior, the_found = home(), found()
+    signs = looking([1.2, 1.2], [0, 0.6], [0.9, 0.1])
+    result = foreseen(the_prior, the_found, signs)
+    chance = leads(signs, CFG)
+    np.testing.assert_allclose(result.toward[0] / result.toward[1], chance[0] / chance[1])
+
+
 def test_many_openings_do_not_make_sure_what_one_does_not():
     """Openings of one map lead to the same rooms: fourteen make a third bath likelier, not certain."""
     many = Views(np.tile(np.eye(4)[0], (14, 1)), np.full(14, 0.9), np.full(14, 8.0), around(14))
@@ -222,8 +246,8 @@ def test_only_what_changes_visibly_is_news():
     assert [differs(now, msgspec.structs.replace(now, openings=[one]), CFG) for one in moved] == [False, True]
 
 
-def test_an_opening_tells_every_label_that_it_is_among_the_best_for():
-    """Searches would pass it by; what is likelier elsewhere is told where it is among the likeliest of an opening."""
+def test_an_opening_tells_all_labels_that_it_leads_to():
+    """Searches would pass it by; what it hardly leads to is told where it is among the likeliest."""
     graph, places = a_map()
     openings = openings_of(graph, places, opened((10, (0, 1, 0), 2.0), (40, (0, -1, 0), 2.0)), CFG)
     state_of = {7: region(7, "hall"), 8: region(8, "bath")}
@@ -234,10 +258,10 @@ def test_an_opening_tells_every_label_that_it_is_among_the_best_for():
         assert all(one.labels == sorted(one.labels, key=lambda entry: -entry.within) for one in openings_told)
         return [len(one.labels) for one in openings_told]
 
-    assert told(least_share=0.01) == [4, 4]
-    assert told(least_share=0.5) != [4, 4] and sum(told(least_share=0.5)) >= 4
-    assert told(least_share=1.1) == [1, 1]
-    assert told(least_share=1.1, least_within=1.0) == [0, 0]
+    assert told(least_toward=0.01) == [4, 4]
+    assert told(least_toward=0.5) != [4, 4] and sum(told(least_toward=0.5)) >= 4
+    assert told(least_toward=1.1) == [1, 1]
+    assert told(least_toward=1.1, least_within=1.0) == [0, 0]
 
 
 def region(number, label, neighbours=(), **fields):

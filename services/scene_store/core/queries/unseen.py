@@ -3,7 +3,7 @@
 import numpy as np
 
 from prior_sg.schemas.answers import Missing, Outlook, Prospect
-from prior_sg.schemas.foresight import Foresight, Opening
+from prior_sg.schemas.foresight import ForeseenLabel, Foresight, Opening
 from prior_sg.schemas.members import only_of_robots
 from prior_sg.schemas.names import same
 from prior_sg.schemas.queries import RouteBetween, Spot, WhatIsMissing, WhereToLook
@@ -34,8 +34,7 @@ def outlook(index: Index, question: WhereToLook) -> Outlook:
     except NoSuchSpot as error:
         return Outlook(label=label, found=seen, reason=str(error))
     ways_m = lengths_m[rows]
-    chances = np.array([_chance(opening, label) for opening in held])
-    prospects = _prospects(foresight, held, ways_m, chances, index.points_m[rows])[: question.limit]
+    prospects = _prospects(foresight, held, label, ways_m, index.points_m[rows])[: question.limit]
     missing = {entry.label: entry.probability for entry in foresight.missing}
     if not prospects:
         reason = f"no way leads to any opening behind which {label!r} is at all likely"
@@ -59,12 +58,15 @@ def _of_robots(scene: Scene) -> str:
 
 
 def _prospects(
-    foresight: Foresight, held: list[Opening], ways_m: np.ndarray, chances: np.ndarray, points_m: np.ndarray
+    foresight: Foresight, held: list[Opening], label: str, ways_m: np.ndarray, points_m: np.ndarray
 ) -> list[Prospect]:
-    likely = np.flatnonzero((chances > 0) & np.isfinite(ways_m))
-    ways_m, points_m, chances = ways_m[likely], points_m[likely], chances[likely]
+    entries = [_entry(opening, label) for opening in held]
+    chances = np.array([entry.within if entry else 0.0 for entry in entries])
+    toward = np.array([entry.toward if entry else 0.0 for entry in entries])
+    likely = np.flatnonzero(((chances > 0) | (toward > 0)) & np.isfinite(ways_m))
+    ways_m, points_m, chances, toward = ways_m[likely], points_m[likely], chances[likely], toward[likely]
     metres = expected_metres(ways_m, points_m, chances, foresight.look_m, foresight.elsewhere_m)
-    worth = chances_per_metre(ways_m, chances, foresight.look_m)
+    worth = chances_per_metre(ways_m, toward if toward.any() else chances, foresight.look_m)
     return [
         Prospect(
             opening=held[likely[at]],
@@ -76,8 +78,8 @@ def _prospects(
     ]
 
 
-def _chance(opening: Opening, label: str) -> float:
-    return next((entry.within for entry in opening.labels if entry.label == label), 0.0)
+def _entry(opening: Opening, label: str) -> ForeseenLabel | None:
+    return next((entry for entry in opening.labels if entry.label == label), None)
 
 
 def _known(index: Index, label: str) -> str:

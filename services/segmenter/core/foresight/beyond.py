@@ -5,10 +5,13 @@
     P(another region r)        = P(leads) (1 - P(goes on)) sum_i P(i) T(i, r)
     P(r within some metres)    = P(leads) sigmoid(by the opening and what is around it, by the label of the region it
                                  opens from, by r)
+    P(toward an opening | r)   ~ P(leads) exp(by P(r within some metres) and, again, by the opening, the label of the
+                                 region it opens from and what is around it)
 
 with P(i) the belief of the region it opens from and T from `expectation`. Of a map's openings most lead nowhere: they
 are shadows of furniture, gaps in depth, ceilings. P(goes on) and P(r) are of what is seen first, the last of all that
-begins within REACH_M: a corridor that goes on shows none of the rooms along it and leads to them.
+begins within REACH_M: a corridor that goes on shows none of the rooms along it and leads to them. What is looked for
+often lies deeper, up a stair or along a corridor; P(toward) is of where one comes to it, however far behind.
 """
 
 from dataclasses import dataclass
@@ -38,6 +41,7 @@ class Beyond:
     same: np.ndarray  # (opening,) that the region it opens from goes on, or nothing is behind
     next: np.ndarray  # (opening, label) another region; with `same`, rows sum to one
     within: np.ndarray  # (opening, label) that such a region begins within REACH_M
+    toward: np.ndarray  # (opening, label) that the nearest such region, if one is left, is come to through this opening
     missing: np.ndarray  # (label,) that one more region of that label is behind any of the openings
 
 
@@ -104,6 +108,37 @@ def within_weights(cfg: ForesightConfig) -> np.ndarray:
     )
 
 
+def toward_features(views: Views, expectation: Expectation, within: np.ndarray, goes_on: np.ndarray) -> np.ndarray:
+    """What the log-odds of P(toward an opening | r) are made of (opening, label, feature), in the order of
+    `toward_weights`; `within` (opening, label) are chances behind openings that lead somewhere, `goes_on` (opening,)
+    the logit that the same region goes on there."""
+    count, labels = within.shape
+    beside = np.log(np.maximum(views.beliefs @ expectation.spread, FLOOR))
+    adjacency = np.log(np.maximum(views.beliefs @ expectation.adjacency, FLOOR))
+    around = views.around
+    of_openings = (beside, np.log1p(around.touching), goes_on, np.log(views.widths_m), np.log1p(views.areas_m2))
+    of_around = (np.log1p(around.nearby), np.log1p(around.storey_m2), around.at_border)
+    columns = (
+        np.log(np.maximum(within, FLOOR)),
+        adjacency,
+        views.beliefs,
+        around.at_border[:, None] * adjacency,
+        *(np.broadcast_to(column[:, None], (count, labels)) for column in (*of_openings, *of_around)),
+    )
+    return np.stack(columns, axis=2)
+
+
+def toward_weights(cfg: ForesightConfig) -> np.ndarray:
+    """Weight (feature,) of each of `toward_features`."""
+    return np.array(
+        [
+            *(cfg.toward_within, cfg.toward_adjacency, cfg.toward_again, cfg.toward_border_adjacency),
+            *(cfg.toward_spread, cfg.toward_touching, cfg.toward_same, cfg.toward_width, cfg.toward_area),
+            *(cfg.toward_nearby, cfg.toward_storey, cfg.toward_at_border),
+        ]
+    )
+
+
 def missing_features(within: np.ndarray, expectation: Expectation) -> np.ndarray:
     """What the logit of P(missing) is made of (label, feature), in the order of `missing_weights`.
 
@@ -127,11 +162,20 @@ def missing_weights(cfg: ForesightConfig) -> np.ndarray:
 def beyond(views: Views, expectation: Expectation, cfg: ForesightConfig) -> Beyond:
     """What is expected beyond each opening; behind none, nothing is missing."""
     chance = leads(views, cfg)
-    same = 1.0 - chance * (1.0 - _sigmoid(same_features(views, expectation.spread, cfg) @ same_weights(cfg)))
+    goes_on = same_features(views, expectation.spread, cfg) @ same_weights(cfg)
+    same = 1.0 - chance * (1.0 - _sigmoid(goes_on))
     another = (1.0 - same)[:, None] * (views.beliefs @ expectation.next)
-    within = chance[:, None] * _sigmoid(within_features(views, expectation, chance.sum()) @ within_weights(cfg))
+    behind = _sigmoid(within_features(views, expectation, chance.sum()) @ within_weights(cfg))
+    odds = chance[:, None] * _odds(toward_features(views, expectation, behind, goes_on) @ toward_weights(cfg))
+    within = chance[:, None] * behind
     missing = _sigmoid(missing_features(within, expectation) @ missing_weights(cfg))
-    return Beyond(same, another, within, missing if len(same) else np.zeros(len(missing)))
+    toward = odds / odds.sum(axis=0)
+    return Beyond(same, another, within, toward, missing if len(same) else np.zeros(len(missing)))
+
+
+def _odds(scores: np.ndarray) -> np.ndarray:
+    """Odds (opening, label) among the openings, the largest of each label 1."""
+    return np.asarray(np.exp(scores - scores.max(axis=0, initial=-np.inf)))
 
 
 def _sigmoid(logits: np.ndarray) -> np.ndarray:

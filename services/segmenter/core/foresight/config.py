@@ -60,6 +60,20 @@ class ForesightConfig(msgspec.Struct, frozen=True, kw_only=True):
     within_storey: float = -0.41  # by log(1 + seen area of its storey / m2)
     within_at_border: float = -0.6  # by log P(ri <-> rj), as near as a way into another region is
 
+    # That the nearest region of a label, if one is left, is come to through an opening, and no other one: log-odds.
+    toward_within: float = 1.11  # by log of the chance that such a region begins within REACH_M
+    toward_adjacency: float = 0.63  # by log P(ri <-> rj)
+    toward_again: float = 0.73  # by the belief that the region it opens from has that label
+    toward_border_adjacency: float = -0.01  # by log P(ri <-> rj), as near as a way into another region is
+    toward_spread: float = -1.15  # by log of the mean number of other regions that touch one of its label
+    toward_touching: float = 1.63  # by log(1 + regions that touch the one it opens from)
+    toward_same: float = -0.2  # by the logit that the same region goes on
+    toward_width: float = 0.53  # by log of the opening's width / m
+    toward_area: float = -0.46  # by log(1 + seen area of the region it opens from / m2)
+    toward_nearby: float = -0.52  # by log(1 + other regions around it)
+    toward_storey: float = -0.52  # by log(1 + seen area of its storey / m2)
+    toward_at_border: float = 0.43  # as near as a way into another region is
+
     # That one more region of a label is behind any of the openings: logit.
     missing_bias: float = 0.5
     missing_sum: float = 0.28  # by log of the sum of the chances of all openings
@@ -71,6 +85,6 @@ class ForesightConfig(msgspec.Struct, frozen=True, kw_only=True):
     elsewhere_m: float = 40.0  # to what lies behind none of the openings
     told_change: float = 0.05  # smaller changes of a probability are no news
     told_labels: int = 8  # of each opening, the most probable ...
-    least_share: float = 0.01  # ... and what has so much of its chances behind all openings: searches would miss it
+    least_toward: float = 0.01  # ... and all that it leads to with so much at least: searches would pass it by
     least_told: float = 0.02  # of what is missing
     least_within: float = 0.001  # behind one opening: most lead nowhere, and the best of them is still where to look

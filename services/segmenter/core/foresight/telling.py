@@ -21,10 +21,10 @@ def foresight(openings: Openings, regions: Mapping[int, Region], prior: Prior, c
     names = [region.name for region in prior.regions]
     found = found_in(regions, prior, cfg)
     foreseen = beyond(views_of(openings, regions, cfg), expected(prior, found, cfg), cfg)
-    chances, missing = told_chances(foreseen.within, cfg), foreseen.missing
+    told, missing = told_labels(foreseen, cfg), foreseen.missing
     return Foresight(
         openings=[
-            _opening(openings, row, foreseen=foreseen, chances=chances, prior=prior, found=found)
+            _opening(openings, row, foreseen=foreseen, told=told[row], prior=prior, found=found)
             for row in range(len(openings.place_ids))
         ],
         missing=[
@@ -37,12 +37,12 @@ def foresight(openings: Openings, regions: Mapping[int, Region], prior: Prior, c
     )
 
 
-def told_chances(within: np.ndarray, cfg: ForesightConfig) -> np.ndarray:
-    """Chances (opening, label) of what begins behind openings as they are told, 0 = not told: of each opening its most
-    probable labels, and all that it is among the best openings for."""
-    ranks = np.argsort(np.argsort(-within, axis=1, kind="stable"), axis=1)
-    likely = (ranks < cfg.told_labels) & (within >= cfg.least_within)
-    return np.where(likely | (within >= cfg.least_share * within.sum(axis=0)), np.round(within, DIGITS), 0.0)
+def told_labels(foreseen: Beyond, cfg: ForesightConfig) -> np.ndarray:
+    """Whether (opening, label) an opening tells of a label: of its most probable ones, and of all that it leads to, for
+    searches would pass it by otherwise."""
+    ranks = np.argsort(np.argsort(-foreseen.within, axis=1, kind="stable"), axis=1)
+    likely = (ranks < cfg.told_labels) & (foreseen.within >= cfg.least_within)
+    return np.asarray(likely | (foreseen.toward >= cfg.least_toward))
 
 
 def found_in(regions: Mapping[int, Region], prior: Prior, cfg: ForesightConfig) -> Found:
@@ -73,7 +73,7 @@ def _figures(one: Foresight) -> dict[tuple[int, str], float]:
 
 
 def _opening(
-    openings: Openings, row: int, *, foreseen: Beyond, chances: np.ndarray, prior: Prior, found: Found
+    openings: Openings, row: int, *, foreseen: Beyond, told: np.ndarray, prior: Prior, found: Found
 ) -> Opening:
     here = int(openings.beliefs[row].argmax())
     by_chance = np.argsort(-foreseen.within[row], kind="stable").tolist()
@@ -88,14 +88,15 @@ def _opening(
             ForeseenLabel(
                 label=prior.regions[label].name,
                 next=_short(foreseen.next[row, label]),
-                within=float(chances[row, label]),
+                within=_short(foreseen.within[row, label]),
+                toward=_short(foreseen.toward[row, label]),
                 adjacency=_short(prior.adjacency[here, label]),
                 existence=_short(prior.regions[label].existence),
                 found=int(found.regions[label]),
                 met=int(found.borders[here, label]),
             )
             for label in by_chance
-            if chances[row, label] > 0
+            if told[label]
         ],
     )
 
