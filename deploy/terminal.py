@@ -84,5 +84,20 @@ def keep_apart() -> None:
     )
 
 
+def settle() -> None:
+    """What was printed is on standard output. Raises OSError where it cannot be there."""
+    if sys.stdout is not None:
+        sys.stdout.flush()
+
+
+def give_up() -> None:
+    """What cannot be on standard output any more, for its reader or the disk's room has gone, is nobody's: Python would
+    complain of it at its end."""
+    try:
+        settle()
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
 def _plain(text: Any) -> Any:
     return Text(shown(text)) if isinstance(text, str) else text

@@ -93,13 +93,14 @@ class Spot(Part, frozen=True, kw_only=True):
 
     A region stands for its place nearest to its middle, an object and a point for the place nearest to them; where that
     one leads nowhere, a place stands for a point that it has free space around, or for an object, up to 1 m farther. A
-    marker is a point; of several dictionaries' with one number, the one that is reached first counts, and one in doubt
-    is no end.
+    marker is a point; of several dictionaries' with one number, where none is named, the one that is reached first
+    counts, and one in doubt is no end.
     """
 
     point_m: AskedPoint | None = None
     what: SpotKind | None = None
     id: int | None = None
+    dictionary: Text = ""  # of a marker
     label: Text = ""
     here: bool = False
 

@@ -245,7 +245,7 @@ def _spot(value: SpotLike) -> Spot:
         case SceneObject():
             return Spot(what="object", id=value.id)
         case SceneMarker():
-            return Spot(what="marker", id=value.id)
+            return Spot(what="marker", id=value.id, dictionary=value.dictionary)
         case _:
             return Spot(point_m=_point(value))
 

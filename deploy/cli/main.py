@@ -1,7 +1,6 @@
 """The command line: `prior-sg`. Imports are within `main`, where an interrupt of them is told as one line."""
 
 import argparse
-import os
 import signal
 import sys
 import threading
@@ -68,6 +67,7 @@ def build_parser() -> argparse.ArgumentParser:
 def main(argv: list[str] | None = None) -> int:
     """Exit status of the command; faults of the user or the system are one sentence on standard error."""
     from prior_sg.deploy.interrupts import EXIT_INTERRUPTED, remembered
+    from prior_sg.deploy.terminal import give_up
 
     # As services of `up` have it: products are small, and threads spin for each other and change last bits of sums.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -75,7 +75,7 @@ def main(argv: list[str] | None = None) -> int:
         with remembered():
             return _told(argv)
     except BrokenPipeError:  # the reader of a pipe has left
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        give_up()
         return 1
     except KeyboardInterrupt:
         print("prior-sg: interrupted", file=sys.stderr)
@@ -85,11 +85,13 @@ def main(argv: list[str] | None = None) -> int:
 def _told(argv: list[str] | None) -> int:
     from prior_sg.deploy.cli.faults import sentence_of
     from prior_sg.deploy.interrupts import insist
-    from prior_sg.deploy.terminal import complain
+    from prior_sg.deploy.terminal import complain, give_up, settle
     from prior_sg.services.errors import PriorSgError
 
     try:
-        return _run(argv)
+        status = _run(argv)
+        settle()
+        return status
     except (BrokenPipeError, KeyboardInterrupt):
         raise
     except Exception as error:
@@ -97,6 +99,7 @@ def _told(argv: list[str] | None) -> int:
         if (sentence := sentence_of(error)) is None:
             raise
         complain(sentence)
+        give_up()
         return error.exit_status if isinstance(error, PriorSgError) else 1
 
 

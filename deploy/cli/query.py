@@ -214,7 +214,7 @@ def _numbers(words: Sequence[str], count: int, form: str) -> list[float]:
 
 
 def _id(words: Sequence[str], example: str) -> int:
-    if len(words) != 1 or not words[0].lstrip("-").isdigit():
+    if len(words) != 1 or not words[0].removeprefix("-").isdecimal():
         raise UserError(f"name one number, such as `prior-sg query {example}`, or put a sentence in quotes")
     return int(words[0])
 

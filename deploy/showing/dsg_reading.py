@@ -58,7 +58,7 @@ def scene_of_graph(graph: spark_dsg.DynamicSceneGraph) -> Scene:
         stamp_ns=about.get("stamp_ns") or max(map(_stamp_ns, (*places, *rooms, *objects)), default=0),
         environment=about.get("environment") or _environment(graph),
         task=about.get("task", ""),
-        merged_of=list(about.get("merged_of", ())),
+        merged_of=msgspec.convert(about.get("merged_of", []), list[str]),
         prior_digest=about.get("prior_digest", ""),
         space=about.get("embedding_space", ""),
         labels=labels,

@@ -22,7 +22,7 @@ def scene_of_json(told: dict[str, Any]) -> Scene:
         stamp_ns=told["stamp_ns"],
         environment=told["environment"],
         task=told["task"],
-        merged_of=list(told.get("merged_of", ())),
+        merged_of=msgspec.convert(told.get("merged_of", []), list[str]),
         prior_digest=told["prior_digest"],
         space=told["embedding_space"],
         labels=labels,

@@ -27,6 +27,7 @@ LONGEST_NAME, LONGEST_TASK = 15, 40  # tokens
 FOR_OMISSIONS = 60  # tokens that are kept for saying what was left out
 CANDIDATES, LEAST_BELIEF = 3, 0.05
 MOST_IDS = 8  # of objects with one label in one region
+MOST_MARKERS = 10  # whose lines leave room for what is expected and for openings
 MOST_EXPECTED, LEAST_EXPECTED = 6, 0.2  # labels that are expected and not seen
 REGIONS = "Regions, with the width of the ways out of them:\n"
 PIECES = re.compile(r"[A-Za-z]+|[^ ]")
@@ -43,10 +44,15 @@ class Budget:
         """Whether the text still fits; if so, it is paid for. `kind` is what it is, in the plural."""
         cost = tokens_of(text)
         if cost > self.left:
-            self.omitted[kind] = self.omitted.get(kind, 0) + 1
+            self.leave(1, kind)
             return False
         self.left -= cost
         return True
+
+    def leave(self, count: int, kind: str) -> None:
+        """So many pieces of a kind are left out."""
+        if count:
+            self.omitted[kind] = self.omitted.get(kind, 0) + count
 
 
 def scene_text(scene: Scene, budget_tokens: int = USUAL_TOKENS) -> str:
@@ -188,7 +194,7 @@ def _elsewhere(scene: Scene, budget: Budget) -> Iterator[str]:
 def _markers(scene: Scene, budget: Budget) -> Iterator[str]:
     """Printed markers: where each hangs, and what is doubtful about it."""
     names = {region.id: _name(region) for region in scene.regions}
-    for marker in scene.markers:
+    for marker in scene.markers[:MOST_MARKERS]:
         pose = pose_from_quaternion(np.array(marker.position_m), np.array(marker.quaternion_xyzw))
         rows = rows_before(pose, scene.positions_m)
         gaps_m = np.linalg.norm(scene.positions_m[rows] - pose[:3, 3], axis=1)
@@ -198,6 +204,7 @@ def _markers(scene: Scene, budget: Budget) -> Iterator[str]:
         line = f"Printed marker {marker.id} ({_short(marker.dictionary)}) at {where}{doubt}\n"
         if budget.take(line, "markers"):
             yield line
+    budget.leave(len(scene.markers[MOST_MARKERS:]), "markers")
 
 
 def _expected(scene: Scene, budget: Budget) -> Iterator[str]:

@@ -132,7 +132,7 @@ class Page:
 
     def _go_to_answer(self, row: int) -> None:
         if row < len(self._hits):
-            self._want(goal=Spot(what=self._hits[row].what, id=self._hits[row].id))
+            self._want(goal=self._hits[row].spot)
 
     def _go_to_picked(self) -> None:
         if self._wanted.picked is not None:

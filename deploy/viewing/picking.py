@@ -38,7 +38,7 @@ class PickedMarker:
     @property
     def spot(self) -> Spot:
         """As an end of a way."""
-        return Spot(what="marker", id=self.key.id)
+        return Spot(what="marker", id=self.key.id, dictionary=self.key.dictionary)
 
 
 def pick(

@@ -7,11 +7,11 @@ from typing import NamedTuple
 from prior_sg.deploy.viewing.drawing import Lit
 from prior_sg.deploy.viewing.sources import Likeness
 from prior_sg.schemas.answers import Ranking, SpotKind
-from prior_sg.schemas.queries import AnswersTo
+from prior_sg.schemas.queries import AnswersTo, Spot
 from prior_sg.schemas.scene import Scene
 from prior_sg.services.scene_store.core.queries.answering import answer
 from prior_sg.services.scene_store.core.queries.index import Index
-from prior_sg.services.scene_store.core.queries.markers import nothing_numbered
+from prior_sg.services.scene_store.core.queries.markers import nothing_numbered, numbered
 
 MOST_ANSWERS = 5
 MARKER_NAME = re.compile(r"marker\s*#?\s*(\d{1,9})", re.IGNORECASE)
@@ -27,6 +27,12 @@ class Hit(NamedTuple):
     id: int
     label: str
     score: float | None
+    dictionary: str = ""  # of a printed marker
+
+    @property
+    def spot(self) -> Spot:
+        """As an end of a way."""
+        return Spot(what=self.what, id=self.id, dictionary=self.dictionary)
 
 
 @dataclass(frozen=True)
@@ -83,9 +89,12 @@ def markers_called(scene: Scene, text: str) -> Found | None:
     number = MARKER_NAME.fullmatch(text.strip())
     if number is None:
         return None
-    there = [one for one in scene.markers if one.id == int(number[1])]
+    there = numbered(scene, int(number[1]))
     doubts = "; ".join(f"{one.key} is in doubt: {one.doubt}" for one in there if one.doubt)
-    hits = [Hit("marker", one.id, f"marker {one.id}", None) for one in there]
+    hits = [
+        Hit("marker", one.id, f"marker {one.id}" if len(there) == 1 else str(one.key), None, one.dictionary)
+        for one in there
+    ]
     return Found(hits[:MOST_ANSWERS], Lit(), doubts if there else nothing_numbered(scene, int(number[1])))
 
 

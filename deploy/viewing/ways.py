@@ -13,6 +13,7 @@ from prior_sg.schemas.queries import RouteBetween, Spot
 from prior_sg.schemas.regions import NO_REGION
 from prior_sg.services.scene_store.core.queries.answering import answer
 from prior_sg.services.scene_store.core.queries.index import Index
+from prior_sg.services.scene_store.core.queries.markers import numbered
 
 FROM_THE_ROBOT = Spot(here=True)
 ARROW_EVERY_M, ARROW_M, SHAFT_M = 1.2, 0.05, 0.035
@@ -61,11 +62,11 @@ def way(index: Index, trip: Trip) -> Way:
 
 
 def _point_of(index: Index, spot: Spot) -> Point | None:
-    """Where an end is that is a point or the only marker of its number."""
+    """Where an end is that is a point or the only marker that it can mean."""
     if spot.what != "marker":
         return spot.point_m
-    found = [one.position_m for one in index.scene.markers if one.id == spot.id]
-    return found[0] if len(found) == 1 else None
+    found = numbered(index.scene, spot.id, spot.dictionary)
+    return found[0].position_m if len(found) == 1 else None
 
 
 def _stops(index: Index, route: Route) -> list[Stop]:

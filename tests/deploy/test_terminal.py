@@ -14,8 +14,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rich.table import Table
 
+from prior_sg.deploy.api.scene import Scene
 from prior_sg.deploy.terminal import Description, Terminal, line
 from prior_sg.schemas.names import DIRECTIONS, shown
+from tests.help.homes import marked_home
 from tests.help.paths import ROOT
 
 FULL = Path("/dev/full")
@@ -131,11 +133,25 @@ def test_what_zenoh_says_is_on_standard_error_and_results_alone_on_standard_outp
 
 
 @pytest.mark.skipif(not FULL.exists(), reason="no file that is always full")
-def test_a_full_disk_under_the_results_is_one_sentence():
-    """Also where standard output has another file than Python gave it."""
-    command, environment = [sys.executable, "-m", "prior_sg.deploy.cli.main", "topics"], os.environ | UNBUFFERED
+@pytest.mark.parametrize("more", [{}, UNBUFFERED])
+@pytest.mark.parametrize("words", [["topics"], ["query", "marker", "--scene"]])  # by Python's print, by the console
+def test_a_full_disk_under_the_results_is_one_sentence(words, more, tmp_path):
+    """Also where standard output has another file than Python gave it, and where it is written at the end."""
+    path = tmp_path / "scene.json"
+    Scene(marked_home()).save(path)
+    command = [sys.executable, "-m", "prior_sg.deploy.cli.main", *words, *([path] if len(words) > 1 else [])]
+    environment = os.environ | {"PYTHONUNBUFFERED": ""} | more
     with FULL.open("w") as full:
         done = subprocess.run(
             command, stdout=full, stderr=subprocess.PIPE, check=False, text=True, timeout=60, env=environment
         )
     assert done.returncode == 1 and done.stderr.startswith("prior-sg: there is no space left")
+    assert done.stderr.count("\n") == 1, done.stderr
+
+
+def test_a_reader_that_has_left_is_no_news():
+    command = [sys.executable, "-m", "prior_sg.deploy.cli.main", "topics"]
+    environment = os.environ | {"PYTHONUNBUFFERED": ""}
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment) as asked:
+        asked.stdout.close()
+        assert asked.wait(60) == 1 and asked.stderr.read() == ""

@@ -187,7 +187,7 @@ MARKER = markers.SceneMarker(
     frames=3,
     doubt="it has been seen at 2 spots",
 )
-SPOT = queries.Spot(point_m=(1.0, 2.0, 3.0), what="region", id=4, label="hall", here=True)
+SPOT = queries.Spot(point_m=(1.0, 2.0, 3.0), what="region", id=4, dictionary="4x4_50", label="hall", here=True)
 FORESIGHT = foresight.Foresight(
     openings=[
         foresight.Opening(

@@ -22,7 +22,8 @@ def markers_of(maps: Iterable[Placed]) -> list[SceneMarker]:
         for marker in one.scene.markers:
             here = _moved(marker, one.fleet_from_own)
             if marker.key not in found:
-                found[marker.key] = one.name.robot, here
+                doubt = _doubt(one.name.robot, one.name.robot, marker, 0.0)
+                found[marker.key] = one.name.robot, msgspec.structs.replace(here, doubt=doubt)
                 continue
             robot, known = found[marker.key]
             gap_m = float(np.linalg.norm(np.subtract(here.position_m, known.position_m)))

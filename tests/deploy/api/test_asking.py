@@ -261,7 +261,19 @@ def test_the_command_tells_where_markers_are(capsys, tmp_path):
     assert "name one number" in ask("marker", "seven")[1]
     assert "through kitchen 3" in ask("route", "place:10", "marker:7")[1]
     scene = prior_sg.Scene.read(path)
-    assert scene.route("place:10", scene.markers(7)[0].marker).found
+    (found,) = scene.markers(7)
+    assert scene.route("place:10", found.marker).found
+    elsewhere = msgspec.structs.replace(found.marker, dictionary="4x4_50")
+    assert "no marker 7 of the dictionary '4x4_50'" in scene.route("place:10", elsewhere).reason
+
+
+@pytest.mark.parametrize("robots", [None, 5, "r1", [1, 2], [["r1"]]])
+def test_a_file_whose_merged_robots_are_no_names_is_refused(capsys, tmp_path, robots):
+    path = tmp_path / "scene.json"
+    Scene(message()).save(path)
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"merged_of": robots}))
+    status, _, err = asked(capsys, path, "missing")
+    assert status == 1 and "is not in the layout of scene.json" in " ".join(err.split())
 
 
 def test_the_command_tells_what_was_not_seen(capsys, tmp_path):
@@ -320,6 +332,7 @@ def test_why_nothing_answers_is_said(capsys, tmp_path):
         (["region", "kitchen"], "such as `prior-sg query region 7`"),
         (["object", "oven"], "such as `prior-sg query object 7`"),
         (["marker", "seven"], "such as `prior-sg query marker 7`"),
+        (["marker", "7²"], "name one number"),
         (["region"], "name one number"),
         (["near"], "say `near X Y Z`"),
         (["level"], "name a level: zone"),

@@ -179,13 +179,15 @@ def test_a_marker_that_two_related_maps_have_at_one_spot_is_one_with_the_keyfram
     assert marker.frames == one.markers[0].frames + two.markers[0].frames and not marker.doubt
 
 
-def test_a_marker_that_one_of_the_maps_doubts_is_doubted_and_the_map_is_named():
+@pytest.mark.parametrize("doubting", ["r1", "r2"])
+def test_a_marker_that_one_of_the_maps_doubts_is_doubted_and_the_map_is_named(doubting):
     fleet = Fleet(Config(robots=("r1", "r2"), transforms={"r1": (0, 0, 0, 0), "r2": (0, 0, 0, 0)}))
-    fleet.tell(houses.scene(markers=[(7, HALL)]))
-    other = houses.scene("r2", markers=[(7, HALL)])
-    fleet.tell(msgspec.structs.replace(other, markers=[msgspec.structs.replace(other.markers[0], doubt="it moved")]))
+    for robot in ("r1", "r2"):
+        scene = houses.scene(robot, markers=[(7, HALL)])
+        doubted = [msgspec.structs.replace(scene.markers[0], doubt="it moved" if robot == doubting else "")]
+        fleet.tell(msgspec.structs.replace(scene, markers=doubted))
     fleet.tick()
-    assert [marker.doubt for marker in fleet.scene().markers] == ["in r2 it moved"]
+    assert [marker.doubt for marker in fleet.scene().markers] == [f"in {doubting} it moved"]
 
 
 def test_a_marker_of_a_map_that_is_taken_out_is_doubted():

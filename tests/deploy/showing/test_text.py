@@ -73,6 +73,14 @@ def test_printed_markers_are_told_with_region_and_doubt():
     ]
 
 
+def test_many_markers_leave_room_for_what_is_expected_and_for_openings():
+    seen = marked_home(foresight=foresight(marked_home(), 10, "hall", 0.6))
+    many = [msgspec.structs.replace(seen.markers[0], id=number) for number in range(587)]
+    told = scene_text(msgspec.structs.replace(seen, markers=many))
+    assert told.count("Printed marker") == 10 and "577 markers" in told
+    assert "Expected, not seen: hall" in told and "Openings to unobserved space" in told
+
+
 def test_what_is_expected_is_told_as_such():
     scene = msgspec.structs.replace(house(), foresight=foresight(house(), 1, "hall", 0.6))
     assert "Expected, not seen: hall p 0.60, most likely p 0.60 beyond (2.5, 0.0, 1.0)\n" in scene_text(scene)

@@ -11,7 +11,9 @@ from prior_sg.deploy.viewing.picking import PickedMarker, pick, typical_place
 from prior_sg.deploy.viewing.search import find
 from prior_sg.deploy.viewing.shapes import Mesh, difference
 from prior_sg.deploy.viewing.sources import Likeness
+from prior_sg.deploy.viewing.ways import Trip, way
 from prior_sg.deploy.viewing.words import headline, legend
+from prior_sg.schemas.queries import Spot
 from prior_sg.services.scene_store.core.queries.index import Index
 from tests.help.foreseen import foresight
 from tests.help.homes import home, keyframe, marked_home, region
@@ -266,3 +268,14 @@ def test_where_the_robot_has_been_is_dashed_and_named() -> None:
     lengths_m = np.linalg.norm(dashes[:, 1] - dashes[:, 0], axis=1)
     assert lengths_m.max() < 0.13 and lengths_m.sum() == pytest.approx(5.508 / 2, abs=0.01)
     assert drawn["/trajectory/robot"].text == "robot" and drawn["/trajectory/robot"].position_m[0] == 6.0
+
+
+def test_of_one_number_in_two_dictionaries_each_is_named_clicked_and_gone_to_by_itself() -> None:
+    one = marked_home().markers[0]
+    other = msgspec.structs.replace(one, dictionary="4x4_50", position_m=(8.0, 1.0, 1.5))
+    scene = msgspec.structs.replace(marked_home(), markers=[other, one])
+    hits = find(Index(scene), "marker 7").hits
+    assert [hit.label for hit in hits] == ["marker 7 (4x4_50)", "marker 7 (apriltag_36h11)"]
+    ends = [way(Index(scene), Trip(hit.spot, Spot(what="place", id=10))).goal_m for hit in hits]
+    assert ends == [other.position_m, one.position_m]
+    assert [PickedMarker(marker.key).spot for marker in scene.markers] == [hit.spot for hit in hits]

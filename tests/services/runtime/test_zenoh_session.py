@@ -52,7 +52,7 @@ def output_of(script, *arguments, **environment):
 
 @pytest.fixture
 def flooded(endpoint):
-    """A router over which a writer sends a thousand samples a second."""
+    """A router over which a writer sends thousands of samples a second."""
     over, bus = threading.Event(), ZenohBus(endpoint)
 
     def write():
@@ -60,7 +60,7 @@ def flooded(endpoint):
         while not over.is_set():
             bus.put(PLACE_DELTA, PLACE_DELTA.pattern("flood"), b"x", pack_header("w", number, time.time_ns()))
             number += 1
-            time.sleep(0.001)
+            time.sleep(0.0002)
 
     writer = threading.Thread(target=write)
     writer.start()

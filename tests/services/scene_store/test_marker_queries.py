@@ -50,6 +50,13 @@ def test_those_that_are_not_there_are_told(question, reason):
     assert answer(INDEX, question).reason.startswith(reason)
 
 
+def test_of_many_markers_a_few_are_named():
+    many = [printed(number, (4.45, 1.0, 1.5), (-1.0, 0.0, 0.0)) for number in range(587)]
+    told = answer(Index(_with(many)), q.MarkersOf(id=999)).reason
+    assert told.endswith("marker 29 (apriltag_36h11) and 557 others") and len(told) < 1000
+    assert way(q.Spot(what="marker", id=999), Index(_with(many))).reason == f"the goal: {told}"
+
+
 def test_without_any_it_says_what_makes_them_be_looked_for():
     assert "feature_pyramid.markers.dictionary" in answer(Index(home()), q.MarkersOf(id=7)).reason
 
@@ -79,3 +86,12 @@ def test_a_way_to_a_marker_ends_in_front_of_it():
 def test_no_way_leads_to_a_marker_in_doubt_or_to_none(goal, reason):
     found = way(goal)
     assert not found.found and reason in found.reason
+
+
+def test_of_one_number_in_two_dictionaries_the_one_that_is_named_is_gone_to():
+    other = printed(7, (8.0, 1.0, 1.5), (-1.0, 0.0, 0.0), dictionary="4x4_50")
+    index = Index(_with([other, *INDEX.scene.markers]))
+    ends = {name: way(q.Spot(what="marker", id=7, dictionary=name), index).place_ids[-1] for name in ("", "4X4_50")}
+    assert ends == {"": 14, "4X4_50": 18}
+    missing = way(q.Spot(what="marker", id=7, dictionary="5x5"), index).reason
+    assert "there is no marker 7 of the dictionary '5x5'" in missing

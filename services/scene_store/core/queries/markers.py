@@ -9,6 +9,7 @@ from prior_sg.schemas.queries import MarkersOf
 from prior_sg.schemas.scene import Scene
 from prior_sg.services import geometry
 from prior_sg.services.scene_store.core.queries.index import Index
+from prior_sg.services.scene_store.core.queries.labels import MOST_IDS
 from prior_sg.services.scene_store.core.queries.things import thing
 
 NO_MARKERS = (
@@ -19,14 +20,15 @@ NO_MARKERS = (
 
 def markers(index: Index, question: MarkersOf) -> Markers:
     """Each with the region of the nearest place."""
-    found = [
-        one
-        for one in index.scene.markers
-        if question.id in (None, one.id) and same(question.dictionary) in ("", same(one.dictionary))
-    ]
+    found = numbered(index.scene, question.id, question.dictionary)
     if not found:
         return Markers(reason=nothing_numbered(index.scene, question.id, question.dictionary))
     return Markers(markers=[_held(index, one) for one in found[: question.limit]], total=len(found))
+
+
+def numbered(scene: Scene, number: int | None, dictionary: str = "") -> list[SceneMarker]:
+    """The markers of a number, of a dictionary; of any where none is said."""
+    return [one for one in scene.markers if number in (None, one.id) and same(dictionary) in ("", same(one.dictionary))]
 
 
 def rows_before(index: Index, marker: SceneMarker) -> np.ndarray:
@@ -47,7 +49,9 @@ def nothing_numbered(scene: Scene, number: int | None, dictionary: str = "") -> 
         return NO_MARKERS
     wanted = " ".join(["marker", *([str(number)] if number is not None else [])])
     of = f" of the dictionary {dictionary!r}" if dictionary else ""
-    return f"there is no {wanted}{of}; the scene has {', '.join(str(one.key) for one in there)}"
+    held = ", ".join(str(one.key) for one in there[:MOST_IDS])
+    more = f" and {len(there) - MOST_IDS} others" if len(there) > MOST_IDS else ""
+    return f"there is no {wanted}{of}; the scene has {held}{more}"
 
 
 def _held(index: Index, marker: SceneMarker) -> MarkerInRegion:

@@ -11,7 +11,7 @@ from prior_sg.schemas.markers import SceneMarker
 from prior_sg.schemas.queries import RouteBetween, Spot
 from prior_sg.services.scene_store.core.queries.index import Index, Ways
 from prior_sg.services.scene_store.core.queries.labels import REGIONS_AND_OBJECTS, kinds, not_there, nothing_called
-from prior_sg.services.scene_store.core.queries.markers import gaps_of, nothing_numbered, rows_before
+from prior_sg.services.scene_store.core.queries.markers import gaps_of, nothing_numbered, numbered, rows_before
 from prior_sg.services.scene_store.core.queries.spatial import distances_of
 from prior_sg.services.scene_store.core.queries.things import thing
 
@@ -132,9 +132,9 @@ def _printed(index: Index, spot: Spot, side: str) -> list[SceneMarker]:
     """The markers of a number; only those that stand at one spot. Raises NoSuchSpot."""
     if spot.id is None:
         raise NoSuchSpot(f"the {side} is a marker without a number: write marker:7")
-    found = [one for one in index.scene.markers if one.id == spot.id]
+    found = numbered(index.scene, spot.id, spot.dictionary)
     if not found:
-        raise NoSuchSpot(f"the {side}: {nothing_numbered(index.scene, spot.id)}")
+        raise NoSuchSpot(f"the {side}: {nothing_numbered(index.scene, spot.id, spot.dictionary)}")
     sure = [one for one in found if not one.doubt]
     if not sure:
         raise NoSuchSpot(f"the {side}: nobody knows where {found[0].key} is, for {found[0].doubt}")
