@@ -1,6 +1,7 @@
 """The command line: `prior-sg`. Imports are within `main`, where an interrupt of them is told as one line."""
 
 import argparse
+import os
 import signal
 import sys
 import threading
