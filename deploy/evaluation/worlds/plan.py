@@ -136,7 +136,7 @@ class Plan:
         if not edges:
             raise Unbuildable(f"no door from {one.label} to {other.label}")
         edge = edges[int(self.rng.integers(len(edges)))]
-        slack = edge.length - width - 2 * WALL_M
+        slack = max(edge.length - width - 2 * WALL_M, 0.0)  # of a wall that just suffices rounding makes less than none
         at = edge.start + WALL_M + rounded(self.rng.uniform(0, slack), 0.1)
         self._open(one, other, edge.part(at, at + width), min(DOOR_HEIGHT_M, one.height_m))
 

@@ -237,6 +237,14 @@ def test_an_outline_follows_touching_rectangles_and_moves_inwards():
     assert polygon_area(corners) > 0
 
 
+def test_a_door_fits_a_wall_that_just_suffices():
+    """1.0 m for 0.8 m and 0.1 m of wall on each side: of 1.0 - 0.8 - 0.2 rounding makes less than nothing."""
+    plan = Plan(np.random.default_rng(0), "corridor")
+    one, other = (plan.room(label, Rect(x, 0, x + 3, 1), Level(0.0, 2.6)) for label, x in (("a", 0), ("b", 3)))
+    plan.door(one, other, 0.8)
+    assert len(one.kept_free) == len(other.kept_free) == 1
+
+
 def test_nothing_is_put_where_it_would_block_the_way_between_two_doors():
     plan = Plan(np.random.default_rng(0), "corridor")
     rooms = [plan.room(name, Rect(x, 0, x + 3, 2), Level(0, 2.6)) for name, x in (("a", 0), ("b", 3), ("c", 6))]
