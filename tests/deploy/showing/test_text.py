@@ -74,7 +74,7 @@ def test_printed_markers_are_told_with_region_and_doubt():
 
 
 def test_many_markers_leave_room_for_what_is_expected_and_for_openings():
-    seen = marked_home(foresight=foresight(marked_home(), 10, "hall", 0.6))
+    seen = marked_home(foresight=foresight(marked_home(), 9, "hall", 0.6))
     many = [msgspec.structs.replace(seen.markers[0], id=number) for number in range(587)]
     told = scene_text(msgspec.structs.replace(seen, markers=many))
     assert told.count("Printed marker") == 10 and "577 markers" in told
