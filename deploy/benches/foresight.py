@@ -53,7 +53,7 @@ def foresight_bench(
         for quest in asked:
             for name, policy in POLICIES.items():
                 walked_m[kind][name].append(metres(quest, policy, cfg))
-    metrics = predicted(seen, cfg)
+    metrics = predicted(revealing(seen), cfg)
     whole_m = {name: [way_m for found in walked_m.values() for way_m in found[name]] for name in POLICIES}
     metrics["search"] = search_figures(whole_m) | {"searches": len(whole_m["ours"])}
     metrics["search_by_kind"] = {
@@ -79,12 +79,17 @@ def mapped_figures(worlds: Sequence[WorldName], cfg: ForesightConfig, report: Re
         told = partial(_frames, report, where)
         perceiver = Perceiver({}, Cache(folder), told, ENCODER)
         seen.append((world.kind, *mapped(world.kind, world.seed, perceiver)))
-    seen = [one for one in seen if any(len(moment.outcomes) for moment in one[1])]
+    seen = revealing(seen)
     if not seen:
         return {}
     kinds = dict.fromkeys(kind for kind, _, _ in seen)
     by_kind = {kind: predicted([one for one in seen if one[0] == kind], cfg) for kind in kinds}
     return predicted(seen, cfg) | {"by_kind": by_kind}
+
+
+def revealing(seen: Sequence[Told]) -> list[Told]:
+    """The walks on which any opening reveals something: of others nothing can be foretold."""
+    return [one for one in seen if any(len(moment.outcomes) for moment in one[1])]
 
 
 def _frames(report: Report, where: str, what: str, done: int, whole: int) -> None:

@@ -28,6 +28,16 @@ def maps(monkeypatch):
     monkeypatch.setattr(bench, "mapped", lambda kind, seed, perceiver: (seen[kind], prior(["hall", "bath", "den"])))
 
 
+def test_a_walk_on_which_no_opening_reveals_anything_is_left_out():
+    """It cannot be judged, and would end a bench of many worlds."""
+    home = prior(["hall", "bath", "den"])
+    walks = [("home", [moment([]), moment([SAME])], home), ("shop", [moment([])], home), ("office", [], home)]
+    assert [kind for kind, _, _ in bench.revealing(walks)] == ["home"]
+    with pytest.raises(ValueError, match="no opening reveals anything"):
+        bench.predicted(walks, ForesightConfig())
+    assert bench.predicted(bench.revealing(walks), ForesightConfig())["ours"]["events"] == 1
+
+
 def test_maps_are_judged_together_and_by_kind(maps, tmp_path):
     worlds, said = [WorldName(kind, 80) for kind in ("home", "office", "shop")], []
     found = bench.mapped_figures(worlds, ForesightConfig(), said.append, tmp_path)
