@@ -246,6 +246,18 @@ def test_only_what_changes_visibly_is_news():
     assert [differs(now, msgspec.structs.replace(now, openings=[one]), CFG) for one in moved] == [False, True]
 
 
+@pytest.mark.parametrize("field", ["within", "toward"])
+def test_what_planners_choose_an_opening_by_is_news_when_it_changes(field):
+    graph, places = a_map()
+    state_of = {7: region(7, "hall"), 8: region(8, "bath")}
+    now = foresight(openings_of(graph, places, opened((0, (0, 1, 0), 2.0)), CFG), state_of, home(), CFG)
+    (opening,) = now.openings
+    for shift, news in ((0.01, False), (0.2, True)):
+        first = msgspec.structs.replace(opening.labels[0], **{field: getattr(opening.labels[0], field) - shift})
+        moved = msgspec.structs.replace(opening, labels=[first, *opening.labels[1:]])
+        assert differs(now, msgspec.structs.replace(now, openings=[moved]), CFG) is news
+
+
 def test_an_opening_tells_all_labels_that_it_leads_to():
     """Searches would pass it by; what it hardly leads to is told where it is among the likeliest."""
     graph, places = a_map()

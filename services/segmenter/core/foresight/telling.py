@@ -65,11 +65,14 @@ def differs(told: Foresight | None, now: Foresight, cfg: ForesightConfig) -> boo
     )
 
 
-def _figures(one: Foresight) -> dict[tuple[int, str], float]:
-    """Every probability by opening and label; openings as a whole count as likely."""
-    found = {(opening.place_id, ""): 1.0 + opening.same for opening in one.openings}
-    found |= {(opening.place_id, entry.label): entry.within for opening in one.openings for entry in opening.labels}
-    return found | {(-1, entry.label): entry.probability for entry in one.missing}
+def _figures(one: Foresight) -> dict[tuple[str, int, str], float]:
+    """Every probability that planners choose by, by what it is of, opening and label; openings as a whole count as
+    likely."""
+    found = {("opening", opening.place_id, ""): 1.0 + opening.same for opening in one.openings}
+    for opening in one.openings:
+        found |= {("within", opening.place_id, entry.label): entry.within for entry in opening.labels}
+        found |= {("toward", opening.place_id, entry.label): entry.toward for entry in opening.labels}
+    return found | {("missing", -1, entry.label): entry.probability for entry in one.missing}
 
 
 def _opening(
