@@ -16,6 +16,7 @@ from pathlib import Path
 from types import CodeType, ModuleType
 from typing import Any, TypeVar, cast
 
+from prior_sg.services.compiling import CLOCK
 from prior_sg.services.folders import temporary_cache
 
 F = TypeVar("F", bound=Callable)
@@ -62,7 +63,7 @@ class Loop:
         try:
             return _kept(self._function, self._options)
         except RuntimeError:
-            return _numba().njit(nogil=True, **self._options)(self._function)
+            return _counted(_numba().njit(nogil=True, **self._options)(self._function))
 
     def met(self) -> tuple[int, int]:
         """For how many argument types it was compiled in this process, and for how many that was read from the disk."""
@@ -105,8 +106,12 @@ def _kept(function: Callable, options: dict[str, Any]) -> Callable:
     index = kept._cache._cache_file
     index._source_stamp = (index._source_stamp, made_of(function))
     kept._cache = _Kept(kept._cache)
-    kept._compiler.compile = _compiling.during(kept._compiler.compile)
-    return cast(Callable, kept)
+    return cast(Callable, _counted(kept))
+
+
+def _counted(dispatcher: Any) -> Any:
+    dispatcher._compiler.compile = _compiling.during(dispatcher._compiler.compile)
+    return dispatcher
 
 
 class _Compiling(threading.local):
@@ -121,7 +126,8 @@ class _Compiling(threading.local):
         def counted(*arguments: Any) -> Any:
             self.depth += 1
             try:
-                return compiles(*arguments)
+                with CLOCK.running():
+                    return compiles(*arguments)
             finally:
                 self.depth -= 1
 

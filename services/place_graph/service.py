@@ -13,7 +13,7 @@ from prior_sg.services.place_graph.core import publishing, succession, update
 from prior_sg.services.place_graph.core.config import Config
 from prior_sg.services.place_graph.core.state import Legacy, State, empty
 from prior_sg.services.refusals import NotYet
-from prior_sg.services.runtime.service import Ask, Handover, Identity, Output, Service
+from prior_sg.services.runtime.service import Ask, Handover, Identity, Output, Pause, Service
 
 log = logging.getLogger(__name__)
 
@@ -24,7 +24,7 @@ def init(cfg: Config, identity: Identity) -> State:
 
 
 def step(state: State, message: Message, cfg: Config) -> Iterator[Output]:
-    """One keyframe gives one delta, with or without changes; a repeated keyframe gives nothing.
+    """One keyframe gives one delta, with or without changes, a large one several; a repeated keyframe gives nothing.
 
     A process that joins in mid-stream fetches what it has missed from the archive, page by page, and hears from its
     predecessor, or from the store, which ids places have. Until it has, and while another is in charge, it tells
@@ -106,7 +106,10 @@ def _ask_archive(robot: str, first_frame_id: int, end_frame_id: int) -> Ask:
 
 def _map(state: State, keyframe: Keyframe, cfg: Config, tells: bool) -> Iterator[Output]:
     if keyframe.frame_id not in state.seen:
-        yield from _told(update.integrate(state, keyframe, cfg), tells)
+        for delta in update.integrate(state, keyframe, cfg):
+            yield from _told(delta, tells)
+            if keyframe.frame_id not in state.seen:
+                yield Pause()
 
 
 def _told(delta: PlaceDelta | None, tells: bool) -> Iterator[Output]:

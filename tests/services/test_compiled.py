@@ -57,6 +57,13 @@ def test_without_any_cache_it_is_kept_in_a_temporary_folder_and_said_once(progra
     assert done.stderr.count("\n") == 1 and str(folder) in done.stderr and "NUMBA_CACHE_DIR" in done.stderr
 
 
+def test_the_time_that_it_takes_is_known_with_a_cache_and_without(program, tmp_path):
+    seconds = "\nfrom prior_sg.services.compiling import CLOCK\nprint(CLOCK.seconds() > 0.01)\n"
+    program.write_text(ONE_LOOP + seconds)
+    first, again, without = (run(program, NUMBA_CACHE_DIR=str(where)) for where in (tmp_path, tmp_path, os.devnull))
+    assert [done.stdout for done in (first, again, without)] == ["42\nTrue\n", "42\nFalse\n", "42\nTrue\n"]
+
+
 def test_a_folder_of_the_users_choice_is_taken_in_silence(program, tmp_path):
     done = run(program, NUMBA_CACHE_DIR=str(tmp_path / "mine"))
     assert (done.stdout, done.stderr) == ("42\n", "")

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 import msgspec
 import numpy as np
 
+from prior_sg.schemas.codec import copied
 from prior_sg.schemas.frames import Keyframe
 
 
@@ -57,4 +58,4 @@ def moved(keyframe: Keyframe, world_from_camera: np.ndarray) -> Keyframe:
 
 
 def _without_color(keyframe: Keyframe) -> Keyframe:
-    return msgspec.structs.replace(keyframe, color=b"", world_from_camera=np.array(keyframe.world_from_camera))
+    return copied(msgspec.structs.replace(keyframe, color=b""))

@@ -4,6 +4,7 @@ from typing import Any, ClassVar, Literal
 
 import msgspec
 
+from prior_sg.schemas.codec import Signed
 from prior_sg.services.images import MAX_PRINCIPAL_OFFSET
 from prior_sg.services.place_graph.core.ground import GroundRules
 from prior_sg.services.place_graph.core.skeleton.distance import FieldRules
@@ -12,14 +13,16 @@ from prior_sg.services.place_graph.core.skeleton.places import ExtractionRules, 
 from prior_sg.services.place_graph.core.trajectory import Bounds
 from prior_sg.services.place_graph.core.volume import tsdf
 
+AT_ONCE = 2**31  # blocks: with a `slice_blocks` of so many each keyframe gives one delta
+SLICE_VOXELS = 100  # for each of `slice_blocks`; with two thirds of it all slices together take longer
 MAX_FIELD_VOXELS = 120  # offsets to the nearest obstacle are kept in 8 bits
 
 # What each preset changes of the defaults, which are those of `indoor`. `hydra` are the defaults in Hydra's code,
 # `habitat`, `uhumans2` and `clio` those of its configurations of that name; their diagrams have voxels of 0.2 m.
 PRESETS: dict[str, dict[str, Any]] = {
     "indoor": {},
-    # Middles of whole cells lie a cell apart, that of a share f of one (1 + f) / 2 beside it: parts below half go.
-    "mixed": {"field_voxels": 2, "merge_policy": "middle", "node_merge_distance_m": 0.75},
+    # Middles of whole cells lie a cell apart, that of a share f of one (1 + f) / 2 beside it: small ones are in reach.
+    "mixed": {"field_voxels": 2, "merge_policy": "middle", "node_merge_distance_m": 0.85},
     "outdoor": {
         "voxel_m": 0.2,
         "truncation_m": 0.6,
@@ -102,6 +105,10 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
     use_constant_weight: bool = False  # weigh measurements alike, instead of by 1 / depth^2 as sensors are precise
     map_window_max_radius_m: float = 20.0  # blocks farther from the camera are compressed; an update reads up to 19 m
     map_mb: float = 512.0  # all voxels, open and compressed; beyond it the oldest are dropped and their places freeze
+    # Blocks of 16 x 16 x 16 voxels that a keyframe is fused into at once; a view of 5 m at 0.1 m concerns 20 to 60. One
+    # that concerns more is worked off in slices, after each of which readers are told and questions answered. With
+    # `field_voxels` of 2 or 4 a slice has as many times the blocks.
+    slice_blocks: int = 128
     archive_mb: float = 256.0  # compressed depth images kept for pose updates, oldest dropped first
     # Keyframes heard without an answer from ingest's archive before the map is told as it is; its publisher's cache
     # brings 32 at once, behind which the answer waits.
@@ -112,7 +119,7 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
     min_distance_m: float = 0.2  # no place and no part of the diagram lies nearer to an obstacle
     voronoi_min_distance_m: float = 0.3  # the Voronoi diagram ends this close to obstacles
     parent_l1_separation: float = 20.0  # voxels: obstacles farther apart than this (L1) are distinct basis points ...
-    parent_cos_angle_separation: float = 0.2  # ... and so are those seen under an angle with a smaller cosine
+    parent_cos_angle_separation: Signed = 0.2  # ... and so are those seen under an angle with a smaller cosine
 
     # Places and edges.
     compression_distance_m: float = 1.0  # side of the cells that become one place each
@@ -162,6 +169,8 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
             raise ValueError(f"max_distance_m may be at most {MAX_FIELD_VOXELS} voxels")
         if not 0 <= self.min_range_m < self.max_range_m:
             raise ValueError("min_range_m must be at least 0 and below max_range_m")
+        if not self.slice_blocks >= 1:
+            raise ValueError("slice_blocks must be at least 1")
         if not (self.map_mb > 0 and self.archive_mb >= 0):
             raise ValueError("map_mb must be positive and archive_mb at least 0")
 
@@ -178,6 +187,16 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
     def graph_voxel_m(self) -> float:
         """Side of a voxel of distances, diagram and graph."""
         return self.voxel_m * self.coarseness
+
+    @property
+    def most_blocks(self) -> int:
+        """Blocks in a slice: more where what follows from them is coarser and costs less."""
+        return self.slice_blocks * self.coarseness
+
+    @property
+    def most_voxels(self) -> int:
+        """Voxels whose distances may be expected to change at once, where a keyframe is worked off in slices."""
+        return SLICE_VOXELS * self.slice_blocks
 
     @property
     def fusion(self) -> tsdf.Fusion:

@@ -12,10 +12,10 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 
 from prior_sg.services.compiled import compiled
+from prior_sg.services.opencv import cv2
 from prior_sg.services.place_graph.core.columns import GroundColumns
 from prior_sg.services.place_graph.core.skeleton.graph import Changes, GraphRules, Place, PlaceGraph, Voxel
 from prior_sg.services.place_graph.core.terrain import connected, edge_of, ground_voxels
@@ -63,17 +63,29 @@ class GroundGraph(PlaceGraph):
         self.ground = rules
         self.pieces: dict[int, Piece] = {}
 
-    def renew(self, grid: VoxelGrid, changed: Box) -> Changes:
-        """Divide the ground of all tiles again that labels changed inside `changed` may concern."""
-        tile, changes = self.ground.tile, Changes()
-        low = np.floor_divide(changed.low[:2] - tile // 2, tile)
-        high = np.floor_divide(changed.high[:2] - 1 + tile // 2, tile) + 1
-        for x in range(int(low[0]), int(high[0])):
-            for y in range(int(low[1]), int(high[1])):
-                self._renew_tile(grid, (x, y), changes)
-        z_low, z_high = grid.bounds.low[2], grid.bounds.high[2]
-        self._relink(Box(np.array((*low * tile, z_low)), np.array((*high * tile, z_high))), changes)
+    def renew(self, grid: VoxelGrid, tiles: np.ndarray) -> Changes:
+        """Divide the ground of tiles (m, 2), m > 0, again, and join it anew."""
+        changes, whole = Changes(), self.box_of(tiles, grid.bounds)
+        for x, y in tiles.tolist():
+            self._renew_tile(grid, (x, y), changes)
+        self._relink(whole, changes)
         return changes
+
+    def box_of(self, tiles: np.ndarray, bounds: Box) -> Box:
+        """The box around tiles (m, 2), as high as `bounds`."""
+        low, high = tiles.min(axis=0) * self.ground.tile, (tiles.max(axis=0) + 1) * self.ground.tile
+        return Box(np.array((*low, bounds.low[2])), np.array((*high, bounds.high[2])))
+
+    def concerned(self, changed: np.ndarray) -> np.ndarray:
+        """Tiles (m, 2), in order, with one of the voxels (n, 3), n > 0, in them or up to half a tile beside them."""
+        side = self.ground.tile
+        first, last = (np.floor_divide(changed[:, :2] + beside, side) for beside in (-(side // 2), side // 2))
+        low = first.min(axis=0)
+        concerned = np.zeros(last.max(axis=0) - low + 1, np.bool_)
+        for x in (first[:, 0], last[:, 0]):
+            for y in (first[:, 1], last[:, 1]):
+                concerned[x - low[0], y - low[1]] = True
+        return np.argwhere(concerned) + low
 
     def renumber(self, number: Mapping[int, int], next_id: int) -> None:
         """Give every place another id."""

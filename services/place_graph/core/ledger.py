@@ -68,6 +68,8 @@ class PlaceLedger:
             for b, clearance in links.items():
                 # Neighbours of a shown place are in its component, hence shown too.
                 known = self.edges.get(a, {}).get(b)
+                if known == clearance:
+                    continue
                 if known is None or abs(known**0.5 - clearance**0.5) * voxel_m > min_change_m:
                     upserts[min(a, b), max(a, b)] = clearance
             lost.update((min(a, b), max(a, b)) for b in self.edges.get(a, {}) if b not in links)
@@ -91,6 +93,8 @@ def _within_hops(graph: PlaceGraph, ids: set[int], hops: int) -> list[int]:
 
 
 def _component_reaches(graph: PlaceGraph, start: int, size: int) -> bool:
+    if len(graph.edges.get(start, ())) + 1 >= size:
+        return True
     found, stack = {start}, [start]
     while stack and len(found) < size:
         fresh = set(graph.edges.get(stack.pop(), ())) - found
@@ -101,6 +105,8 @@ def _component_reaches(graph: PlaceGraph, start: int, size: int) -> bool:
 
 def _differs(known: Place | None, place: Place, voxel_m: float, min_change_m: float) -> bool:
     """Whether readers must hear of a place: it is new, or moved or resized by more than the smallest change."""
+    if known == place:
+        return False
     if known is None or known.basis != place.basis:
         return True
     moved = max(abs(a - b) for a, b in zip(known.center, place.center, strict=True)) * voxel_m

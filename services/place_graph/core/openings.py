@@ -5,6 +5,7 @@ outward normals of a place's open faces, each weighed by its area, add up to its
 surfaces, whose normals cancel, and a doorway not yet passed adds up to its width times its height.
 """
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
@@ -15,6 +16,8 @@ from prior_sg.services.place_graph.core.columns import OpeningColumns
 from prior_sg.services.place_graph.core.skeleton.graph import PlaceGraph
 from prior_sg.services.place_graph.core.volume.grid import FREE, UNOBSERVED, Box, VoxelGrid
 
+Normal = tuple[int, int, int]
+CLOSED: Normal = (0, 0, 0)
 BESIDE = 1.0  # voxels: a sphere ends on the voxel before an obstacle, and its faces one beside that
 TOLD_AREA, TOLD_COSINE = 0.2, 0.966  # a change of a fifth of the area, or of 15 degrees, is told
 
@@ -24,35 +27,36 @@ class Openings:
     """The opening of each place as a sum of outward normals, in faces of voxels, and what readers were told of it."""
 
     reach: int  # voxels from a place's centre to the farthest face that can belong to it
-    normals: dict[int, np.ndarray] = field(default_factory=dict)
-    told: dict[int, np.ndarray] = field(default_factory=dict)
+    normals: dict[int, Normal] = field(default_factory=dict)
+    told: dict[int, Normal] = field(default_factory=dict)
 
     def renew(self, grid: VoxelGrid, graph: PlaceGraph, changed: Box) -> set[int]:
         """Recompute what labels or places changed inside `changed` may concern; returns the ids looked at."""
-        near = graph.within(changed.grown(self.reach))
         rivals = graph.within(changed.grown(2 * self.reach))
-        if near:
-            voxels = np.array([graph.places[i].voxel for i in rivals], np.int64)
+        voxels = graph.voxels(rivals)
+        near = np.flatnonzero(changed.grown(self.reach).contains(voxels)).tolist()
+        wanted = [n for n in near if rivals[n] not in graph.frozen]
+        if wanted:
             radii = np.sqrt([float(graph.places[i].d2) for i in rivals]) + BESIDE
-            window = changed.grown(2 * self.reach + 1).clipped(grid.bounds.grown(1))
+            window = Box.around(voxels[wanted]).grown(self.reach + 1).clipped(grid.bounds.grown(1))
             label = grid.gather("label", window)
             found = summed_normals(label, voxels - window.low, np.minimum(radii, self.reach))
-            wanted = set(near) - graph.frozen
-            self.normals |= {i: normal for i, normal in zip(rivals, found, strict=True) if i in wanted}
-        return set(near)
+            sums = zip(wanted, found[wanted].tolist(), strict=True)
+            self.normals |= {rivals[n]: (x, y, z) for n, (x, y, z) in sums}
+        return {rivals[n] for n in near}
 
     def update(self, ids: Iterable[int], shown: Iterable[int], voxel_m: float, min_area_m2: float) -> OpeningColumns:
         """What readers must hear of the places `ids`, of those that are `shown`; it is remembered as told."""
-        news: dict[int, np.ndarray] = {}
+        news: dict[int, Normal] = {}
         for place_id in sorted(ids):
-            normal = self.normals.get(place_id, np.zeros(3, np.int64)) if place_id in shown else np.zeros(3, np.int64)
-            if np.linalg.norm(normal) * voxel_m**2 < min_area_m2:
-                normal = np.zeros(3, np.int64)
-            if _differs(self.told.get(place_id, np.zeros(3, np.int64)), normal):
+            normal = self.normals.get(place_id, CLOSED) if place_id in shown else CLOSED
+            if _length(normal) * voxel_m**2 < min_area_m2:
+                normal = CLOSED
+            if _differs(self.told.get(place_id, CLOSED), normal):
                 news[place_id] = normal
         for place_id, normal in news.items():
             self.told[place_id] = normal
-            if not normal.any():
+            if normal == CLOSED:
                 del self.told[place_id]
         return _columns({i: normal for i, normal in news.items() if i in shown}, voxel_m)
 
@@ -100,14 +104,22 @@ def summed_normals(label, voxels, reaches):  # noqa: ANN001, ANN201
     return found
 
 
-def _differs(told: np.ndarray, now: np.ndarray) -> bool:
-    before, after = float(np.linalg.norm(told)), float(np.linalg.norm(now))
+def _differs(told: Normal, now: Normal) -> bool:
+    if told == now:
+        return False
+    before, after = _length(told), _length(now)
     if not before or not after:
         return before != after
-    return abs(after - before) > TOLD_AREA * before or float(told @ now) < TOLD_COSINE * before * after
+    along = told[0] * now[0] + told[1] * now[1] + told[2] * now[2]
+    return abs(after - before) > TOLD_AREA * before or along < TOLD_COSINE * before * after
 
 
-def _columns(openings: dict[int, np.ndarray], voxel_m: float) -> OpeningColumns:
+def _length(normal: Normal) -> float:
+    x, y, z = normal
+    return math.sqrt(x * x + y * y + z * z)
+
+
+def _columns(openings: dict[int, Normal], voxel_m: float) -> OpeningColumns:
     normals = np.array(list(openings.values()), np.float64).reshape(-1, 3)
     lengths = np.linalg.norm(normals, axis=1)
     directions = np.divide(normals, lengths[:, None], out=np.zeros_like(normals), where=lengths[:, None] > 0)

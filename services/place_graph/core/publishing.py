@@ -1,6 +1,7 @@
 """What readers are told of the map: changes, everything, or the voxels themselves (pure)."""
 
 from collections.abc import Iterable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,20 +14,17 @@ from prior_sg.services.place_graph.core.state import State
 from prior_sg.services.place_graph.core.volume.grid import FREE, OCCUPIED
 
 
-def publish(
-    state: State,
-    changes: Changes,
-    cfg: Config,
-    *,
-    stamp_ns: int,
-    event: str,
-    camera_m: tuple[float, float, float] | None = None,
-    moved_ids: Sequence[int] = (),
-) -> PlaceDelta:
-    """The delta that follows from `changes`; it has the next revision also when it is empty.
+class Cause(NamedTuple):
+    """What a delta follows from."""
 
-    `camera_m` is the camera of the keyframe that caused it, `moved_ids` are keyframes whose cameras an update moved.
-    """
+    stamp_ns: int
+    event: str = ""
+    camera_m: tuple[float, float, float] | None = None  # of the keyframe
+    moved_ids: Sequence[int] = ()  # keyframes whose cameras an update moved
+
+
+def publish(state: State, changes: Changes, cfg: Config, cause: Cause) -> PlaceDelta:
+    """The delta that follows from `changes`; it has the next revision also when it is empty."""
     state.revision += 1
     graph = state.ledger.update(state.graph, changes, cfg.graph_voxel_m, cfg.min_component_size, cfg.min_diff_m)
     shown, told_ids = state.ledger.places, graph.places.place_ids.tolist()
@@ -34,11 +32,11 @@ def publish(
     openings = state.openings.update(looked_at, shown, cfg.graph_voxel_m, cfg.frontier_min_area_m2)
     state.openings.forget(i for i in changes.touched if i not in state.graph.places)
     return place_delta(
-        _heading(state)._replace(stamp_ns=stamp_ns, camera_m=camera_m, event=event),
+        _heading(state)._replace(stamp_ns=cause.stamp_ns, camera_m=cause.camera_m, event=cause.event),
         graph,
         openings,
         _shapes(state, shown.keys() & changes.touched.union(told_ids), cfg),
-        _cameras(state, moved_ids),
+        _cameras(state, cause.moved_ids),
     )
 
 

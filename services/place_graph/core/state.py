@@ -45,7 +45,7 @@ class State:
     trajectory: Trajectory = dataclasses.field(default_factory=Trajectory)
     # By frame id, of those fused.
     cameras_m: dict[int, tuple[float, float, float]] = dataclasses.field(default_factory=dict)
-    seen: set[int] = dataclasses.field(default_factory=set)  # frame ids of all keyframes, also the refused
+    seen: set[int] = dataclasses.field(default_factory=set)  # frame ids of keyframes worked off, also of the refused
     corrections: PoseCorrections = dataclasses.field(default_factory=PoseCorrections)
     refused: dict[int, str] = dataclasses.field(default_factory=dict)  # why keyframes could not be used, by frame id
     joined_frame_id: int = 0  # first keyframe heard live; earlier ones come from the archive
@@ -87,10 +87,9 @@ class State:
                 losses.add("keyframes not mapped", reason, of=f"keyframe {frame_id}")
         return losses.told
 
-    def heard(self, keyframe: Keyframe) -> None:
+    def follows_from(self, keyframe: Keyframe) -> None:
         """The next delta follows from this keyframe."""
         self.stamp_ns, self.frame_id = max(self.stamp_ns, keyframe.stamp_ns), keyframe.frame_id
-        self.seen.add(keyframe.frame_id)
 
 
 def empty(robot: str, epoch: int, cfg: Config) -> State:

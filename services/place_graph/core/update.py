@@ -5,6 +5,8 @@ and the Voronoi diagram around changed voxels, extract places there again, give 
 Or its 2D places, pieces of ground, which need the map only.
 """
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from prior_sg.schemas.frames import Keyframe, PoseUpdate
@@ -12,16 +14,28 @@ from prior_sg.schemas.places import PlaceDelta
 from prior_sg.services.images import ImageFault
 from prior_sg.services.place_graph.core.archive import moved
 from prior_sg.services.place_graph.core.config import Config
-from prior_sg.services.place_graph.core.fusing import fuse_and_keep, fuse_doubted, fuse_reconsidered, leave_behind, move
-from prior_sg.services.place_graph.core.publishing import publish
+from prior_sg.services.place_graph.core.fusing import (
+    Slice,
+    fuse_reconsidered,
+    fuse_slice,
+    fuse_slices,
+    leave_behind,
+    move,
+    slices_of,
+    slices_of_doubted,
+)
+from prior_sg.services.place_graph.core.ground import GroundGraph
+from prior_sg.services.place_graph.core.publishing import Cause, publish
 from prior_sg.services.place_graph.core.refusals import distrust, jump_of, lateness, usable_depth
-from prior_sg.services.place_graph.core.renewal import renew
+from prior_sg.services.place_graph.core.renewal import renew, renew_ground, tile_groups
 from prior_sg.services.place_graph.core.skeleton.graph import Changes
 from prior_sg.services.place_graph.core.state import State
 
 
-def integrate(state: State, keyframe: Keyframe, cfg: Config) -> PlaceDelta:
-    """Fuse one keyframe and return what changed in the place graph.
+def integrate(state: State, keyframe: Keyframe, cfg: Config) -> Iterator[PlaceDelta | None]:
+    """Fuse one keyframe, step by step, and yield after each what changed in the place graph; None = nothing.
+
+    Only the last step makes the keyframe one of those `seen`, and always yields a delta.
 
     A keyframe that cannot be used leaves the map as it is; the delta's `event` says why. One whose pose has jumped is
     kept, for a pose update or the keyframes that follow may show where it was taken.
@@ -30,23 +44,53 @@ def integrate(state: State, keyframe: Keyframe, cfg: Config) -> PlaceDelta:
     try:
         depth_m = usable_depth(keyframe, cfg)
     except ImageFault as fault:
-        return reject(state, keyframe, str(fault), cfg)
+        yield reject(state, keyframe, str(fault), cfg)
+        return
     jump_m = jump_of(state, keyframe, cfg)
     if jump_m and (reason := distrust(state, keyframe, depth_m, jump_m, cfg)):
         state.archive.put(keyframe, fused=False)
-        return reject(state, keyframe, reason, cfg)
+        yield reject(state, keyframe, reason, cfg)
+        return
     state.origin_m = keyframe.origin_m
     event = lateness(state, keyframe)
-    changed = [fuse_and_keep(state, keyframe, depth_m, cfg)]
+    work = slices_of(state, keyframe, depth_m, cfg)
     if jump_m:
         event = f"believed again at keyframe {keyframe.frame_id}: the pose stays where it jumped to and fits the map"
-        changed += fuse_doubted(state, keyframe, cfg)
+        work += slices_of_doubted(state, keyframe, cfg)
     state.trajectory.believe(keyframe)
-    changes = renew(state, np.concatenate(changed), cfg)
-    leave_behind(state, keyframe, cfg)
-    state.heard(keyframe)
-    camera_m = state.cameras_m[keyframe.frame_id]
-    return publish(state, changes, cfg, stamp_ns=keyframe.stamp_ns, event=event, camera_m=camera_m)
+    state.follows_from(keyframe)
+    news = Cause(keyframe.stamp_ns, event, state.cameras_m[keyframe.frame_id])
+    for changes, last in _steps(state, keyframe, work, cfg):
+        if last:
+            leave_behind(state, keyframe, cfg)
+            state.seen.add(keyframe.frame_id)
+        if last or changes.touched or changes.opened:
+            yield publish(state, changes, cfg, news)
+            news = Cause(keyframe.stamp_ns)
+        else:
+            yield None
+
+
+def _steps(state: State, keyframe: Keyframe, work: list[Slice], cfg: Config) -> Iterator[tuple[Changes, bool]]:
+    """Fuse slices and follow them up, step by step; after each, what changed in the graph, and whether that was all.
+
+    A slice is followed up before more is fused: distances hold where no label has changed unnoticed. Ground is
+    divided tile by tile, and a change concerns tiles around it, which slices would divide again and again: all slices
+    are fused first, and followed up in groups of tiles.
+    """
+    if not isinstance(state.graph, GroundGraph):
+        for changed, last in fuse_slices(state, work, cfg):
+            yield renew(state, changed, cfg), last
+        return
+    found = []
+    for part in work:
+        found.append(fuse_slice(state, part, cfg))
+        if len(work) > 1:
+            yield Changes(), False
+    changed = np.concatenate(found)
+    groups = tile_groups(state.graph, changed, keyframe.world_from_camera[:2, 3], cfg)
+    for number, tiles in enumerate(groups, 1):
+        yield renew_ground(state, state.graph, tiles, changed), number == len(groups)
 
 
 def correct(state: State, update: PoseUpdate, cfg: Config) -> PlaceDelta | None:
@@ -71,12 +115,13 @@ def correct(state: State, update: PoseUpdate, cfg: Config) -> PlaceDelta | None:
     changed += fuse_reconsidered(state, cfg)
     event = f"{lost} of {len(poses)} keyframes are no longer archived and keep their poses" if lost else ""
     changes = renew(state, np.concatenate(changed), cfg)
-    return publish(state, changes, cfg, stamp_ns=update.stamp_ns, event=event, moved_ids=moved_ids)
+    return publish(state, changes, cfg, Cause(update.stamp_ns, event, moved_ids=moved_ids))
 
 
 def reject(state: State, keyframe: Keyframe, reason: str, cfg: Config) -> PlaceDelta:
     """Count a keyframe that cannot be used; the delta says why and changes nothing."""
     state.refused[keyframe.frame_id] = reason
-    state.heard(keyframe)
+    state.follows_from(keyframe)
+    state.seen.add(keyframe.frame_id)
     event = f"keyframe {keyframe.frame_id} refused: {reason}"
-    return publish(state, Changes(), cfg, stamp_ns=keyframe.stamp_ns, event=event)
+    return publish(state, Changes(), cfg, Cause(keyframe.stamp_ns, event))

@@ -41,25 +41,23 @@ def refresh(grid: VoxelGrid, changed: np.ndarray, rules: FieldRules) -> Box | No
     if not len(changed):
         return None
     reach, max_d2 = int(np.ceil(rules.max_distance)), int(np.floor(rules.max_distance**2))
-    core = Box(changed.min(axis=0), changed.max(axis=0) + 1).grown(reach).clipped(grid.bounds)
+    core = Box.around(changed).grown(reach).clipped(grid.bounds)
     while True:
         window = core.grown(RIM)
-        label = grid.gather("label", window)
-        d2 = grid.gather("d2", window, UNKNOWN_D2)
-        offset = grid.gather("offset", window)
+        label, d2, offset = grid.gather_all({"label": 0, "d2": UNKNOWN_D2, "offset": 0}, window)
         touched, inside = repair(label, d2, offset, changed - window.low, RIM, max_d2)
         if inside:
             break
         core = core.grown(reach).clipped(grid.bounds)  # a chain of replaced values has left the window
     if not len(touched):
         return None
-    box = Box(touched.min(axis=0) + window.low, touched.max(axis=0) + window.low + 1).grown(1)
-    basis = grid.gather("basis", window)
+    inner = Box.around(touched).grown(1)
+    box = Box(inner.low + window.low, inner.high + window.low)
+    basis = grid.gather("basis", box)
     limits = (rules.voronoi_min_distance**2, rules.parent_l1, rules.parent_cos)
-    renew_voronoi(label, d2, offset, basis, touched, *limits)
-    part = tuple(slice(*ends) for ends in zip(box.low - window.low, box.high - window.low, strict=True))
-    for name, values in (("d2", d2), ("offset", offset), ("basis", basis)):
-        grid.scatter(name, box, values[part])
+    renew_voronoi(label, d2, offset, basis, inner.low, touched, *limits)
+    part = tuple(slice(*ends) for ends in zip(*inner, strict=True))
+    grid.scatter({"d2": d2[part], "offset": offset[part], "basis": basis}, box)
     return box
 
 
@@ -109,65 +107,67 @@ class Wave(NamedTuple):
 NEW, KNOWN, QUEUED = 0, 1, 2
 TOUCHED, LEFT, LEVEL = 0, 1, 2
 
-
-@compiled()
-def _touch(wave, voxel):  # noqa: ANN001, ANN202
-    if wave.listed[voxel] == NEW:
-        wave.listed[voxel] = KNOWN
-        wave.touched[wave.counts[TOUCHED]] = voxel
-        wave.counts[TOUCHED] += 1
+# Loops get arrays one by one: read from a tuple within a loop, an array is counted as held each time.
 
 
 @compiled()
-def _unqueue(wave, voxel):  # noqa: ANN001, ANN202
+def _touch(listed, touched, counts, voxel):  # noqa: ANN001, ANN202
+    if listed[voxel] == NEW:
+        listed[voxel] = KNOWN
+        touched[counts[TOUCHED]] = voxel
+        counts[TOUCHED] += 1
+
+
+@compiled()
+def _unqueue(d2, listed, before, after, head, voxel):  # noqa: ANN001, ANN202, PLR0917
     """Take a voxel out of the list of its distance; call it before the distance changes."""
-    if wave.listed[voxel] == QUEUED:
-        wave.listed[voxel] = KNOWN
-        before, after = wave.before[voxel], wave.after[voxel]
-        if before >= 0:
-            wave.after[before] = after
+    if listed[voxel] == QUEUED:
+        listed[voxel] = KNOWN
+        last, following = before[voxel], after[voxel]
+        if last >= 0:
+            after[last] = following
         else:
-            wave.head[wave.d2[voxel]] = after
-        if after >= 0:
-            wave.before[after] = before
+            head[d2[voxel]] = following
+        if following >= 0:
+            before[following] = last
 
 
 @compiled()
-def _queue(wave, voxel):  # noqa: ANN001, ANN202
+def _queue(d2, listed, before, after, head, counts, voxel):  # noqa: ANN001, ANN202, PLR0917
     """Put a touched voxel into the list of its distance."""
-    level = wave.d2[voxel]
-    wave.listed[voxel] = QUEUED
-    wave.before[voxel], wave.after[voxel] = -1, wave.head[level]
-    if wave.head[level] >= 0:
-        wave.before[wave.head[level]] = voxel
-    wave.head[level] = voxel
-    wave.counts[LEVEL] = min(wave.counts[LEVEL], level)
+    level = d2[voxel]
+    listed[voxel] = QUEUED
+    before[voxel], after[voxel] = -1, head[level]
+    if head[level] >= 0:
+        before[head[level]] = voxel
+    head[level] = voxel
+    counts[LEVEL] = min(counts[LEVEL], level)
 
 
 @compiled()
-def _in_rim(wave, voxel, rim):  # noqa: ANN001, ANN202
-    nx, ny, nz = wave.shape
+def _in_rim(shape, voxel, rim):  # noqa: ANN001, ANN202
+    nx, ny, nz = shape[0], shape[1], shape[2]
     i, j, k = voxel // (ny * nz), (voxel // nz) % ny, voxel % nz
     return i < rim or j < rim or k < rim or i >= nx - rim or j >= ny - rim or k >= nz - rim
 
 
 @compiled()
-def _handed_on(wave, voxel, max_d2):  # noqa: ANN001, ANN202
+def _handed_on(d2, offset, shape, voxel, max_d2):  # noqa: ANN001, ANN202
     """The nearest obstacle that the neighbours of a free voxel hand on to it: squared distance and offset."""
-    stride_x, stride_y = wave.shape[1] * wave.shape[2], wave.shape[2]
+    stride_x, stride_y = shape[1] * shape[2], shape[2]
     best = np.int64(max_d2 + 1)
     bx = by = bz = np.int64(0)
     for dx in (-1, 0, 1):
         for dy in (-1, 0, 1):
             for dz in (-1, 0, 1):
                 other = voxel - dx * stride_x - dy * stride_y - dz
-                known = wave.d2[other]
+                known = d2[other]
                 if known < 0 or known == FAR_D2 or other == voxel:
                     continue
-                ox, oy, oz = wave.offset[other]
+                ox, oy, oz = np.int64(offset[other, 0]), np.int64(offset[other, 1]), np.int64(offset[other, 2])
                 if ox * dx < 0 or oy * dy < 0 or oz * dz < 0:
                     continue
-                px, py, pz = np.int64(ox + dx), np.int64(oy + dy), np.int64(oz + dz)
+                px, py, pz = ox + dx, oy + dy, oz + dz
                 reach = px * px + py * py + pz * pz
                 if reach < best or (reach == best and (px, py, pz) > (bx, by, bz)):
                     best, bx, by, bz = reach, px, py, pz
@@ -177,21 +177,20 @@ def _handed_on(wave, voxel, max_d2):  # noqa: ANN001, ANN202
 
 
 @compiled()
-def _resting(wave, voxel, known, ox, oy, oz, stack, depth):  # noqa: ANN001, ANN202, PLR0917
+def _resting(d2, offset, shape, voxel, known, ox, oy, oz, stack, depth):  # noqa: ANN001, ANN202, PLR0917
     """Push the neighbours that have the obstacle which `voxel`, of former distance and offset, may have handed on."""
     if known < 0 or known == FAR_D2:
         return stack, depth
-    stride_x, stride_y = wave.shape[1] * wave.shape[2], wave.shape[2]
+    stride_x, stride_y = shape[1] * shape[2], shape[2]
     if depth + 26 > len(stack):
         stack = np.concatenate((stack, np.empty_like(stack)))
     for dx in range(-1 if ox <= 0 else 0, 2 if ox >= 0 else 1):
         for dy in range(-1 if oy <= 0 else 0, 2 if oy >= 0 else 1):
             for dz in range(-1 if oz <= 0 else 0, 2 if oz >= 0 else 1):
                 other = voxel + dx * stride_x + dy * stride_y + dz
-                if wave.d2[other] <= 0 or wave.d2[other] == FAR_D2:
+                if d2[other] <= 0 or d2[other] == FAR_D2:
                     continue
-                px, py, pz = wave.offset[other]
-                if px == ox + dx and py == oy + dy and pz == oz + dz:
+                if offset[other, 0] == ox + dx and offset[other, 1] == oy + dy and offset[other, 2] == oz + dz:
                     stack[depth] = other
                     depth += 1
     return stack, depth
@@ -200,6 +199,7 @@ def _resting(wave, voxel, known, ox, oy, oz, stack, depth):  # noqa: ANN001, ANN
 @compiled()
 def _raise(wave, changed, rim):  # noqa: ANN001, ANN202
     """Withdraw the values of changed voxels, and all that rested on them."""
+    label, d2, offset, listed, touched, _, _, _, counts, shape = wave
     stack = np.empty(4096, np.int64)
     for n in range(len(changed)):
         stack[0] = changed[n]
@@ -207,93 +207,106 @@ def _raise(wave, changed, rim):  # noqa: ANN001, ANN202
         while depth > 0:
             depth -= 1
             voxel = stack[depth]
-            if wave.listed[voxel] != NEW:
+            if listed[voxel] != NEW:
                 continue
-            if _in_rim(wave, voxel, rim):
-                wave.counts[LEFT] += 1
+            if _in_rim(shape, voxel, rim):
+                counts[LEFT] += 1
                 continue
-            _touch(wave, voxel)
-            known = wave.d2[voxel]
-            ox, oy, oz = (
-                np.int64(wave.offset[voxel, 0]),
-                np.int64(wave.offset[voxel, 1]),
-                np.int64(wave.offset[voxel, 2]),
-            )
-            wave.d2[voxel] = FAR_D2 if wave.label[voxel] == FREE else UNKNOWN_D2
-            wave.offset[voxel] = 0
-            stack, depth = _resting(wave, voxel, known, ox, oy, oz, stack, depth)
+            _touch(listed, touched, counts, voxel)
+            known = d2[voxel]
+            ox, oy, oz = np.int64(offset[voxel, 0]), np.int64(offset[voxel, 1]), np.int64(offset[voxel, 2])
+            d2[voxel] = FAR_D2 if label[voxel] == FREE else UNKNOWN_D2
+            offset[voxel] = 0
+            stack, depth = _resting(d2, offset, shape, voxel, known, ox, oy, oz, stack, depth)
 
 
 @compiled()
 def _settle(wave, max_d2):  # noqa: ANN001, ANN202
     """Obstacles are at distance zero; what was withdrawn takes what its neighbours hand on."""
-    count = wave.counts[TOUCHED]
-    wave.counts[LEVEL] = max_d2
+    label, d2, offset, listed, touched, before, after, head, counts, shape = wave
+    count = counts[TOUCHED]
+    counts[LEVEL] = max_d2
     for n in range(count):
-        voxel = wave.touched[n]
-        if wave.label[voxel] == OCCUPIED:
-            wave.d2[voxel] = 0
-            _queue(wave, voxel)
+        voxel = touched[n]
+        if label[voxel] == OCCUPIED:
+            d2[voxel] = 0
+            _queue(d2, listed, before, after, head, counts, voxel)
     for n in range(count):
-        voxel = wave.touched[n]
-        if wave.label[voxel] == FREE:
-            best, bx, by, bz = _handed_on(wave, voxel, max_d2)
-            wave.d2[voxel] = best
-            wave.offset[voxel, 0], wave.offset[voxel, 1], wave.offset[voxel, 2] = bx, by, bz
+        voxel = touched[n]
+        if label[voxel] == FREE:
+            best, bx, by, bz = _handed_on(d2, offset, shape, voxel, max_d2)
+            d2[voxel] = best
+            offset[voxel, 0], offset[voxel, 1], offset[voxel, 2] = bx, by, bz
             if best != FAR_D2:
-                _queue(wave, voxel)
+                _queue(d2, listed, before, after, head, counts, voxel)
 
 
 @compiled()
 def _lower(wave, rim, max_d2):  # noqa: ANN001, ANN202
-    """In order of distance, each voxel hands its obstacle on."""
-    stride_x, stride_y = wave.shape[1] * wave.shape[2], wave.shape[2]
+    """In order of distance, each voxel hands its obstacle on.
+
+    A voxel that is nearer to that obstacle takes it unasked: whatever else its neighbours have for it is no nearer, or
+    is handed on when its turn comes.
+    """
+    label, d2, offset, listed, touched, before, after, head, counts, shape = wave
+    stride_x, stride_y = shape[1] * shape[2], shape[2]
     stack = np.empty(4096, np.int64)
-    while wave.counts[LEVEL] <= max_d2:
-        voxel = np.int64(wave.head[wave.counts[LEVEL]])
+    while counts[LEVEL] <= max_d2:
+        voxel = np.int64(head[counts[LEVEL]])
         if voxel < 0:
-            wave.counts[LEVEL] += 1
+            counts[LEVEL] += 1
             continue
-        _unqueue(wave, voxel)
-        ox, oy, oz = np.int64(wave.offset[voxel, 0]), np.int64(wave.offset[voxel, 1]), np.int64(wave.offset[voxel, 2])
+        _unqueue(d2, listed, before, after, head, voxel)
+        ox, oy, oz = np.int64(offset[voxel, 0]), np.int64(offset[voxel, 1]), np.int64(offset[voxel, 2])
         for dx in range(-1 if ox <= 0 else 0, 2 if ox >= 0 else 1):
             for dy in range(-1 if oy <= 0 else 0, 2 if oy >= 0 else 1):
                 for dz in range(-1 if oz <= 0 else 0, 2 if oz >= 0 else 1):
                     other = voxel + dx * stride_x + dy * stride_y + dz
                     px, py, pz = ox + dx, oy + dy, oz + dz
                     reach = px * px + py * py + pz * pz
-                    known = wave.d2[other]
-                    if wave.label[other] != FREE or reach > max_d2 or reach > known:
+                    known = d2[other]
+                    if reach > known or reach > max_d2 or label[other] != FREE:
                         continue
-                    qx, qy, qz = wave.offset[other]
-                    if reach == known and (px, py, pz) <= (np.int64(qx), np.int64(qy), np.int64(qz)):
+                    qx, qy, qz = np.int64(offset[other, 0]), np.int64(offset[other, 1]), np.int64(offset[other, 2])
+                    if reach == known and (px, py, pz) <= (qx, qy, qz):
                         continue
-                    stack = _look_again(wave, other, rim, max_d2, stack)
+                    if _in_rim(shape, other, rim):
+                        counts[LEFT] += 1
+                        continue
+                    _touch(listed, touched, counts, other)
+                    _unqueue(d2, listed, before, after, head, other)
+                    d2[other] = reach
+                    offset[other, 0], offset[other, 1], offset[other, 2] = px, py, pz
+                    _queue(d2, listed, before, after, head, counts, other)
+                    stack, depth = _resting(d2, offset, shape, other, known, qx, qy, qz, stack, 0)
+                    if depth:
+                        stack = _look_again(wave, rim, max_d2, stack, depth)
 
 
 @compiled()
-def _look_again(wave, start, rim, max_d2, stack):  # noqa: ANN001, ANN202
-    """Give a voxel what its neighbours hand on; where that is news, look again at what rested on its former value."""
-    stack[0] = start
-    depth = 1
+def _look_again(wave, rim, max_d2, stack, depth):  # noqa: ANN001, ANN202
+    """Give the first `depth` voxels of a stack what their neighbours hand on; where that is news, look again at what
+    rested on the former value.
+    """
+    _, d2, offset, listed, touched, before, after, head, counts, shape = wave
     while depth > 0:
         depth -= 1
         voxel = stack[depth]
-        best, bx, by, bz = _handed_on(wave, voxel, max_d2)
-        known = wave.d2[voxel]
-        ox, oy, oz = np.int64(wave.offset[voxel, 0]), np.int64(wave.offset[voxel, 1]), np.int64(wave.offset[voxel, 2])
+        best, bx, by, bz = _handed_on(d2, offset, shape, voxel, max_d2)
+        known = d2[voxel]
+        ox, oy, oz = np.int64(offset[voxel, 0]), np.int64(offset[voxel, 1]), np.int64(offset[voxel, 2])
         if best == known and bx == ox and by == oy and bz == oz:
             continue
-        if _in_rim(wave, voxel, rim):
-            wave.counts[LEFT] += 1
+        if _in_rim(shape, voxel, rim):
+            counts[LEFT] += 1
             continue
-        _touch(wave, voxel)
-        _unqueue(wave, voxel)
-        wave.d2[voxel] = best
-        wave.offset[voxel, 0], wave.offset[voxel, 1], wave.offset[voxel, 2] = bx, by, bz
+        _touch(listed, touched, counts, voxel)
+        _unqueue(d2, listed, before, after, head, voxel)
+        d2[voxel] = best
+        offset[voxel, 0], offset[voxel, 1], offset[voxel, 2] = bx, by, bz
         if best != FAR_D2:
-            _queue(wave, voxel)
-        stack, depth = _resting(wave, voxel, known, ox, oy, oz, stack, depth)
+            _queue(d2, listed, before, after, head, counts, voxel)
+        stack, depth = _resting(d2, offset, shape, voxel, known, ox, oy, oz, stack, depth)
     return stack
 
 
@@ -355,19 +368,23 @@ def _basis_points(label, d2, offset, i, j, k, l1, cosine):  # noqa: ANN001, ANN2
 
 
 @compiled()
-def renew_voronoi(label, d2, offset, basis, touched, min_d2, l1, cosine):  # noqa: ANN001, ANN201, PLR0917
-    """Recompute `basis` of the voxels (n, 3) and their neighbours in place: 0 off the GVD, else its basis points."""
-    done = np.zeros(label.shape, np.bool_)
+def renew_voronoi(label, d2, offset, basis, low, touched, min_d2, l1, cosine):  # noqa: ANN001, ANN201, PLR0917
+    """Recompute `basis` of the voxels (n, 3) and their neighbours in place: 0 off the GVD, else its basis points.
+
+    `basis` begins at the voxel `low` of the window.
+    """
+    done = np.zeros(basis.shape, np.bool_)
     for n in range(len(touched)):
         for dx in (-1, 0, 1):
             for dy in (-1, 0, 1):
                 for dz in (-1, 0, 1):
                     i, j, k = touched[n, 0] + dx, touched[n, 1] + dy, touched[n, 2] + dz
-                    if done[i, j, k]:
+                    a, b, c = i - low[0], j - low[1], k - low[2]
+                    if done[a, b, c]:
                         continue
-                    done[i, j, k] = True
-                    basis[i, j, k] = 0
+                    done[a, b, c] = True
+                    basis[a, b, c] = 0
                     if label[i, j, k] != FREE or d2[i, j, k] == FAR_D2 or d2[i, j, k] <= min_d2:
                         continue
                     if _on_gvd(label, d2, offset, i, j, k, min_d2, l1, cosine):
-                        basis[i, j, k] = _basis_points(label, d2, offset, i, j, k, l1, cosine)
+                        basis[a, b, c] = _basis_points(label, d2, offset, i, j, k, l1, cosine)

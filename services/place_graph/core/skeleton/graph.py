@@ -1,5 +1,6 @@
 """Places with lasting ids and the edges between them, updated inside a region of the map (pure)."""
 
+import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -12,6 +13,7 @@ from prior_sg.services.place_graph.core.skeleton.links import (
     joined,
     lenses,
     line_d2,
+    near_pairs,
     nearest,
     thinned,
 )
@@ -74,6 +76,12 @@ class _Sight:
     d2: np.ndarray
     box: Box
 
+    def over(self, box: Box, grid: VoxelGrid) -> "_Sight":
+        """One that holds `box`: this, if it does."""
+        if (box.low >= self.box.low).all() and (box.high <= self.box.high).all():
+            return self
+        return _Sight(grid.gather("d2", box, UNKNOWN_D2), box)
+
     def observed(self, voxel: Voxel) -> bool:
         """Whether a voxel of the window was observed."""
         return bool(self.d2[tuple(np.array(voxel) - self.box.low)] != UNKNOWN_D2)
@@ -100,17 +108,17 @@ class PlaceGraph:
 
         Distances have changed inside `changed` only.
         """
-        window = region.grown(self._reach_voxels).clipped(grid.bounds)
-        sight = _Sight(grid.gather("d2", window, UNKNOWN_D2), window)
+        sight = _Sight(extraction.field_d2, extraction.box)
         changes = Changes()
-        before = {place_id: self.places[place_id].voxel for place_id in self.within(region)}
-        id_of, gone = self._replace(extraction, region, sight, changes)
+        old_ids = self.within(region)
+        before = {place_id: self.places[place_id].voxel for place_id in old_ids}
+        id_of, gone = self._replace(old_ids, extraction, region, sight, changes)
         self._retire(gone, extraction, id_of, sight, changes)
         stirred = self._touch(region, extraction, id_of) | (changes.touched & self.places.keys())
         ends = [before[place_id] for place_id in sorted(changes.touched & before.keys())]  # gone, or moved from there
         left = np.array(ends, np.int64).reshape(-1, 3)
-        voxels = np.concatenate((self._voxels(sorted(stirred)), [changed.low, changed.high - 1], left))
-        self._relink(Box(voxels.min(axis=0), voxels.max(axis=0) + 1), grid, changes)
+        voxels = np.concatenate((self.voxels(sorted(stirred)), [changed.low, changed.high - 1], left))
+        self._relink(Box.around(voxels), grid, sight, changes)
         return changes
 
     @property
@@ -139,32 +147,30 @@ class PlaceGraph:
         return int(np.ceil(max(self.rules.reach, 3 * self.rules.cell)))
 
     def _replace(
-        self, extraction: Extraction, region: Box, sight: _Sight, changes: Changes
+        self, old_ids: list[int], extraction: Extraction, region: Box, sight: _Sight, changes: Changes
     ) -> tuple[dict[int, int], list[int]]:
-        """Give the extracted places of `region` their old ids, or new ones.
+        """Give the extracted places of `region` its old ids, or new ones.
 
-        Returns the id of every extracted place that has one, and the old ids of `region` that nothing took over.
+        Returns the id of every extracted place that has one, and the old ids that nothing took over.
         """
-        old_ids = self.within(region)
         inside = region.contains(extraction.voxels)
         new = np.flatnonzero(inside)
         frozen = np.array([i in self.frozen for i in old_ids], np.bool_)
-        matched = _match(self._voxels(old_ids), extraction.voxels[new], frozen, self.rules, sight)
+        matched = _match(self.voxels(old_ids), extraction.voxels[new], frozen, self.rules, sight)
+        places = _places_of(extraction, new)
         id_of: dict[int, int] = {}
         for position, index in enumerate(new.tolist()):
             if position in matched:
                 id_of[index] = old_ids[matched[position]]
             else:
                 id_of[index], self._next_id = self._next_id, self._next_id + 1
-            x, y, z = extraction.voxels[index].tolist()
-            i, j, k = extraction.shifts[index].tolist()
-            d2, free_d2 = float(extraction.d2[index]), float(extraction.free_d2[index])
-            place = Place((x, y, z), d2, free_d2, int(extraction.basis[index]), (i, j, k))
+            place = places[position]
             if self.places.get(id_of[index]) != place:
                 changes.touched.add(id_of[index])
                 self._put(id_of[index], place)
-        for index in np.flatnonzero(~inside).tolist():
-            outside = self._id_at(extraction.voxels[index])
+        others = np.flatnonzero(~inside)
+        for index, (x, y, z) in zip(others.tolist(), extraction.voxels[others].tolist(), strict=True):
+            outside = self._id_at((x, y, z))
             if outside is not None:
                 id_of[index] = outside
         self.frozen.difference_update(id_of.values())
@@ -206,22 +212,26 @@ class PlaceGraph:
         for place_id, others in before.items():
             for other in others - inside:
                 self._touching[other].discard(place_id)
-        for one, two in extraction.touching.tolist():
+        here = region.contains(extraction.voxels)[extraction.touching].any(axis=1)
+        for one, two in extraction.touching[here].tolist():
             a, b = id_of.get(one), id_of.get(two)
             if a is not None and b is not None and (a in inside or b in inside):
                 self._touching.setdefault(a, set()).add(b)
                 self._touching.setdefault(b, set()).add(a)
         return {place_id for place_id, others in before.items() if others != self._touching.get(place_id, set())}
 
-    def _relink(self, region: Box, grid: VoxelGrid, changes: Changes) -> None:
+    def _relink(self, region: Box, grid: VoxelGrid, sight: _Sight, changes: Changes) -> None:
         """Renew the edges that a change inside `region` may concern."""
         farther = self._margin or int(np.ceil(self.rules.reach))  # witnesses, or rivals where their number is limited
         window = region.grown(self._reach_voxels + farther).clipped(grid.bounds)
         ids = [i for i in self.within(window) if i not in self.frozen]
+        if not ids:
+            return
         index = {place_id: n for n, place_id in enumerate(ids)}
-        sight = _Sight(grid.gather("d2", window, UNKNOWN_D2), window)
-        renewed = self._links_within(ids, index, region, sight)
-        for pair in self._concerned(ids, index, region):
+        voxels = self.voxels(ids)
+        sight = sight.over(Box.around(voxels), grid)
+        renewed = self._links_within(ids, index, voxels, region, sight)
+        for pair in self._concerned(ids, index, voxels, region):
             renewed.setdefault(pair, 0)
         for (a, b), clearance in renewed.items():
             if self.edges.get(a, {}).get(b, 0) != clearance:
@@ -232,15 +242,28 @@ class PlaceGraph:
                 else:
                     del self.edges[one][two]
 
-    def _concerned(self, ids: list[int], index: Mapping[int, int], region: Box) -> list[tuple[int, int]]:
+    def _concerned(
+        self, ids: list[int], index: Mapping[int, int], voxels: np.ndarray, region: Box
+    ) -> list[tuple[int, int]]:
         """Known edges, smaller id first, that a change inside `region` may concern."""
-        ends = ((a, b) for a in ids for b in self.edges.get(a, ()) if b not in self.frozen)
-        pairs = sorted({(min(pair), max(pair)) for pair in ends})
-        far = sorted({i for pair in pairs for i in pair if i not in index})  # from before an end moved
-        rows = {**index, **{place_id: len(ids) + n for n, place_id in enumerate(far)}}
-        where = np.array([(rows[a], rows[b]) for a, b in pairs], np.int64).reshape(-1, 2)
-        found = concerned(self._voxels(ids + far), where, *region, self.rules.reach**2, self._margin)
-        return [pairs[n] for n in np.flatnonzero(found).tolist()]
+        rows = dict(index)
+        all_ids = list(ids)  # and places outside: from before an end moved
+        ends: list[int] = []
+        for one, a in enumerate(ids):
+            for b in self.edges.get(a, ()):
+                two = rows.get(b)
+                if two is None:
+                    if b in self.frozen:
+                        continue
+                    two = rows[b] = len(all_ids)
+                    all_ids.append(b)
+                if two > one:
+                    ends += (one, two)
+        pairs = np.array(ends, np.int64).reshape(-1, 2)
+        voxels = np.concatenate((voxels, self.voxels(all_ids[len(ids) :])))
+        found = pairs[concerned(voxels, pairs, *region, self.rules.reach**2, self._margin)]
+        known = ((all_ids[one], all_ids[two]) for one, two in found.tolist())
+        return sorted((min(pair), max(pair)) for pair in known)
 
     @property
     def _margin(self) -> int:
@@ -249,15 +272,16 @@ class PlaceGraph:
         return self._reach_voxels if limited else 0
 
     def _links_within(
-        self, ids: list[int], index: Mapping[int, int], region: Box, sight: _Sight
+        self, ids: list[int], index: Mapping[int, int], voxels: np.ndarray, region: Box, sight: _Sight
     ) -> dict[tuple[int, int], int]:
         """Squared clearance of the edges, smaller id first, that a change inside `region` may concern."""
-        touching = np.zeros((len(ids), len(ids)), np.bool_)
-        for place_id in ids:
+        flags = bytearray(len(ids) ** 2)
+        for row, place_id in enumerate(ids):
             for other in self._touching.get(place_id, ()):
                 if other in index:
-                    touching[index[place_id], index[other]] = True
-        voxels = self._voxels(ids) - sight.box.low
+                    flags[row * len(ids) + index[other]] = 1
+        touching = np.frombuffer(flags, np.bool_).reshape(len(ids), len(ids))
+        voxels = voxels - sight.box.low
         rules, low, high = self.rules, region.low - sight.box.low, region.high - sight.box.low
         limits = rules.edge**2, rules.reach**2, rules.free**2
         if not self._margin:
@@ -278,29 +302,36 @@ class PlaceGraph:
         ends = zip(pairs.tolist(), clearances.tolist(), strict=True)
         return {(ids[one], ids[two]): int(clearance) for (one, two), clearance in ends}
 
-    def _voxels(self, ids: list[int]) -> np.ndarray:
-        return np.array([self.places[i].voxel for i in ids], np.int64).reshape(-1, 3)
+    def voxels(self, ids: list[int]) -> np.ndarray:
+        """Voxels (n, 3) at the centres of places."""
+        flat = itertools.chain.from_iterable([self.places[i].voxel for i in ids])
+        return np.fromiter(flat, np.int64, 3 * len(ids)).reshape(-1, 3)
 
     def within(self, box: Box) -> list[int]:
         """Ids of the places whose centre lies in `box`, ascending."""
         low = np.floor_divide(box.low, self.rules.cell)
         high = np.floor_divide(box.high - 1, self.rules.cell) + 1
         found: list[int] = []
-        for x in range(int(low[0]), int(high[0])):
-            for y in range(int(low[1]), int(high[1])):
-                for z, ids in self._columns.get((x, y), {}).items():
-                    if low[2] <= z < high[2]:
-                        found.extend(ids)
+        (x_low, y_low, z_low), (x_high, y_high, z_high) = low.tolist(), high.tolist()
+        if (x_high - x_low) * (y_high - y_low) < len(self._columns):
+            around = itertools.product(range(x_low, x_high), range(y_low, y_high))
+            columns = [column for at in around if (column := self._columns.get(at)) is not None]
+        else:
+            items = self._columns.items()
+            columns = [column for (x, y), column in items if x_low <= x < x_high and y_low <= y < y_high]
+        for column in columns:
+            for z, ids in column.items():
+                if z_low <= z < z_high:
+                    found.extend(ids)
         if not (np.concatenate(box) % self.rules.cell).any():
             return sorted(found)
-        return sorted(np.array(found, np.int64)[box.contains(self._voxels(found))].tolist())
+        return sorted(np.array(found, np.int64)[box.contains(self.voxels(found))].tolist())
 
-    def _id_at(self, voxel: np.ndarray) -> int | None:
+    def _id_at(self, voxel: Voxel) -> int | None:
         """The place with exactly this centre."""
-        center = (int(voxel[0]), int(voxel[1]), int(voxel[2]))
-        x, y, z = self._cell(center)
+        x, y, z = self._cell(voxel)
         for place_id in self._columns.get((x, y), {}).get(z, ()):
-            if self.places[place_id].voxel == center:
+            if self.places[place_id].voxel == voxel:
                 return place_id
         return None
 
@@ -334,6 +365,13 @@ class PlaceGraph:
             del self._columns[x, y]
 
 
+def _places_of(extraction: Extraction, rows: np.ndarray) -> list[Place]:
+    """The extracted places of these rows (n,)."""
+    columns = (extraction.voxels, extraction.d2, extraction.free_d2, extraction.basis, extraction.shifts)
+    found = zip(*(column[rows].tolist() for column in columns), strict=True)
+    return [Place((x, y, z), d2, free_d2, basis, (i, j, k)) for (x, y, z), d2, free_d2, basis, (i, j, k) in found]
+
+
 def _match(
     old_voxels: np.ndarray, new_voxels: np.ndarray, frozen: np.ndarray, rules: GraphRules, sight: _Sight
 ) -> dict[int, int]:
@@ -341,17 +379,12 @@ def _match(
 
     What lies between a `frozen` place and a new one is not known: they are one if they would merge.
     """
-    cell_voxels = rules.cell
-    squared = ((old_voxels[:, None] - new_voxels[None]) ** 2).sum(axis=2)
-    same_cell = (old_voxels[:, None] // cell_voxels == new_voxels[None] // cell_voxels).all(axis=2)
-    rows, columns = np.nonzero(same_cell | (squared <= cell_voxels**2))
-    order = np.lexsort((columns, rows, squared[rows, columns]))
     matched: dict[int, int] = {}
     taken: set[int] = set()
-    for row, column in zip(rows[order].tolist(), columns[order].tolist(), strict=True):
+    for squared, row, column in sorted(near_pairs(old_voxels, new_voxels, rules.cell).tolist()):
         if row in taken or column in matched:
             continue
-        near = squared[row, column] <= rules.merge**2 if frozen[row] else squared[row, column] == 0
+        near = squared <= rules.merge**2 if frozen[row] else squared == 0
         if not near and not sight.clear(old_voxels[row], new_voxels[column]):
             continue
         matched[column] = row

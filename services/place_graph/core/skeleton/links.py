@@ -38,6 +38,28 @@ def line_d2(d2, start, stop):  # noqa: ANN001, ANN201
 
 
 @compiled()
+def near_pairs(old, new, cell):  # noqa: ANN001, ANN201
+    """Places (n, 3) and (m, 3) in one cell or at most a cell's side apart: (pair, 3) squared distance, row of each."""
+    found, count = np.empty((8 * len(new) + 16, 3), np.int64), 0
+    for one in range(len(old)):
+        for two in range(len(new)):
+            x, y, z = old[one, 0] - new[two, 0], old[one, 1] - new[two, 1], old[one, 2] - new[two, 2]
+            squared = x * x + y * y + z * z
+            if squared > cell * cell and not (
+                max(abs(x), abs(y), abs(z)) < cell
+                and old[one, 0] // cell == new[two, 0] // cell
+                and old[one, 1] // cell == new[two, 1] // cell
+                and old[one, 2] // cell == new[two, 2] // cell
+            ):
+                continue
+            if count == len(found):
+                found = np.concatenate((found, np.empty_like(found)))
+            found[count, 0], found[count, 1], found[count, 2] = squared, one, two
+            count += 1
+    return found[:count]
+
+
+@compiled()
 def clear_lines(d2, voxels, touching, edge_d2, reach_d2, free_d2):  # noqa: ANN001, ANN201, PLR0917
     """Squared clearance (n, n) of the admissible lines between places (n, 3) of a window; 0 = no line.
 

@@ -8,7 +8,7 @@ only.
 import numpy as np
 
 from prior_sg.services.compiled import compiled
-from prior_sg.services.place_graph.core.volume.grid import BLOCK, FREE, OCCUPIED, UNOBSERVED, Box, VoxelGrid
+from prior_sg.services.place_graph.core.volume.grid import BLOCK, FREE, OCCUPIED, UNOBSERVED, VoxelGrid
 
 
 def renew_labels(fine: VoxelGrid, coarse: VoxelGrid, changed: np.ndarray, scale: int) -> np.ndarray:
@@ -18,27 +18,34 @@ def renew_labels(fine: VoxelGrid, coarse: VoxelGrid, changed: np.ndarray, scale:
     """
     found: list[np.ndarray] = []
     listed = np.empty(((BLOCK // scale) ** 3, 3), np.int64)
-    for x, y, z in _blocks_of(changed):
-        label = fine.gather("label", Box(np.array((x, y, z)) * BLOCK, np.array((x + 1, y + 1, z + 1)) * BLOCK))
+    for x, y, z in sorted(set(map(tuple, _blocks_of(changed).tolist()))):
+        changed_block = fine.block((x, y, z))
+        assert changed_block is not None
         key = (x // scale, y // scale, z // scale)
         block = coarse.block(key)
         if block is None:
             block = coarse.blank()
             coarse.insert(key, block)
         corner = np.array((x % scale, y % scale, z % scale), np.int64) * (BLOCK // scale)
-        count = _renew_block(label, block.label, corner, scale, listed)
+        count = _renew_block(changed_block.label, block.label, corner, scale, listed)
         if count:
             found.append(listed[:count] + np.array(key, np.int64) * BLOCK)
     return np.concatenate(found) if found else np.empty((0, 3), np.int64)
 
 
-def _blocks_of(voxels: np.ndarray) -> list[list[int]]:
-    """Blocks that hold the voxels (n, 3), once each, ascending; voxels come block by block."""
-    keys = voxels // BLOCK
-    first = np.ones(len(keys), np.bool_)
-    first[1:] = (keys[1:] != keys[:-1]).any(axis=1)
-    found: list[list[int]] = np.unique(keys[first], axis=0).tolist()
-    return found
+@compiled()
+def _blocks_of(voxels):  # noqa: ANN001, ANN202
+    """Blocks (m, 3) that hold the voxels (n, 3), once for each run of voxels of one block."""
+    found, count = np.empty((64, 3), np.int64), 0
+    for n in range(len(voxels)):
+        x, y, z = voxels[n, 0] // BLOCK, voxels[n, 1] // BLOCK, voxels[n, 2] // BLOCK
+        if count and x == found[count - 1, 0] and y == found[count - 1, 1] and z == found[count - 1, 2]:
+            continue
+        if count == len(found):
+            found = np.concatenate((found, np.empty_like(found)))
+        found[count, 0], found[count, 1], found[count, 2] = x, y, z
+        count += 1
+    return found[:count]
 
 
 @compiled()

@@ -6,11 +6,13 @@ the map does not change by it. When even the compressed blocks exceed the bound,
 
 import itertools
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
+
+from prior_sg.services.compiled import compiled
 
 BLOCK = 16  # voxels along one side of a block
 UNOBSERVED, FREE, OCCUPIED = 0, 1, 2
@@ -36,11 +38,27 @@ class Box(NamedTuple):
         """Whether each voxel (..., 3) lies inside."""
         return np.all((voxels >= self.low) & (voxels < self.high), axis=-1)
 
+    @staticmethod
+    def around(voxels: np.ndarray) -> "Box":
+        """The smallest box that holds all voxels (n, 3), n > 0."""
+        return Box(*_extent(voxels))
+
     @property
     def shape(self) -> tuple[int, int, int]:
         """Voxels along each axis, never negative."""
         size = np.maximum(self.high - self.low, 0)
         return int(size[0]), int(size[1]), int(size[2])
+
+
+@compiled()
+def _extent(voxels):  # noqa: ANN001, ANN202
+    low, high = voxels[0].copy(), voxels[0] + 1
+    for axis in range(3):
+        least = greatest = voxels[0, axis]
+        for n in range(len(voxels)):
+            least, greatest = min(least, voxels[n, axis]), max(greatest, voxels[n, axis])
+        low[axis], high[axis] = least, greatest + 1
+    return low, high
 
 
 def _cube(dtype: str, fill: int = 0) -> np.ndarray:
@@ -121,7 +139,9 @@ class VoxelGrid:
 
         Returns the keys of the dropped blocks. The limit counts open blocks too, which are never dropped.
         """
-        keys = list(self.blocks)
+        low, high = self.bounds
+        farthest = np.linalg.norm(np.maximum(np.abs(low - center), np.abs(high - center)))
+        keys = list(self.blocks) if farthest > radius else []
         distances = np.linalg.norm((np.array(keys).reshape(-1, 3) + 0.5) * BLOCK - center, axis=1)
         for index in np.flatnonzero(distances > radius).tolist():
             data = self._squeezed(self.blocks.pop(keys[index]))
@@ -136,22 +156,30 @@ class VoxelGrid:
 
     def gather(self, name: str, box: Box, fill: int = 0) -> np.ndarray:
         """Dense copy of one field inside `box`; `fill` where there is no block."""
-        sample = getattr(_EMPTY, name)
-        window = np.full((*box.shape, *sample.shape[3:]), fill, sample.dtype)
-        for block, outer, inner in self._overlaps(box):
-            window[outer] = getattr(block, name)[inner]
-        return window
+        return self.gather_all({name: fill}, box)[0]
 
-    def scatter(self, name: str, box: Box, window: np.ndarray) -> None:
-        """Write one field inside `box` back; voxels without a block are left out."""
+    def gather_all(self, fills: Mapping[str, int], box: Box) -> list[np.ndarray]:
+        """Dense copies of several fields inside `box`, in the order of `fills`."""
+        windows = []
+        for name, fill in fills.items():
+            sample = getattr(_EMPTY, name)
+            windows.append(np.full((*box.shape, *sample.shape[3:]), fill, sample.dtype))
         for block, outer, inner in self._overlaps(box):
-            getattr(block, name)[inner] = window[outer]
+            for name, window in zip(fills, windows, strict=True):
+                window[outer] = getattr(block, name)[inner]
+        return windows
+
+    def scatter(self, windows: Mapping[str, np.ndarray], box: Box) -> None:
+        """Write fields inside `box` back; voxels without a block are left out."""
+        for block, outer, inner in self._overlaps(box):
+            for name, window in windows.items():
+                getattr(block, name)[inner] = window[outer]
 
     def forget(self, box: Box) -> None:
         """Nothing inside `box` was ever observed; blocks that hold nothing else are gone."""
-        for name in self.names:
-            sample = getattr(_EMPTY, name)
-            self.scatter(name, box, np.full((*box.shape, *sample.shape[3:]), sample[0, 0, 0], sample.dtype))
+        blank = {name: getattr(_EMPTY, name) for name in self.names}
+        blank = {name: np.broadcast_to(one[0, 0, 0], (*box.shape, *one.shape[3:])) for name, one in blank.items()}
+        self.scatter(blank, box)
         ends = zip((box.low // BLOCK).tolist(), (-(-box.high // BLOCK)).tolist(), strict=True)
         for x, y, z in itertools.product(*(range(low, high) for low, high in ends)):
             block = self.block((x, y, z))
@@ -184,12 +212,13 @@ class VoxelGrid:
 
     def _overlaps(self, box: Box) -> list[tuple[Block, Part, Part]]:
         """Blocks that meet `box`, each with its part of the window and its part of the block."""
-        axes = [_axis_overlaps(int(low), int(high)) for low, high in zip(box.low, box.high, strict=True)]
+        axes = [_axis_overlaps(low, high) for low, high in zip(box.low.tolist(), box.high.tolist(), strict=True)]
         found: list[tuple[Block, Part, Part]] = []
+        block_at = self.block if self._packed else self.blocks.get
         for bx, ox, ix in axes[0]:
             for by, oy, iy in axes[1]:
                 for bz, oz, iz in axes[2]:
-                    block = self.block((bx, by, bz))
+                    block = block_at((bx, by, bz))
                     if block is not None:
                         found.append((block, (ox, oy, oz), (ix, iy, iz)))
         return found

@@ -22,7 +22,6 @@ from prior_sg.services.place_graph.core.volume.grid import (
     FREE,
     OCCUPIED,
     UNOBSERVED,
-    BlockKey,
     Box,
     VoxelGrid,
 )
@@ -31,7 +30,6 @@ HALF_DIAGONAL = float(np.sqrt(3.0) / 2.0)
 FINENESS = 256  # integer weight of a measurement at the maximal range
 LARGEST = 2**30  # integer weight at which evidence fades for lack of bits
 ADD, REMOVE = 1, -1
-CORNERS = np.array(list(np.ndindex(2, 2, 2)), np.float64)
 TILE_PX = 8  # of the depth image, of which one knows the greatest depth
 SHARE_KNOWN = 0.2  # of a depth image that must lie in the known map to be judged by it
 
@@ -69,71 +67,52 @@ class Fusion:
         return np.array((*lengths, self.unit, heaviest, float(self.constant_weight)))
 
 
-def integrate(grid: VoxelGrid, view: View, fusion: Fusion, sign: int = ADD) -> np.ndarray:
-    """Fuse a depth image, or take it out again (`REMOVE`); return the voxels (n, 3) whose label changed."""
+def blocks_of(view: View, fusion: Fusion) -> np.ndarray:
+    """Blocks (n, 3) of which a depth image may say something, in a fixed order; a few too many, none too few.
+
+    Those that meet the viewing pyramid within range, and not behind all that the image shows there.
+    """
+    camera, world_from_camera, block_m = view.camera, view.world_from_camera, BLOCK * fusion.voxel_m
+    farthest_m = _farthest(view.depth_m, TILE_PX)
+    deepest_m = min(fusion.max_range_m, float(farthest_m.max(initial=0.0)) + fusion.truncation_m)
+    size = np.array((camera.width_px, camera.height_px))
+    focal, middle = np.array((camera.fx_px, camera.fy_px)), np.array((camera.cx_px, camera.cy_px))
+    slopes = (np.stack((np.zeros(2), size)) - 0.5 - middle) / focal  # (end, axis): x / z and y / z of its sides
+    corners = np.array([(x, y, 1.0) for x in slopes[:, 0] for y in slopes[:, 1]]) * deepest_m
+    points_world = transform(world_from_camera, np.concatenate((np.zeros((1, 3)), corners)))
+    low = np.floor(np.maximum(points_world.min(axis=0), world_from_camera[:3, 3] - fusion.max_range_m) / block_m)
+    high = np.floor(np.minimum(points_world.max(axis=0), world_from_camera[:3, 3] + fusion.max_range_m) / block_m) + 1
+    found = np.zeros((high - low).astype(np.int64), np.bool_)
+    lengths_m = np.array((block_m, fusion.min_range_m, fusion.max_range_m, deepest_m, fusion.truncation_m))
+    _mark_seen(found, low, inverse(world_from_camera), slopes, focal, middle, size, farthest_m, lengths_m)
+    return np.argwhere(found) + low.astype(np.int64)
+
+
+def integrate(grid: VoxelGrid, view: View, fusion: Fusion, blocks: np.ndarray, sign: int = ADD) -> np.ndarray:
+    """Fuse a depth image into some blocks (n, 3), or take it out again (`REMOVE`); return the voxels (m, 3) whose label
+    changed.
+    """
     camera_from_world = inverse(view.world_from_camera)
     camera, limits = view.camera, fusion.limits()
     lens = np.array((camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px))
     changed: list[np.ndarray] = []
     found = np.empty((BLOCK**3, 3), np.int64)
     spare = grid.blank()
-    keys = visible_blocks(camera, view.world_from_camera, fusion.voxel_m, fusion.max_range_m)
-    for key in seen_blocks(keys, view, fusion):
-        known = grid.block(key)
+    for x, y, z in blocks.tolist():
+        known = grid.block((x, y, z))
         if known is None and sign == REMOVE:
             continue
         block = spare if known is None else known
-        corner = np.array(key, np.int64) * BLOCK
+        corner = np.array((x, y, z), np.int64) * BLOCK
         touched, count = _integrate_block(
             block.sdf, block.weight, block.label, corner, view.depth_m, camera_from_world, lens, limits, sign, found
         )
         if touched and known is None:
-            grid.insert(key, spare)
+            grid.insert((x, y, z), spare)
             spare = grid.blank()
         if count:
             changed.append(found[:count].copy())
     return np.concatenate(changed) if changed else np.empty((0, 3), np.int64)
-
-
-def visible_blocks(
-    camera: Intrinsics, world_from_camera: np.ndarray, voxel_m: float, max_range_m: float
-) -> list[BlockKey]:
-    """Blocks that may meet the viewing pyramid within range, in a fixed order; a few too many, none too few."""
-    u = np.array((0, camera.width_px - 1)) - camera.cx_px
-    v = np.array((0, camera.height_px - 1)) - camera.cy_px
-    corners = np.array([(x / camera.fx_px, y / camera.fy_px, 1.0) for x in u for y in v]) * max_range_m
-    apex = np.zeros((1, 3))
-    points_world = transform(world_from_camera, np.concatenate((apex, corners)))
-    reach_low = np.maximum(points_world.min(axis=0), world_from_camera[:3, 3] - max_range_m)
-    reach_high = np.minimum(points_world.max(axis=0), world_from_camera[:3, 3] + max_range_m)
-    block_m = BLOCK * voxel_m
-    low, high = np.floor(reach_low / block_m).astype(int), np.floor(reach_high / block_m).astype(int) + 1
-    keys = np.stack(np.meshgrid(*map(np.arange, low, high), indexing="ij"), axis=-1).reshape(-1, 3)
-    centers = transform(inverse(world_from_camera), (keys + 0.5) * block_m)
-    radius_m = HALF_DIAGONAL * block_m
-    inside = (centers[:, 2] > -radius_m) & (np.linalg.norm(centers, axis=1) < max_range_m + radius_m)
-    for axis, slopes in ((0, u / camera.fx_px), (1, v / camera.fy_px)):
-        for slope, side in zip(slopes, (1.0, -1.0), strict=True):
-            distance = side * (centers[:, axis] - slope * centers[:, 2]) / np.hypot(1.0, slope)
-            inside &= distance > -radius_m
-    return [(int(x), int(y), int(z)) for x, y, z in keys[inside]]
-
-
-def seen_blocks(keys: list[BlockKey], view: View, fusion: Fusion) -> list[BlockKey]:
-    """Those of the blocks that the depth image may say something of: not the ones behind all that it shows there."""
-    if not keys:
-        return []
-    camera, block_m = view.camera, BLOCK * fusion.voxel_m
-    points = (np.array(keys, np.float64)[:, None] + CORNERS) * block_m
-    x, y, z = np.moveaxis(transform(inverse(view.world_from_camera), points.reshape(-1, 3)), -1, 0).reshape(3, -1, 8)
-    before = z.min(axis=1) > fusion.min_range_m  # the others are looked at voxel by voxel
-    z = np.where(before[:, None], z, 1.0)
-    u, v = camera.fx_px * x / z + camera.cx_px, camera.fy_px * y / z + camera.cy_px
-    ends = np.stack((u.min(axis=1), u.max(axis=1) + 1.0, v.min(axis=1), v.max(axis=1) + 1.0), axis=1)
-    size = np.array((camera.width_px, camera.width_px, camera.height_px, camera.height_px)) - 1
-    tiles = np.clip(np.floor(ends), 0, size).astype(np.int64) // TILE_PX
-    seen = ~before | _any_beyond(_farthest(view.depth_m, TILE_PX), tiles, z.min(axis=1) - fusion.truncation_m)
-    return [key for key, there in zip(keys, seen.tolist(), strict=True) if there]
 
 
 @compiled()
@@ -152,18 +131,69 @@ def _farthest(depth_m, side):  # noqa: ANN001, ANN202
 
 
 @compiled()
-def _any_beyond(farthest_m, tiles, nearest_m):  # noqa: ANN001, ANN202
-    """Whether any tile of each range (n, 4) of columns and rows holds a depth of at least `nearest_m` (n,)."""
-    found = np.zeros(len(tiles), np.bool_)
-    for n in range(len(tiles)):
-        for row in range(tiles[n, 2], tiles[n, 3] + 1):
-            for column in range(tiles[n, 0], tiles[n, 1] + 1):
-                if farthest_m[row, column] >= nearest_m[n] and farthest_m[row, column] > 0:
-                    found[n] = True
-                    break
-            if found[n]:
-                break
-    return found
+def _mark_seen(found, low, camera_from_world, slopes, focal, middle, size, farthest_m, lengths_m):  # noqa: ANN001, ANN202, PLR0917
+    """Mark the blocks from `low` on of which an image may say something, by the greatest depth of its tiles."""
+    block_m, min_range_m, max_range_m, deepest_m, truncation_m = lengths_m
+    radius_m = HALF_DIAGONAL * block_m
+    tilts = np.sqrt(1.0 + slopes * slopes)
+    m = camera_from_world
+    middle_m, ends = np.empty(3), np.empty((2, 2))
+    for i in range(found.shape[0]):
+        for j in range(found.shape[1]):
+            for k in range(found.shape[2]):
+                x, y, z = (low[0] + i) * block_m, (low[1] + j) * block_m, (low[2] + k) * block_m
+                half_m = 0.5 * block_m
+                for axis in range(3):
+                    middle_m[axis] = (
+                        m[axis, 0] * (x + half_m) + m[axis, 1] * (y + half_m) + m[axis, 2] * (z + half_m) + m[axis, 3]
+                    )
+                if middle_m[2] <= -radius_m or middle_m[2] >= deepest_m + radius_m:
+                    continue
+                if np.sqrt((middle_m * middle_m).sum()) >= max_range_m + radius_m:
+                    continue
+                inside = True
+                for axis in range(2):
+                    inside = (
+                        inside
+                        and middle_m[axis] - slopes[0, axis] * middle_m[2] > -radius_m * tilts[0, axis]
+                        and middle_m[axis] - slopes[1, axis] * middle_m[2] < radius_m * tilts[1, axis]
+                    )
+                if not inside:
+                    continue
+                nearest_m = np.inf
+                ends[0], ends[1] = np.inf, -np.inf
+                for corner in range(8):
+                    a = x + block_m * (corner & 1)
+                    b = y + block_m * ((corner >> 1) & 1)
+                    c = z + block_m * (corner >> 2)
+                    depth_m = m[2, 0] * a + m[2, 1] * b + m[2, 2] * c + m[2, 3]
+                    nearest_m = min(nearest_m, depth_m)
+                    if nearest_m <= min_range_m:
+                        break
+                    for axis in range(2):
+                        across_m = m[axis, 0] * a + m[axis, 1] * b + m[axis, 2] * c + m[axis, 3]
+                        pixel = focal[axis] * across_m / depth_m + middle[axis]
+                        ends[0, axis], ends[1, axis] = min(ends[0, axis], pixel), max(ends[1, axis], pixel + 1.0)
+                # One that reaches to before the image is looked at voxel by voxel.
+                found[i, j, k] = nearest_m <= min_range_m or _any_beyond(
+                    farthest_m, ends, size, nearest_m - truncation_m
+                )
+
+
+@compiled()
+def _any_beyond(farthest_m, ends, size, nearest_m):  # noqa: ANN001, ANN202
+    """Whether a tile that a range of pixels (end, axis) meets holds a depth of at least `nearest_m`."""
+    first_column, last_column = _tile(ends[0, 0], size[0]), _tile(ends[1, 0], size[0])
+    for row in range(_tile(ends[0, 1], size[1]), _tile(ends[1, 1], size[1]) + 1):
+        for column in range(first_column, last_column + 1):
+            if farthest_m[row, column] >= nearest_m and farthest_m[row, column] > 0:
+                return True
+    return False
+
+
+@compiled()
+def _tile(pixel, size):  # noqa: ANN001, ANN202
+    return int(min(max(np.floor(pixel), 0.0), size - 1.0)) // TILE_PX
 
 
 @compiled()
@@ -174,18 +204,20 @@ def _integrate_block(sdf, weight, label, corner, depth_m, camera_from_world, len
     height, width = depth_m.shape
     surface = surface_m / truncation_m
     touched = count = 0
+    m, size, range_m = camera_from_world, (width, height), (min_range_m, max_range_m)
     for i in range(BLOCK):
+        x = (corner[0] + i + 0.5) * voxel_m
         for j in range(BLOCK):
-            for k in range(BLOCK):
-                x = (corner[0] + i + 0.5) * voxel_m
-                y = (corner[1] + j + 0.5) * voxel_m
+            y = (corner[1] + j + 0.5) * voxel_m
+            xp, yp, zp = m[0, 0] * x + m[0, 1] * y, m[1, 0] * x + m[1, 1] * y, m[2, 0] * x + m[2, 1] * y
+            start, stop = _seen_part(xp, yp, zp, corner[2], m, voxel_m, lens, size, range_m)
+            for k in range(start, stop):
                 z = (corner[2] + k + 0.5) * voxel_m
-                m = camera_from_world
-                zc = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
+                zc = zp + m[2, 2] * z + m[2, 3]
                 if zc < min_range_m or zc > max_range_m:
                     continue
-                xc = m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]
-                yc = m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]
+                xc = xp + m[0, 2] * z + m[0, 3]
+                yc = yp + m[1, 2] * z + m[1, 3]
                 u = int(np.floor(fx * xc / zc + cx + 0.5))
                 v = int(np.floor(fy * yc / zc + cy + 0.5))
                 if u < 0 or v < 0 or u >= width or v >= height:
@@ -193,10 +225,10 @@ def _integrate_block(sdf, weight, label, corner, depth_m, camera_from_world, len
                 measured_m = depth_m[v, u]
                 if not measured_m > 0.0:
                     continue
-                range_m = np.sqrt(xc * xc + yc * yc + zc * zc)
-                if range_m > max_range_m:
+                apart_m = np.sqrt(xc * xc + yc * yc + zc * zc)
+                if apart_m > max_range_m:
                     continue
-                sdf_m = (measured_m / zc - 1.0) * range_m
+                sdf_m = (measured_m / zc - 1.0) * apart_m
                 if sdf_m < -truncation_m:
                     continue
                 gain = 1.0 if constant else 1.0 / (zc * zc)
@@ -224,6 +256,39 @@ def _integrate_block(sdf, weight, label, corner, depth_m, camera_from_world, len
                     changed[count, 2] = corner[2] + k
                     count += 1
     return touched, count
+
+
+@compiled()
+def _seen_part(xp, yp, zp, low, m, voxel_m, lens, size, range_m):  # noqa: ANN001, ANN202, PLR0917
+    """First and last plus one of the voxels of a row along z that may be in the image; a few too many, none too few.
+
+    What keeps a voxel out is a side of the viewing pyramid or an end of the range; both are linear along the row, of
+    which `xp`, `yp` and `zp` are the parts of its camera coordinates that x and y make.
+    """
+    fx, fy, cx, cy = lens
+    z = (low + 0.5) * voxel_m
+    xc, yc, zc = xp + m[0, 2] * z + m[0, 3], yp + m[1, 2] * z + m[1, 3], zp + m[2, 2] * z + m[2, 3]
+    dx, dy, dz = m[0, 2] * voxel_m, m[1, 2] * voxel_m, m[2, 2] * voxel_m
+    left, right, top, bottom = cx + 0.5, size[0] - cx - 0.5, cy + 0.5, size[1] - cy - 0.5
+    first, last = 0.0, BLOCK - 1.0
+    for at, step in (
+        (zc - range_m[0], dz),
+        (range_m[1] - zc, -dz),
+        (fx * xc + left * zc, fx * dx + left * dz),
+        (right * zc - fx * xc, right * dz - fx * dx),
+        (fy * yc + top * zc, fy * dy + top * dz),
+        (bottom * zc - fy * yc, bottom * dz - fy * dy),
+    ):
+        # Inside where at + k * step >= 0.
+        if step > 0.0:
+            first = max(first, -at / step - 1.0)
+        elif step < 0.0:
+            last = min(last, -at / step + 1.0)
+        elif at < -voxel_m:
+            return 0, 0
+    if last < first:  # also where a row that hardly leans to a side would cross it beyond all whole numbers
+        return 0, 0
+    return int(first), int(last) + 1
 
 
 def contradiction(grid: VoxelGrid, view: View, fusion: Fusion, samples: int = 48) -> float:
