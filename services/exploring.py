@@ -11,23 +11,32 @@ import numpy as np
 STOPS = 8  # openings after the first that are thought of
 DETOUR = 1.4  # a way between openings over the straight line
 LEAST_CHANCE = 1e-4
+LEAST_M = 0.01  # of a way by which a chance is divided: nobody stands nearer, even where no look is paid for
 
 
 def expected_metres(
-    distances_m: np.ndarray, points_m: np.ndarray, chances: np.ndarray, look_m: float, elsewhere_m: float
+    distances_m: np.ndarray,
+    points_m: np.ndarray,
+    chances: np.ndarray,
+    look_m: float,
+    elsewhere_m: float,
+    *,
+    firsts: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Expected metres (opening,) until the thing is found, if that opening comes first.
+    """Expected metres (first,) until the thing is found, if that one of the openings comes first; of all where no
+    `firsts` (first,) are named. The cost is by firsts and openings, the memory by openings.
 
     `distances_m` (opening,) is the way to each, inf = there is none; `points_m` (opening, 3) where they are; `chances`
     (opening,) that it is behind. `look_m` is walked behind each opening; `elsewhere_m` when it is behind none of the
     openings thought of.
     """
     chances = np.clip(chances, LEAST_CHANCE, 1.0)
-    between_m = DETOUR * np.linalg.norm(points_m[:, None] - points_m[None], axis=2)
-    found = np.full(len(chances), np.inf)
-    for first in np.flatnonzero(np.isfinite(distances_m)).tolist():
+    firsts = np.arange(len(chances)) if firsts is None else firsts
+    found = np.full(len(firsts), np.inf)
+    for row in np.flatnonzero(np.isfinite(distances_m[firsts])).tolist():
+        first = int(firsts[row])
         way_m = float(distances_m[first])
-        found[first] = _in_order(first, way_m, between_m, chances, look_m=look_m, elsewhere_m=elsewhere_m)
+        found[row] = _in_order(first, way_m, points_m, chances, look_m=look_m, elsewhere_m=elsewhere_m)
     return found
 
 
@@ -38,20 +47,21 @@ def chances_per_metre(distances_m: np.ndarray, chances: np.ndarray, look_m: floa
     To think further ahead, by the expected metres of whole orders, made searches of generated worlds no shorter
     (docs/evaluation.md).
     """
-    return np.asarray(np.maximum(chances, LEAST_CHANCE) / (distances_m + look_m))
+    return np.asarray(np.maximum(chances, LEAST_CHANCE) / np.maximum(distances_m + look_m, LEAST_M))
 
 
 def _in_order(
-    here: int, way_m: float, between_m: np.ndarray, chances: np.ndarray, *, look_m: float, elsewhere_m: float
+    here: int, way_m: float, points_m: np.ndarray, chances: np.ndarray, *, look_m: float, elsewhere_m: float
 ) -> float:
     """Expected metres of one order of openings, which begins at `here`."""
     waiting = np.ones(len(chances), dtype=bool)
     total_m, missed = way_m + look_m, 1.0 - float(chances[here])
     waiting[here] = False
     for _ in range(min(STOPS, len(chances) - 1)):
-        price = np.where(waiting, (between_m[here] + look_m) / chances, np.inf)
+        off_m = DETOUR * np.linalg.norm(points_m - points_m[here], axis=1)
+        price = np.where(waiting, (off_m + look_m) / chances, np.inf)
         there = int(price.argmin())
-        total_m += missed * (float(between_m[here, there]) + look_m)
+        total_m += missed * (float(off_m[there]) + look_m)
         missed *= 1.0 - float(chances[there])
         waiting[there] = False
         here = there

@@ -1,6 +1,7 @@
 """Expected metres of openings against all orders by hand."""
 
 import itertools
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -51,6 +52,11 @@ def test_the_chance_by_metre_counts_the_look_behind():
     assert found == pytest.approx([0.1, 0.15, 0.0])
 
 
+def test_where_one_stands_and_looks_for_nothing_the_chance_by_metre_is_a_number():
+    found = chances_per_metre(np.array([0.0, 0.0, 1.0]), np.array([0.2, 0.9, 1.0]), 0.0)
+    assert np.isfinite(found).all() and found.argmax() == 1
+
+
 def test_what_has_no_chance_comes_by_its_way_alone():
     assert chances_per_metre(np.array([9.0, 4.0]), np.zeros(2), 1.0).argmax() == 1
 
@@ -63,3 +69,15 @@ def test_what_cannot_be_reached_is_never_first():
 
 def test_no_openings_no_metres():
     assert expected_metres(np.zeros(0), np.zeros((0, 3)), np.zeros(0), 3.0, 40.0).shape == (0,)
+
+
+def test_some_openings_of_thousands_take_the_memory_and_time_of_those():
+    rng = np.random.default_rng(5)
+    points_m, distances_m, chances = rng.uniform(0, 50, (4000, 3)), rng.uniform(1, 50, 4000), rng.uniform(0, 0.3, 4000)
+    few = np.array([17, 3999, 5])
+    tracemalloc.start()
+    found = expected_metres(distances_m, points_m, chances, 3.0, 40.0, firsts=few)
+    _, most_b = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert most_b < 2**20, "no matrix of all openings by all"
+    assert found == pytest.approx(expected_metres(distances_m, points_m, chances, 3.0, 40.0)[few])

@@ -2,6 +2,7 @@
 
 import msgspec
 
+from prior_sg.schemas.codec import Positive
 from prior_sg.schemas.features import DEFAULT_SPACE
 from prior_sg.services.segmenter.core.appearance.adaptation import AdaptationConfig
 from prior_sg.services.segmenter.core.appearance.information import InformationConfig
@@ -62,7 +63,7 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
     edge_sum: float = 3.0  # sum of w_dist at a place, whatever the graph's density and scale; 0 = w_dist as it is
     solver: Settings = msgspec.field(default_factory=Settings)
     budget_ms: float = 40.0  # of solving per keyframe; the rest is done when idle. 0 = as long as it takes
-    look_ms: float = 2.0  # of solving between two looks at the budget, see Budget
+    look_ms: Positive = 2.0  # of solving between two looks at the budget, see Budget
     edge_clearance_m: float = (
         0.8  # w_dist times min(clearance / edge_clearance_m, 1): half of it in a usual door; 0 = off
     )
@@ -81,7 +82,7 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
     predicted_trust: float = 1.0  # sum of trust below which a place counts as predicted; one close look gives about 2
     door_clearance_m: float = 0.7  # a way between regions with at most this clearance is a door
     posterior_change: float = 0.01  # smaller changes of a belief are not sent
-    footprint_cell_m: float = 0.1  # grid of the regions' areas
+    footprint_cell_m: Positive = 0.1  # grid of the regions' areas
     foresight: ForesightConfig = msgspec.field(default_factory=ForesightConfig)  # beyond the paper
     evidence_ticks: int = 40  # ticks between two reports of what the map shows of its prior; 0 = none
     evidence_places: int = 5  # a region of fewer places is not counted there: most are mistakes

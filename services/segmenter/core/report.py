@@ -18,7 +18,6 @@ from prior_sg.schemas.regions import (
 )
 from prior_sg.services.segmenter.core.config import Config
 from prior_sg.services.segmenter.core.energy import posteriors
-from prior_sg.services.segmenter.core.energy.mrf import energy
 from prior_sg.services.segmenter.core.foresight.openings import openings_of
 from prior_sg.services.segmenter.core.foresight.telling import differs, foresight
 from prior_sg.services.segmenter.core.inference import field_of, temperature, votes, weights
@@ -43,7 +42,7 @@ def publish(
     places.unbelieved[:] = False
     foreseen = _foreseen(state, cfg) if (idle or everything) and cfg.foresight.enabled else None
     return regions.ledger.tell(
-        _head(state),
+        _head(state, fresh),
         places.slots[fresh],
         _beliefs(state, fresh, cfg),
         regions.known,
@@ -64,10 +63,9 @@ def _renew_layers(state: State, changed: Set[int] | None, cfg: Config) -> None:
     levels = state.aim.aligned.levels
     state.layers.renew(regions.known, graph, places, regions.storeys, levels=levels, cfg=cfg.layers, changed=changed)
     zones = state.layers.zones
-    for number, region in regions.known.items():
-        zone = zones.get(number, "")
-        if zone != region.parent:
-            regions.known[number] = msgspec.structs.replace(region, parent=zone)
+    moved = [number for number, region in regions.known.items() if region.parent != zones.get(number, "")]
+    for number in moved:
+        regions.known[number] = msgspec.structs.replace(regions.known[number], parent=zones.get(number, ""))
 
 
 def _foreseen(state: State, cfg: Config) -> Foresight | None:
@@ -78,8 +76,8 @@ def _foreseen(state: State, cfg: Config) -> Foresight | None:
     return now if differs(held.ledger.foresight, now, cfg.foresight) else None
 
 
-def _head(state: State) -> RegionDelta:
-    """From what the map is made: a delta that tells nothing else."""
+def _head(state: State, fresh: np.ndarray) -> RegionDelta:
+    """From what the map is made: a delta that tells nothing else. `fresh` (n,): places whose beliefs may be others."""
     aligned = state.aim.aligned
     return msgspec.structs.replace(
         ledger.nothing(state.robot, state.epoch, aligned.labels),
@@ -88,7 +86,7 @@ def _head(state: State) -> RegionDelta:
         environment=aligned.prior.environment,
         task=aligned.prior.task,
         space=state.seen.spaces.force if len(state.seen.archive) else "",
-        energy=energy(field_of(state), state.map.places.labels),
+        energy=state.terms.energy(field_of(state), state.map.places.labels, state.map.ties, fresh),
     )
 
 
@@ -122,7 +120,9 @@ def _described(state: State, everything: bool, cfg: Config) -> dict[int, Region]
     border = components.border(graph, places.regions, set(ids.tolist()), cfg.door_clearance_m)
     objects = components.members(state.objects.view, graph.positions_m, places.regions, rows)
     known, reformed = state.regions.known, state.regions.reformed
-    found = {} if everything else {number: region for number, region in known.items() if not wanted[number]}
+    found = {} if everything else dict(known)
+    for number in np.flatnonzero(wanted).tolist():
+        found.pop(number, None)
     for number, members in zip(ids.tolist(), np.split(order, starts[1:]), strict=False):
         formed = everything or number in reformed or number not in known
         found[number] = msgspec.structs.replace(

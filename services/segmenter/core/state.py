@@ -7,6 +7,7 @@ from prior_sg.services.deltas import PoseCorrections
 from prior_sg.services.intent import Intent
 from prior_sg.services.segmenter.core.aim import Aim
 from prior_sg.services.segmenter.core.config import Config
+from prior_sg.services.segmenter.core.energy.mrf import KeptTerms
 from prior_sg.services.segmenter.core.energy.solver import Solver
 from prior_sg.services.segmenter.core.evidence.handover import Spaces
 from prior_sg.services.segmenter.core.evidence.seen import Seen
@@ -38,6 +39,7 @@ class State:
     corrections: PoseCorrections = field(default_factory=PoseCorrections)
     report: PriorReport = field(default_factory=PriorReport)
     catching_up: CatchingUp = field(default_factory=CatchingUp)
+    terms: KeptTerms = field(default_factory=KeptTerms)  # of the energy that was told last
     stamp_ns: int = 0  # of the newest place delta, pyramid or detections
 
     @property

@@ -19,13 +19,14 @@ from prior_sg.schemas.regions import RegionDelta
 from prior_sg.schemas.scene import Scene
 from prior_sg.schemas.status import Tick
 from prior_sg.schemas.succession import Evidence, EvidenceRequest, Succession, TakesOver
-from prior_sg.services.segmenter.core import inference, prior_evidence, report
+from prior_sg.services.segmenter.core import inference, prior_evidence, report, resting
 from prior_sg.services.segmenter.core.aim import object_concepts, region_concepts
 from prior_sg.services.segmenter.core.config import Config
 from prior_sg.services.segmenter.core.evidence import handover
 from prior_sg.services.segmenter.core.evidence.kernel import Targets
 from prior_sg.services.segmenter.core.experts.contents import has_say
 from prior_sg.services.segmenter.core.objects.names import named
+from prior_sg.services.segmenter.core.slices import at_once
 from prior_sg.services.segmenter.core.state import State
 from prior_sg.services.segmenter.core.succession import SAME_MAP
 
@@ -42,9 +43,10 @@ def update(state: State, message: Message, cfg: Config) -> Iterator[Message]:
     if switched or idle:
         yield from follow_objects(state, cfg)
         yield from follow_markers(state, cfg)
-    if switched or (state.labelling.dirty and isinstance(message, Pyramid | Tick)):
+    news = isinstance(message, Pyramid) and state.labelling.under_way is None
+    if switched or (state.labelling.dirty and (news or idle)):
         yield from _segment(state, switched, idle, cfg)
-    if idle and state.report.due(not state.labelling.dirty, cfg.evidence_ticks):
+    if idle and state.report.due(state.labelling.settled, cfg.evidence_ticks):
         yield from _observed(state, cfg)
 
 
@@ -64,6 +66,7 @@ def take(state: State, message: Message, cfg: Config) -> Iterator[Message]:
         case TextEmbeddings():
             state.aim.take_text(message, cfg)
         case Tick():
+            state.labelling.still_ticks += 1
             state.aim.tick()
             handover.tick(state.seen.spaces)
             if not state.catching_up.stands_by:
@@ -99,7 +102,7 @@ def observe(state: State, pyramid: Pyramid, cfg: Config) -> None:
     rows = state.seen.observe(pyramid, _targets(state), cfg)
     if rows is not None:
         state.map.places.stale[rows] = True
-        state.labelling.dirty = True
+        state.labelling.news()
         state.heard(pyramid.stamp_ns)
 
 
@@ -115,6 +118,7 @@ def detect(state: State, detections: Detections, cfg: Config) -> None:
         state.seen.losses.add("detections ignored", "their space is not in force", of=of)
         return
     if state.objects.observe(msgspec.structs.replace(detections, world_from_camera=pose), cfg.tracking):
+        state.labelling.news()
         state.heard(detections.stamp_ns)
     else:
         state.seen.losses.add("detections ignored", "they repeat some, or do not fit those before", of=of)
@@ -133,7 +137,7 @@ def correct_poses(state: State, update: PoseUpdate, cfg: Config) -> None:
     affected = np.flatnonzero(state.seen.move(poses, state.map.graph.positions_m, cfg))
     if len(affected):
         _integrate_afresh(state, affected, cfg)
-        state.labelling.dirty = True
+    state.labelling.news()
 
 
 def follow_spaces(state: State, cfg: Config) -> Iterator[TextRequest]:
@@ -187,8 +191,8 @@ def follow_objects(state: State, cfg: Config) -> Iterator[ObjectDelta]:
     now = named(objects.tracks, prior, text, cfg.tracking, graph=state.map.graph, size_cfg=cfg.sizes)
     delta = objects.tell(state.robot, state.epoch, state.stamp_ns, now=now, digest=digest)
     if delta is not None:
-        if prior is not None:
-            inference.see_objects(state, objects.ledger.view(), cfg)
+        if prior is not None and objects.present is not None:
+            inference.see_objects(state, objects.present, cfg)
         yield delta
 
 
@@ -293,12 +297,20 @@ def _segment(state: State, switched: bool, idle: bool, cfg: Config) -> Iterator[
     """Experts, graph cuts, beliefs, connected components; then the difference to what was published."""
     if state.aim.in_force is None:
         return
-    inference.evaluate_experts(state, idle or switched, cfg)
-    inference.settle(state, cfg, hurried=not (idle or switched))
+    thoroughly = idle or switched
+    anew = thoroughly and state.labelling.still(len(state.map.graph.ids))
+    if anew and switched:
+        at_once(inference.label_anew(state, cfg))
+    elif anew:
+        if not resting.go_on(state, cfg):
+            return
+    else:
+        inference.evaluate_experts(state, thoroughly, cfg)
+        inference.settle(state, cfg, hurried=not thoroughly)
     changes = state.regions.partition(state.map, state.aim.in_force.labels, cfg.layers.storeys)
     inference.believe(state, cfg)
     delta = report.publish(state, changes, switched or state.regions.ledger.head is None, cfg, idle)
-    state.labelling.labelled()
+    state.labelling.labelled(anew)
     if delta is not None:
         yield delta
 

@@ -3,9 +3,15 @@
 import numpy as np
 import pytest
 
-from prior_sg.services.segmenter.core.appearance.adaptation import Adaptation, AdaptationConfig, adapted, differs
+from prior_sg.services.segmenter.core.appearance import adaptation
+from prior_sg.services.segmenter.core.appearance.adaptation import Adaptation, AdaptationConfig, differs
+from prior_sg.services.segmenter.core.slices import at_once
 
 PLAIN = AdaptationConfig(rounds=1, half_places=0.0)
+
+
+def adapted(*given):
+    return at_once(adaptation.adapted(*given, visits=0))
 
 
 def nearest(similarity):

@@ -1,5 +1,7 @@
 """Components, ids that last, and footprints."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 from scipy import sparse
@@ -74,6 +76,26 @@ def test_footprint_of_discs():
     lens = 2 * np.pi / 3 - np.sqrt(3) / 2  # two unit discs whose centres are one radius apart
     overlapping = np.array([(0.0, 0.0, 0.0), (1.0, 0.0, 0.0)])
     assert footprint_m2(overlapping, np.ones(2), 0.02) == pytest.approx(2 * np.pi - lens, rel=0.01)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_footprint_is_the_number_of_cells_whose_middle_a_disc_covers(seed):
+    rng = np.random.default_rng(seed)
+    positions_m, radii_m, cell_m = rng.uniform(0, 6, (20, 3)), rng.uniform(0, 1, 20), 0.1
+    low = (positions_m[:, :2] - radii_m[:, None]).min(axis=0)
+    middles_m = low + (np.indices((90, 90)).reshape(2, -1).T + 0.5) * cell_m
+    inside = np.linalg.norm(middles_m[:, None] - positions_m[:, :2], axis=2) <= radii_m
+    assert footprint_m2(positions_m, radii_m, cell_m) == float(inside.any(axis=1).sum() * cell_m**2)
+
+
+def test_a_footprint_takes_no_memory_for_what_lies_between_discs():
+    apart = np.array([(0.0, 0.0, 0.0), (3000.0, 3000.0, 0.0)])
+    tracemalloc.start()
+    try:
+        assert footprint_m2(apart, np.array([1.0, 0.5]), 0.1) == pytest.approx(1.25 * np.pi, rel=0.02)
+        assert tracemalloc.get_traced_memory()[1] < 1e6  # bytes
+    finally:
+        tracemalloc.stop()
 
 
 def test_footprint_of_discs_smaller_than_a_cell():

@@ -5,7 +5,7 @@ import re
 import numpy as np
 import pytest
 
-from prior_sg.schemas.priors import Counts, RegionPrior
+from prior_sg.schemas.priors import LEAST_STD_RAD, Counts, RegionPrior
 from prior_sg.services.segmenter.core.experts import REGISTRY
 from prior_sg.services.segmenter.core.experts.contents import words_of_contents
 from prior_sg.services.segmenter.core.experts.context import Context, ObjectSettings, ObjectView, standardised
@@ -106,6 +106,14 @@ def test_geometric_by_hand():
     log_probabilities, confidence = REGISTRY["geometric"](found)
     np.testing.assert_allclose(np.exp(log_probabilities[0]), (0.36914, 0.63086), atol=1e-5)
     assert confidence[0] == pytest.approx(0.4)
+
+
+def test_the_sharpest_and_the_widest_spread_of_a_prior_are_numbers():
+    for spread in (LEAST_STD_RAD, 1e300):
+        fields = {"prior": prior(["kitchen", "hall"], regions=inclined((0.0, np.pi / 2), (spread, spread)))}
+        angles = np.array([0.0, 0.7, np.pi / 2])
+        found = context([(0.6, 0.8)] * 3, [1] * 3, inclination_rad=angles, **fields)
+        assert not np.isnan(REGISTRY["geometric"](found)[0]).any()
 
 
 def test_geometric_densities_are_normalised():

@@ -242,7 +242,7 @@ def test_only_what_changes_visibly_is_news():
     now = foresight(openings, state_of, home(), CFG)
     assert differs(None, now, CFG) and not differs(now, now, CFG) and differs(now, Foresight(), CFG)
     assert not differs(None, Foresight(), CFG)
-    moved = [msgspec.structs.replace(now.openings[0], same=now.openings[0].same + shift) for shift in (0.01, 0.2)]
+    moved = [msgspec.structs.replace(now.openings[0], same=now.openings[0].same - shift) for shift in (0.01, 0.2)]
     assert [differs(now, msgspec.structs.replace(now, openings=[one]), CFG) for one in moved] == [False, True]
 
 
@@ -253,7 +253,8 @@ def test_what_planners_choose_an_opening_by_is_news_when_it_changes(field):
     now = foresight(openings_of(graph, places, opened((0, (0, 1, 0), 2.0)), CFG), state_of, home(), CFG)
     (opening,) = now.openings
     for shift, news in ((0.01, False), (0.2, True)):
-        first = msgspec.structs.replace(opening.labels[0], **{field: getattr(opening.labels[0], field) - shift})
+        chance = getattr(opening.labels[0], field)
+        first = msgspec.structs.replace(opening.labels[0], **{field: chance + (shift if chance < 0.5 else -shift)})
         moved = msgspec.structs.replace(opening, labels=[first, *opening.labels[1:]])
         assert differs(now, msgspec.structs.replace(now, openings=[moved]), CFG) is news
 

@@ -290,7 +290,7 @@ CHANGES = {
     "in \\(0, 1\\]": {"adjacency": np.zeros((2, 2), np.float32)},
     "not symmetric": {"adjacency": np.array([[1, 0.5], [0.25, 1]], np.float32)},
     "sum to one": {"entries": [Entry(name="a", existence=1.0), Entry(name="b", existence=1.0)]},
-    "different names": {"entries": [Entry(name="a", existence=0.5)] * 2},
+    "the same name": {"entries": [Entry(name="a", existence=0.5)] * 2},
 }
 
 

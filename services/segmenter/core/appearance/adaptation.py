@@ -5,8 +5,8 @@ So each label gets a direction in the embedding space, from the map's mean to th
 most, and a place's similarity is the text's plus its own along that direction, both scaled alike. That is done a few
 times, with the labels that follow from it: self-training of a nearest-mean classifier.
 
-It is a function of the evidence and the text, not of the labels in force: a restarted segmenter finds the same up to
-`tolerance`, below which an adaptation is left as it is.
+It is a function of the evidence and the text, not of the labels in force: a restarted segmenter finds the same. While
+news comes, one that would change less than `tolerance` is left as it is; when the map rests, it is found anew.
 """
 
 from collections.abc import Callable
@@ -14,6 +14,8 @@ from dataclasses import dataclass, field
 
 import msgspec
 import numpy as np
+
+from prior_sg.services.segmenter.core.slices import Parts
 
 SAMPLE = 4096  # places that stand for all when directions are computed
 TINY = 1e-9
@@ -51,12 +53,14 @@ def adapted(
     masses: np.ndarray,
     labels_of: Callable[[np.ndarray], np.ndarray],
     cfg: AdaptationConfig,
-) -> Adaptation:
-    """The adaptation to a map, from places that were observed.
+    *,
+    visits: int,
+) -> Parts[Adaptation]:
+    """The adaptation to a map, from places that were observed, round by round.
 
     `descriptors` (place, dim) have unit length, `similarity` (place, label) is that with the text, `masses` (place,)
-    weigh places, and `labels_of` gives the label (place,) that similarities speak for. A label that no place resembles
-    most gets no direction.
+    weigh places, and `labels_of` gives the label (place,) that similarities speak for, in about so many
+    `visits`. A label that no place resembles most gets no direction.
     """
     count, labels = similarity.shape
     scale = cfg.weight * count / (count + cfg.half_places) * _spread(similarity, masses)
@@ -66,6 +70,7 @@ def adapted(
     weights = (masses[some] / masses[some].sum()).astype(offsets.dtype)
     directions = np.zeros((labels, len(center)), offsets.dtype)
     for _ in range(cfg.rounds):
+        yield visits
         best = labels_of(similarity + offsets @ directions.T)
         members = weights[:, None] * (best[some, None] == np.arange(labels))
         means = members.T @ offsets[some] / np.maximum(members.sum(axis=0), TINY)[:, None]

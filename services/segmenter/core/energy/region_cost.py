@@ -15,6 +15,7 @@ from prior_sg.services.compiled import compiled
 from prior_sg.services.segmenter.core.energy.mrf import Field
 from prior_sg.services.segmenter.core.map.arcs import Arcs, arcs_of, spread
 
+SPARSE = 32  # rows a place of a region, up to which going over them is quicker than sorting
 MOST_CHANGED = 0.1  # of the places; with more, to go over former passes again takes longer than to begin anew
 
 
@@ -75,8 +76,7 @@ def _pass(labels, rows, near, region_of, field, cost, after):  # noqa: ANN001, A
     members, count = np.empty(len(labels), np.int64), 0  # of region after region; its number is where it begins
     for row in rows:
         count = spread(row, labels, starts, neighbours, region_of, members, count)
-    for index in range(count):
-        count = _touched(members[index], labels, starts, neighbours, region_of, members, count)
+    count = _touched(members[:count], labels, starts, neighbours, region_of, members, count)
     certain, begin = count, 0
     gains, best, given = np.empty(len(labels)), np.empty(len(labels), np.int64), np.empty(len(labels), np.int64)
     settled = np.zeros(len(labels), np.bool_)
@@ -86,14 +86,13 @@ def _pass(labels, rows, near, region_of, field, cost, after):  # noqa: ANN001, A
         while end < count and region_of[members[end]] == begin:
             end += 1
         inside = members[begin:end]
-        inside.sort()
+        _sort(inside, begin, region_of)
         given[begin] = labels[inside[0]]
         gains[begin], best[begin] = _gain(inside, labels, near, field)
         if gains[begin] < cost:
             poor.append(np.int64(begin))
         if begin < certain or gains[begin] < cost:
-            for place in inside:
-                count = _touched(place, labels, starts, neighbours, region_of, members, count)
+            count = _touched(inside, labels, starts, neighbours, region_of, members, count)
         begin = end
     _give(np.array(poor, np.int64), gains, best, given, settled, members[:count], labels, near, region_of)
     differs, found = np.empty(count, np.int64), 0
@@ -107,12 +106,14 @@ def _pass(labels, rows, near, region_of, field, cost, after):  # noqa: ANN001, A
 
 
 @compiled()
-def _touched(place, labels, starts, neighbours, region_of, members, count):  # noqa: ANN001, ANN202, PLR0917
-    """`spread` from all neighbours of a place, unless every place of the map has a number."""
-    if count == len(members):
-        return count
-    for arc in range(starts[place], starts[place + 1]):
-        count = spread(neighbours[arc], labels, starts, neighbours, region_of, members, count)
+def _touched(inside, labels, starts, neighbours, region_of, members, count):  # noqa: ANN001, ANN202, PLR0917
+    """`spread` from all neighbours of the places `inside`, until every place of the map has a number."""
+    for place in inside:
+        if count == len(members):
+            break
+        for arc in range(starts[place], starts[place + 1]):
+            if region_of[neighbours[arc]] < 0:  # most have one, and a call costs more than to look
+                count = spread(neighbours[arc], labels, starts, neighbours, region_of, members, count)
     return count
 
 
@@ -128,18 +129,21 @@ def _gain(inside, labels, near, field):  # noqa: ANN001, ANN202
     arcs, count = 0, 0
     for place in inside:
         arcs += starts[place + 1] - starts[place]
-    across, others = np.empty(arcs, np.int64), np.empty(arcs, np.int64)
+    across = np.empty(arcs, np.int64)  # number of an edge, times the labels, plus the label beyond it
     for place in inside:
         for label in range(len(costs)):
             costs[label] += unary[place, label]
         for arc in range(starts[place], starts[place + 1]):
             if labels[neighbours[arc]] != own:
-                across[count], others[count] = numbers[arc], labels[neighbours[arc]]
+                across[count] = np.int64(numbers[arc]) * len(costs) + labels[neighbours[arc]]
                 count += 1
-    for at in np.argsort(across[:count]):
-        beside[others[at]] = True
+    across = across[:count]
+    across.sort()
+    for key in across:
+        edge, other = key // len(costs), key % len(costs)
+        beside[other] = True
         for label in range(len(costs)):
-            costs[label] += weights[across[at]] * pairwise[label, others[at]]
+            costs[label] += weights[edge] * pairwise[label, other]
     gain, best = np.inf, own
     for label in range(len(costs)):
         if beside[label] and costs[label] - costs[own] < gain:
@@ -165,3 +169,19 @@ def _give(poor, gains, best, given, settled, members, labels, near, region_of): 
         for place in members[region:index]:
             for arc in range(starts[place], starts[place + 1]):
                 settled[region_of[neighbours[arc]]] = True
+
+
+@compiled()
+def _sort(inside, number, region_of):  # noqa: ANN001, ANN202
+    """Put the places `inside`, which are those of this number, in ascending order."""
+    low, high = inside[0], inside[0]
+    for place in inside:
+        low, high = min(low, place), max(high, place)
+    if high - low > SPARSE * len(inside):
+        inside.sort()
+        return
+    count = 0
+    for place in range(low, high + 1):
+        if region_of[place] == number:
+            inside[count] = place
+            count += 1

@@ -35,6 +35,7 @@ from prior_sg.services.segmenter.core.energy.maxflow import CUTS, MinCut, min_cu
 from prior_sg.services.segmenter.core.energy.mrf import Field, least_gain
 from prior_sg.services.segmenter.core.energy.trws import empty_messages, lay_down, run_pass, take_up
 from prior_sg.services.segmenter.core.map.arcs import Arcs, arcs_of, ball, no_arcs
+from prior_sg.services.segmenter.core.slices import Parts, at_once
 
 Expired = Callable[[], bool]
 
@@ -99,29 +100,39 @@ class Solver:
     ) -> np.ndarray:
         """Labels (place,) for `field`, starting from `labels`, by work near the change only; see the module."""
         self.take(field, labels, dirty=dirty, previous=previous, ties=ties)
-        self._propose_near(expired)
-        self._swap(swap_work.NEAR, expired)
+        at_once(self.updating(expired))
         return self.labels.copy()
 
     def drain(self, expired: Expired = never) -> np.ndarray:
         """Go on with what is pending, on the whole field; the labels (place,) so far."""
-        self._propose_near(expired)
-        self._swap(swap_work.DEEP, expired)
-        if self._worn and not expired():
-            if self._propose(np.arange(len(self.labels)), self.settings.idle_round_trips, expired):
-                self._changes = 0
-            self._swap(swap_work.DEEP, expired)
+        at_once(self.draining(expired))
         return self.labels.copy()
+
+    def updating(self, expired: Expired = never) -> Parts[None]:
+        """What `update` does after `take`, part by part."""
+        yield from self._propose_near(expired)
+        yield from self._swap(swap_work.NEAR, expired)
+
+    def draining(self, expired: Expired = never) -> Parts[None]:
+        """What `drain` does, part by part."""
+        yield from self._propose_near(expired)
+        yield from self._swap(swap_work.DEEP, expired)
+        if self._worn and not expired():
+            trips = yield from self._propose(np.arange(len(self.labels)), self.settings.idle_round_trips, expired)
+            if trips or not self.settings.idle_round_trips:
+                self._changes = 0
+            yield from self._swap(swap_work.DEEP, expired)
 
     @property
     def _worn(self) -> bool:
         """Whether so much changed since message passing went over the whole field that it may well find better."""
         return self._changes > self.settings.worn_share * len(self.labels)
 
-    def _swap(self, depth: int, expired: Expired) -> None:
+    def _swap(self, depth: int, expired: Expired) -> Parts[None]:
         settings, arrays = self.settings, (self._graph, self._unary, self._pairwise, self.labels, self._work)
         limits = swap_moves.Limits(depth, settings.near, settings.compiled_up_to, settings.chunk, self._least_gain)
         while swap_work.waiting(self._work, depth) and not expired():
+            yield settings.chunk
             swap_moves.run_swaps(*arrays, self._cut, limits)
 
     def take(
@@ -187,8 +198,8 @@ class Solver:
         waits[old_unproposed] = True
         self._unproposed = known[waits[origin[known]]]
 
-    def _propose(self, rows: np.ndarray, round_trips: int, expired: Expired) -> bool:
-        """Message passing on `rows` (ascending) takes what lowers the energy; False if there was no budget for it.
+    def _propose(self, rows: np.ndarray, round_trips: int, expired: Expired) -> Parts[int]:
+        """Message passing on `rows` (ascending) takes what lowers the energy; how many trips there was budget for.
 
         A budget that ends it early is not made up for: the swaps go first then, lest nothing ever gets done.
         """
@@ -198,19 +209,21 @@ class Solver:
         take_up(rows, graph, self._unary, labels, messages)
         before = labels[rows]
         while trips < round_trips and not expired():
+            yield len(rows)
             round_trip(rows, labels, *scene, messages, self._work.mark, self._least_gain)
             trips += 1
         lay_down(rows, messages)
         swap_work.flag_around(rows[labels[rows] != before], swap_work.NEAR, graph, self._work)
-        return trips > 0 or not round_trips
+        return trips
 
-    def _propose_near(self, expired: Expired) -> None:
+    def _propose_near(self, expired: Expired) -> Parts[None]:
         """Proposals around the places that changed."""
         if len(self._unproposed):
             rows = ball(
                 self._unproposed, self.settings.reach, self._graph.starts, self._graph.neighbours, self._messages.inside
             )
-            if self._propose(rows, self.settings.round_trips, expired):
+            trips = yield from self._propose(rows, self.settings.round_trips, expired)
+            if trips or not self.settings.round_trips:
                 self._unproposed = self._unproposed[:0]
 
 

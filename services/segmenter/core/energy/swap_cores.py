@@ -66,7 +66,7 @@ def explore(graph, unary, pairwise, labels, work, limit):  # noqa: PLR0917, ANN0
         close_off(alpha, beta, cost, graph, labels, work)
 
 
-@compiled()
+@compiled(inline="always")
 def weigh(place, alpha, beta, starts, neighbours, weights, unary, pairwise, labels, mark, lean, hold):  # noqa: PLR0917, ANN001, ANN201
     """D and S of a place, the forced neighbours counted as fixed."""
     cost, total, held = pairwise[alpha, beta], unary[place, beta] - unary[place, alpha], 0.0
@@ -84,7 +84,7 @@ def weigh(place, alpha, beta, starts, neighbours, weights, unary, pairwise, labe
     lean[place], hold[place] = total, held
 
 
-@compiled()
+@compiled(inline="always")
 def is_forced(place, alpha, labels, mark, lean, hold):  # noqa: PLR0917, ANN001, ANN201
     """Mark a free place that one label suits whatever its free neighbours take; of two equal ones, its own."""
     for_alpha, for_beta = lean[place] >= hold[place], lean[place] <= -hold[place]

@@ -104,7 +104,7 @@ def settle(graph, unary, pairwise, labels, work, limits):  # noqa: PLR0917, ANN0
     return SPENT
 
 
-@compiled()
+@compiled(inline="always")
 def next_pending(place, depth, graph, unary, pairwise, labels, pending, costs):  # noqa: PLR0917, ANN001, ANN201
     """A label to try at `place`, -1 if none; clears the flags of labels that its neighbours force it not to take."""
     alpha = labels[place]
@@ -120,7 +120,7 @@ def next_pending(place, depth, graph, unary, pairwise, labels, pending, costs): 
     return found
 
 
-@compiled()
+@compiled(inline="always")
 def conditional(place, starts, neighbours, weights, unary, pairwise, labels, costs):  # noqa: PLR0917, ANN001, ANN201
     """Fill in `costs` (label,) of each label while the neighbours keep theirs; return the like neighbours' weight."""
     like, own, count = 0.0, labels[place], len(costs)
@@ -166,7 +166,7 @@ def commit(graph, unary, pairwise, labels, work, limits):  # noqa: PLR0917, ANN0
             flag_after(neighbours[arc], alpha, beta, labels, work)
 
 
-@compiled()
+@compiled(inline="always")
 def flag_after(place, alpha, beta, labels, work):  # noqa: ANN001, ANN201
     """Flag a place after a swap of alpha and beta nearby; that swap need not be tried again, unless it was ended."""
     kept_alpha, kept_beta = work.pending[place, alpha], work.pending[place, beta]

@@ -58,14 +58,14 @@ def waiting(work: Work, depth: int) -> int:
     return int(work.rings[:depth, COUNT].sum())
 
 
-@compiled()
+@compiled(inline="always")
 def flag(place, depth, work):  # noqa: ANN001, ANN201
     """All swaps of this place's label are to be tried."""
     work.pending[place, :] = depth
     enqueue(place, depth - 1, work.queues, work.queued, work.rings)
 
 
-@compiled()
+@compiled(inline="always")
 def enqueue(place, ring, queues, queued, rings):  # noqa: ANN001, ANN201
     """Put the place at the end of the ring unless it is there."""
     if queued[ring, place] == 0:
@@ -119,7 +119,7 @@ def sort_queues(work):  # noqa: ANN001, ANN201
                 enqueue(place, work.pending[place, label] - 1, queues, queued, rings)
 
 
-@compiled()
+@compiled(inline="always")
 def tried(place, label, capped, work):  # noqa: ANN001, ANN201
     """Note that the swap with `label` was tried at `place`: it is done with, or still to be tried DEEP."""
     if capped == 0:

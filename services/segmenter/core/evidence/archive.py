@@ -7,6 +7,7 @@ frame that goes stays with it.
 """
 
 from collections.abc import Set
+from operator import itemgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -81,6 +82,11 @@ class FrameArchive:
     def frames(self) -> list[Frame]:
         """All that are kept, in the order of arrival."""
         return list(self._kept.values())
+
+    @property
+    def by_number(self) -> dict[int, Frame]:
+        """All that are kept, in the order of their ids, however they arrived."""
+        return dict(sorted(self._kept.items(), key=itemgetter(0)))
 
     @property
     def kept_ids(self) -> Set[int]:

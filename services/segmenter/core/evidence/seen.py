@@ -11,6 +11,7 @@ from prior_sg.services.segmenter.core.config import Config
 from prior_sg.services.segmenter.core.evidence import handover, kernel
 from prior_sg.services.segmenter.core.evidence.archive import FrameArchive, integrate_all
 from prior_sg.services.segmenter.core.evidence.handover import Spaces
+from prior_sg.services.segmenter.core.evidence.surfaces import Shown
 
 RESTING_TICKS = 2  # without a pyramid, after which the map rests
 
@@ -23,6 +24,7 @@ class Seen:
     query_radius_m: float  # r_Q with which the evidence was integrated
     archive: FrameArchive = field(default_factory=FrameArchive)
     evidence: kernel.Evidence = field(default_factory=kernel.Evidence)
+    shown: Shown = field(default_factory=Shown)
     losses: Losses = field(default_factory=Losses)  # pyramids ignored
 
     @property

@@ -105,7 +105,6 @@ def _buildings(now: Standing, level: LevelInForce | None, cfg: AlignmentConfig) 
 
 def _floors(buildings: np.ndarray, storeys: np.ndarray) -> Layer:
     """What each building (region,) has on each storey (region,)."""
-    pairs = np.stack((buildings, storeys), axis=1)
-    found, groups = np.unique(pairs, axis=0, return_inverse=True)
-    labels = [f"floor {storey}" for storey in found[:, 1].tolist()]
-    return Layer("floor", groups.reshape(-1), labels, np.ones(len(found)))
+    count = int(storeys.max()) + 1
+    found, groups = np.unique(buildings * count + storeys, return_inverse=True)
+    return Layer("floor", groups, [f"floor {storey}" for storey in (found % count).tolist()], np.ones(len(found)))

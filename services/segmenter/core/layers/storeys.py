@@ -59,9 +59,7 @@ class Storeys(NamedTuple):
 
 def storeys_of(graph: ReceivedGraph, cfg: StoreyConfig) -> Storeys:
     """The storeys of a map."""
-    heights_m, radii_m = graph.positions_m[:, 2], np.minimum(graph.radii_m, LARGEST_M)
-    bottoms_m = heights_m if graph.on_ground else heights_m - graph.radii_m
-    weights_m2 = np.pi * radii_m**2
+    bottoms_m, weights_m2 = _bottoms(graph.positions_m, graph.radii_m, graph.on_ground)
     floors_m = floors_of(bottoms_m, weights_m2, cfg)
     storey, grounded, between = _standing(bottoms_m, floors_m, cfg.tolerance_m, cfg.clutter_m)
     return Storeys(floors_m, storey, grounded, between, weights_m2)
@@ -70,6 +68,17 @@ def storeys_of(graph: ReceivedGraph, cfg: StoreyConfig) -> Storeys:
 def floors_differ(one_m: np.ndarray, other_m: np.ndarray) -> bool:
     """Whether two maps, of which one has several storeys, have floors at other heights."""
     return max(len(one_m), len(other_m)) > 1 and not np.array_equal(one_m, other_m)
+
+
+@compiled()
+def _bottoms(positions_m, radii_m, on_ground):  # noqa: ANN001, ANN202
+    """Where the free space of each place ends, and the ground that it covers."""
+    bottoms_m, weights_m2 = np.empty(len(radii_m)), np.empty(len(radii_m))
+    for place in range(len(radii_m)):
+        bottoms_m[place] = positions_m[place, 2] - (0.0 if on_ground else radii_m[place])
+        radius_m = min(radii_m[place], LARGEST_M)
+        weights_m2[place] = np.pi * (radius_m * radius_m)
+    return bottoms_m, weights_m2
 
 
 @compiled()
@@ -94,7 +103,7 @@ def floors_of(bottoms_m: np.ndarray, weights_m2: np.ndarray, cfg: StoreyConfig) 
     low_m, high_m = float(bottoms_m.min()), float(bottoms_m.max())
     if not high_m - low_m < MOST_CELLS * CELL_M:
         return np.array([low_m])
-    profile = _profile(bottoms_m - low_m, weights_m2, round((high_m - low_m) / CELL_M) + 1)
+    profile = _profile(bottoms_m, low_m, weights_m2, round((high_m - low_m) / CELL_M) + 1)
     padded = np.concatenate(([-1.0], profile, [-1.0]))
     modes = np.flatnonzero((padded[1:-1] > padded[:-2]) & (padded[1:-1] >= padded[2:]))
     apart = cfg.least_height_m / CELL_M
@@ -110,19 +119,23 @@ def floors_of(bottoms_m: np.ndarray, weights_m2: np.ndarray, cfg: StoreyConfig) 
     return low_m + CELL_M * np.array(sorted(floors))
 
 
-def _profile(heights_m: np.ndarray, weights_m2: np.ndarray, cells: int) -> np.ndarray:
-    """Density (cell,) of the ground by height, m2 per m, smoothed."""
-    counts = _by_height(heights_m, weights_m2, cells) / CELL_M
+def _profile(bottoms_m: np.ndarray, low_m: float, weights_m2: np.ndarray, cells: int) -> np.ndarray:
+    """Density (cell,) of the ground by its height over the lowest, m2 per m, smoothed."""
+    counts = _by_height(bottoms_m, low_m, weights_m2, cells) / CELL_M
     reach = round(3 * SMOOTH_M / CELL_M)
     kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) * CELL_M / SMOOTH_M) ** 2)
     return np.convolve(counts, kernel / kernel.sum())[reach : reach + len(counts)]
 
 
 @compiled()
-def _by_height(heights_m, weights_m2, cells):  # noqa: ANN001, ANN202
-    counts = np.zeros(cells)
-    for place in range(len(heights_m)):
-        counts[int(np.rint(heights_m[place] / CELL_M))] += weights_m2[place]
+def _by_height(bottoms_m, low_m, weights_m2, cells):  # noqa: ANN001, ANN202
+    counts, cell, sum_m2 = np.zeros(cells), 0, 0.0  # neighbours in the order of ids mostly share a cell
+    for place in range(len(bottoms_m)):
+        at = int(np.rint((bottoms_m[place] - low_m) / CELL_M))
+        if at != cell:
+            counts[cell], cell, sum_m2 = sum_m2, at, counts[at]
+        sum_m2 += weights_m2[place]
+    counts[cell] = sum_m2
     return counts
 
 

@@ -1,5 +1,6 @@
 """What followers have been told of the objects, and the smallest delta to what they should know (pure)."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -21,19 +22,6 @@ class ObjectLedger:
     digest: str = ""
     revision: int = -1
     stamp_ns: int = 0
-
-    def view(self) -> ObjectView:
-        """The objects that carry a label or have a say, for regions and experts."""
-        named = [item for item in self.told.values() if item.entry.label or item.weight > 0]
-        if not named:
-            return ObjectView()
-        return ObjectView(
-            ids=np.array([item.entry.id for item in named], np.int64),
-            positions_m=np.array([item.entry.position_m for item in named]),
-            concepts=np.array([item.concepts for item in named]),
-            weights=np.array([item.weight for item in named]),
-            sought=np.array([item.sought for item in named]),
-        )
 
     def snapshot(self, robot: str, epoch: int) -> ObjectDelta:
         """Everything told so far; before the first delta, the empty state that it follows on."""
@@ -100,6 +88,20 @@ class ObjectLedger:
             merged_ids=np.array(joined or [], np.int64).reshape(-1, 2),
             markers=markers or [],
         )
+
+
+def view_of(items: Iterable[Named]) -> ObjectView:
+    """Those objects that carry a label or have a say, for regions and experts."""
+    named = [item for item in items if item.entry.label or item.weight > 0]
+    if not named:
+        return ObjectView()
+    return ObjectView(
+        ids=np.array([item.entry.id for item in named], np.int64),
+        positions_m=np.array([item.entry.position_m for item in named]),
+        concepts=np.array([item.concepts for item in named]),
+        weights=np.array([item.weight for item in named]),
+        sought=np.array([item.sought for item in named]),
+    )
 
 
 def _differs(now: Named, before: Named) -> bool:

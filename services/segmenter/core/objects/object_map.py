@@ -9,7 +9,7 @@ from prior_sg.schemas.objects import Detections, ObjectDelta, SceneObject
 from prior_sg.schemas.priors import Prior
 from prior_sg.services.segmenter.core.experts.context import ObjectView
 from prior_sg.services.segmenter.core.objects import association, renewal, tracks
-from prior_sg.services.segmenter.core.objects.ledger import ObjectLedger
+from prior_sg.services.segmenter.core.objects.ledger import ObjectLedger, view_of
 from prior_sg.services.segmenter.core.objects.names import Named
 from prior_sg.services.segmenter.core.objects.track import TrackingConfig
 from prior_sg.services.segmenter.core.objects.tracks import Tracks
@@ -22,6 +22,7 @@ class ObjectMap:
 
     tracks: Tracks
     view: ObjectView = field(default_factory=ObjectView)
+    present: ObjectView | None = None  # as they are now, where they are named
     ledger: ObjectLedger = field(default_factory=ObjectLedger)
 
     def observe(self, detections: Detections, cfg: TrackingConfig) -> bool:
@@ -73,7 +74,10 @@ class ObjectMap:
         """The delta to the objects as they are `now`, named by the prior with this digest; None without news."""
         merged = self.tracks.merged
         self.tracks.merged, self.tracks.changed = [], False
-        return self.ledger.tell(robot, epoch, stamp_ns, now=now, merged=merged, digest=digest)
+        delta = self.ledger.tell(robot, epoch, stamp_ns, now=now, merged=merged, digest=digest)
+        if now or delta is not None or self.present is not None:
+            self.present = view_of(now.values())
+        return delta
 
     def see(self, view: ObjectView) -> np.ndarray:
         """From now on these are the objects of the map; where (n, 3) some are new, changed or gone."""
@@ -85,4 +89,5 @@ class ObjectMap:
         """A prior has come into force, with `switched` after another: the objects are to be named in its terms."""
         if len(prior.objects) != self.view.concepts.shape[1] or switched:
             self.view = ObjectView()  # its columns are the former prior's objects
+        self.present = None
         self.tracks.changed = True

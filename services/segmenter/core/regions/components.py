@@ -113,7 +113,8 @@ def _runs(one, other, sizes):  # noqa: ANN001, ANN202
 def footprint_m2(positions_m: np.ndarray, radii_m: np.ndarray, cell_m: float) -> float:
     """Area of the union of discs (n, 2 or 3) with `radii_m` (n,), seen from above, counted on a grid of `cell_m`.
 
-    Each disc covers, in each grid row it crosses, an interval of cell centres; intervals are added up as differences.
+    Each disc covers, in each grid row it crosses, an interval of cell centres; what intervals of a row share is counted
+    once. So the cost follows the discs' sizes, however far apart they lie.
     """
     low = (positions_m[:, :2] - radii_m[:, None]).min(axis=0)
     x_cells, y_cells = ((positions_m[:, :2] - low) / cell_m).T.astype(np.float64)
@@ -127,10 +128,12 @@ def footprint_m2(positions_m: np.ndarray, radii_m: np.ndarray, cell_m: float) ->
     stop = np.floor(x_cells[disc] + half - 0.5).astype(np.int64) + 1
     if not len(disc):
         return 0.0
-    steps = np.zeros((row.max() + 1, max(stop.max(), start.max()) + 2), dtype=np.int32)
-    np.add.at(steps, (row, start), 1)
-    np.add.at(steps, (row, np.maximum(stop, start)), -1)
-    return float((np.cumsum(steps, axis=1) > 0).sum() * cell_m**2)
+    width = max(stop.max(), start.max()) + 1  # rows laid end to end, so that no interval reaches into the next
+    order = np.argsort(start := row * width + start)
+    start, stop = start[order], (row * width + stop)[order]
+    reached = np.maximum.accumulate(stop)
+    covered = stop - np.maximum(start, np.concatenate((start[:1], reached[:-1])))
+    return float(np.maximum(covered, 0).sum() * cell_m**2)
 
 
 def events(previous: np.ndarray, now: np.ndarray, before: dict[int, str], labels: dict[int, str]) -> list[RegionEvent]:

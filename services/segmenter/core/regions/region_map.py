@@ -68,6 +68,12 @@ class RegionMap:
         others = {*former.tolist(), *labels, *self.reformed} & self.known.keys()
         return components.events(former, now, {region: self.known[region].label for region in others}, labels)
 
+    def parts(self, place_map: PlaceMap, cfg: StoreyConfig) -> np.ndarray:
+        """The regions that the labels as they are make, as numbers (place,) that do not last."""
+        labels, edges = place_map.places.labels, place_map.graph.edges
+        inside = edges[labels[edges[:, 0]] == labels[edges[:, 1]]]
+        return split(components.numbered(labels, inside), inside, storeys_of(place_map.graph, cfg), cfg)
+
     def wanted(self, everything: bool) -> np.ndarray:
         """Mask (region id,) of those to be described again; the last entry is that of no region."""
         mask = np.zeros(self.next_id + 1, dtype=bool)
