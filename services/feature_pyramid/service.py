@@ -12,6 +12,7 @@ from prior_sg.services.feature_pyramid.core.config import Config
 from prior_sg.services.feature_pyramid.detectors.load import load_detector
 from prior_sg.services.feature_pyramid.encoders.base import Options, load_encoder, space_of
 from prior_sg.services.feature_pyramid.worker import Worker, detections, look_at, prepare, pyramid
+from prior_sg.services.runtime import heap
 from prior_sg.services.runtime.service import Ask, Identity, Output, Service
 
 QUESTIONS = {TaskRequest: TASK_IN_FORCE, PriorRequest: PRIORS}
@@ -45,7 +46,9 @@ def answer_text(state: Worker, request: TextRequest, cfg: Config) -> TextEmbeddi
     """Descriptors of concepts. Raises ValueError for another space or a concept without phrases."""
     if request.space != state.encoder.space:
         raise ValueError(f"this worker serves the space {state.encoder.space}, not {request.space}")
-    return state.encoder.encode_text(request.concepts)
+    found = state.encoder.encode_text(request.concepts)
+    heap.give_back()
+    return found
 
 
 SERVICE = Service(

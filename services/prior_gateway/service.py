@@ -21,10 +21,10 @@ from prior_sg.schemas.topics import PRIOR, PRIOR_CLAIM, PRIOR_EVIDENCE, PRIOR_RE
 from prior_sg.services.prior_gateway.core.config import Config
 from prior_sg.services.prior_gateway.core.state import State, known_prior
 from prior_sg.services.prior_gateway.core.update import TICK_S, update
-from prior_sg.services.prior_gateway.outside import archive, endpoint, library, prompts
+from prior_sg.services.prior_gateway.outside import archive, asking, library, prompts
 from prior_sg.services.runtime.service import Ask, Errand, Identity, Output, Service
 
-ASK_MODEL = Errand("ASK_MODEL", ModelRequest, ModelReply, endpoint.open_endpoint)
+ASK_MODEL = Errand("ASK_MODEL", ModelRequest, ModelReply, asking.open_endpoint)
 RECALL = Errand("RECALL_PRIOR", Recall, Recalled, archive.open_recall)
 KEEP = Errand("KEEP_PRIOR", Keep, Kept, archive.open_keep)
 ERRANDS = {ModelRequest: ASK_MODEL, Recall: RECALL, Keep: KEEP}

@@ -5,17 +5,15 @@ plane is that of the depth inside it, its corners lie where their rays meet the 
 square of the given size on these four points. Their distances are a measurement of the size, which must agree.
 """
 
+from functools import lru_cache
 from typing import Any, NamedTuple
 
-import cv2
 import msgspec
 import numpy as np
 
 from prior_sg.schemas.frames import Intrinsics
+from prior_sg.services.opencv import cv2
 
-DICTIONARIES: dict[str, int] = {
-    name.removeprefix("DICT_").lower(): getattr(cv2.aruco, name) for name in dir(cv2.aruco) if name.startswith("DICT_")
-}
 LEAST_MEASURED = 0.5  # share of a marker's pixels that must have a depth
 TRIMMED, TRIMS = 3.0, 3  # median deviations beyond which a depth is left out of the plane, and how often that is done
 LEAST_NOISE = 1e-3  # of an inverse depth, as a share of it: below that none is left out
@@ -31,8 +29,8 @@ class MarkersConfig(msgspec.Struct, frozen=True, kw_only=True):
     least_px: float = 16.0  # smaller ones are left out: mean of the four sides as seen
 
     def __post_init__(self) -> None:
-        if self.dictionary and self.dictionary not in DICTIONARIES:
-            raise ValueError(f"no such dictionary: {self.dictionary}; there are {', '.join(sorted(DICTIONARIES))}")
+        if self.dictionary and self.dictionary not in dictionaries():
+            raise ValueError(f"no such dictionary: {self.dictionary}; there are {', '.join(sorted(dictionaries()))}")
         if self.dictionary and not self.size_m > 0:
             raise ValueError("size_m is missing: measure the side of the markers' black square")
         if not (0 < self.size_tolerance < 1 and self.least_px > 0):
@@ -73,11 +71,18 @@ def seen_markers(color: np.ndarray, depth_m: np.ndarray, camera: Intrinsics, cfg
     return MarkersSeen(np.array(ids, np.int32), np.array(sides_px, np.float32), np.stack(poses), faults)
 
 
+@lru_cache(maxsize=1)
+def dictionaries() -> dict[str, int]:
+    """OpenCV's number of each dictionary of markers, by its name in lower case."""
+    names = [name for name in dir(cv2.aruco) if name.startswith("DICT_")]
+    return {name.removeprefix("DICT_").lower(): getattr(cv2.aruco, name) for name in names}
+
+
 def _found(color: np.ndarray, cfg: MarkersConfig) -> list[tuple[int, np.ndarray]]:
     """Number and corners (4, 2) of each, from the upper left one as printed, clockwise, by number and place."""
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
-    dictionary = cv2.aruco.getPredefinedDictionary(DICTIONARIES[cfg.dictionary])
+    dictionary = cv2.aruco.getPredefinedDictionary(dictionaries()[cfg.dictionary])
     detector: Any = cv2.aruco.ArucoDetector(dictionary, parameters)
     corners, ids, _ = detector.detectMarkers(cv2.cvtColor(color, cv2.COLOR_RGB2GRAY))
     if ids is None:

@@ -9,11 +9,12 @@
 It knows no categories and asks for no weights. Touching things of one depth stay one object, thin legs get lost.
 """
 
-import cv2
 import msgspec
 import numpy as np
 
+from prior_sg.schemas.codec import AtLeastOne, Positive
 from prior_sg.schemas.frames import Intrinsics
+from prior_sg.services.opencv import cv2
 
 UPRIGHT, LEVEL = 0.25, 0.9  # |z| of the normals of upright and of level surfaces
 COLOUR_CLOSE_CELLS = 3  # gaps inside a coloured patch that are closed
@@ -22,9 +23,9 @@ COLOUR_CLOSE_CELLS = 3  # gaps inside a coloured patch that are closed
 class SegmentsConfig(msgspec.Struct, frozen=True, kw_only=True):
     """What counts as structure, and which of the rest is an object."""
 
-    cell_px: int = 4  # grid of the depth image that is looked at
+    cell_px: AtLeastOne = 4  # grid of the depth image that is looked at
     max_depth_m: float = 6.0  # beyond it, depth is too coarse and crops are too small
-    plane_tolerance_m: float = 0.05  # distance from a plane within which points are on it
+    plane_tolerance_m: Positive = 0.05  # distance from a plane within which points are on it
     level_area_m2: float = 0.3  # least visible area of floor and ceiling
     wall_area_m2: float = 1.0  # and of a wall
     behind_share: float = 0.08  # share of the points that may lie behind a wall: doors and windows are open

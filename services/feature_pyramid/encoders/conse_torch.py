@@ -74,10 +74,12 @@ class Sentences:
             return self.network(torch.from_numpy(tokens), torch.from_numpy(mask)).numpy()
 
     def export(self, path: Path) -> None:
-        """Write the network as ONNX: `tokens` and `mask` to `means`."""
+        """Write the network as ONNX: `tokens` and `mask` to `means`, weights in a file of their own, of which a process
+        holds only what it reads: half of them are words.
+        """
         example = (torch.tensor([[101, 2023, 102], [101, 102, 0]]), torch.tensor([[1, 1, 1], [1, 1, 0]]))
         axes = {0: "text", 1: "token"}
-        to_onnx.write(self.network, example, path, {"tokens": axes, "mask": axes}, "means")
+        to_onnx.write_large(self.network, example, path, {"tokens": axes, "mask": axes}, "means", apart=True)
 
 
 class _Pooled(torch.nn.Module):

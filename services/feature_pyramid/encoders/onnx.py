@@ -7,7 +7,6 @@ import hashlib
 from pathlib import Path
 from typing import Literal
 
-import cv2
 import msgspec
 import numpy as np
 from tokenizers import Tokenizer
@@ -17,6 +16,7 @@ from prior_sg.services.feature_pyramid.encoders.onnx_session import Session
 from prior_sg.services.feature_pyramid.encoders.resampling import resampled
 from prior_sg.services.feature_pyramid.encoders.two_towers import ClipEncoder
 from prior_sg.services.folders import expanded
+from prior_sg.services.opencv import cv2
 
 MANIFEST = "manifest.json"
 TEXT_BATCH = 64

@@ -3,6 +3,7 @@
 import hashlib
 import logging
 import os
+import tempfile
 from collections.abc import Callable
 from functools import cache, cached_property
 from pathlib import Path
@@ -17,13 +18,15 @@ log = logging.getLogger(__name__)
 
 
 class Session:
-    """One network, ready to run: arrays by input name to the first output."""
+    """One network, ready to run: arrays by input name to the first output. One that `keeps` holds memory ready for its
+    next call."""
 
-    def __init__(self, path: Path, threads: int, device: str = "cpu") -> None:
+    def __init__(self, path: Path, threads: int, device: str = "cpu", *, keeps: bool = True) -> None:
         runtime = _runtime()
         options = runtime.SessionOptions()
         options.log_severity_level = 3
         options.intra_op_num_threads = threads_of(threads)
+        options.enable_cpu_mem_arena = keeps
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # idle threads leave others the cores
         try:
             self._session = runtime.InferenceSession(str(path), options, providers=_providers(runtime, device))
@@ -44,7 +47,7 @@ class AtFirstCall:
 
     @cached_property
     def _session(self) -> Session:
-        return Session(*self._made_of)
+        return Session(*self._made_of, keeps=False)
 
     def __call__(self, *arrays: np.ndarray) -> np.ndarray:
         """The first output; inputs in the network's own order."""
@@ -59,8 +62,8 @@ def threads_of(threads: int) -> int:
 def cached(name: str, made_of: list[str], export: Callable[[Path], None], suffix: str = ".onnx") -> Path:
     """The exported network `name`, or another file that takes long to make, made at first use.
 
-    `made_of` is everything that determines it (versions, weights): whatever changes gets a file of its own. Several
-    processes may export at once; a half-written file is never seen.
+    `made_of` is everything that determines it (versions, weights): whatever changes gets a file of its own. An export
+    may write more files beside the one it is given. Several processes may export at once; half of one is never seen.
     """
     digest = hashlib.blake2b("\n".join(made_of).encode(), digest_size=8).hexdigest()
     file = f"{name}-{digest}{suffix}"
@@ -86,13 +89,13 @@ def say_temporary(folder: Path, reason: str) -> None:
 def _made(path: Path, export: Callable[[Path], None]) -> Path:
     if path.exists():
         return path
-    partial = path.with_name(f".{path.name}.{os.getpid()}")
     path.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        export(partial)
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
+    with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}.") as folder:
+        made = Path(folder) / path.name
+        export(made)
+        for beside in set(made.parent.iterdir()) - {made}:
+            beside.replace(path.parent / beside.name)
+        made.replace(path)
     return path
 
 

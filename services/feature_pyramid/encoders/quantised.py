@@ -11,10 +11,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from prior_sg.services.feature_pyramid.encoders.base import package
+from prior_sg.services.opencv import cv2
 
 PICTURES = 32  # that ranges are found on
 LEAVES = 400  # of a picture

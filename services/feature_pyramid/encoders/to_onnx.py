@@ -33,10 +33,17 @@ def write(network: Any, example: tuple, path: Path, inputs: dict[str, dict[int, 
 
 
 def write_large(
-    network: Any, example: tuple, path: Path, inputs: dict[str, dict[int, str]], output: str
+    network: Any,
+    example: tuple,
+    path: Path,
+    inputs: dict[str, dict[int, str]],
+    output: str,
+    *,
+    apart: bool = False,
 ) -> Path | None:
-    """As `write`, but weights too large for one file go into a second one beside it, which is returned."""
-    if sum(value.numel() * value.element_size() for value in network.state_dict().values()) <= MOST_BYTES:
+    """As `write`, but weights that are too many for one file, or are to lie `apart`, go into a second one beside it,
+    which is returned."""
+    if not apart and sum(value.numel() * value.element_size() for value in network.state_dict().values()) <= MOST_BYTES:
         write(network, example, path, inputs, output)
         return None
     onnx, weights = package("onnx"), path.with_suffix(".weights")

@@ -8,11 +8,11 @@ means anything at all. So tau and s_null need no labelled images.
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-import cv2
 import numpy as np
 
 from prior_sg.schemas.features import TextEmbeddings
 from prior_sg.services.feature_pyramid.encoders.base import unit
+from prior_sg.services.opencv import cv2
 
 TEMPLATES = ("{}", "a picture of {}", "a photo of {}")  # paper, Prior Graph Attributes: observation phrases, averaged
 NULL_PROMPTS = ("a photo", "a picture of nothing", "a blurry photo", "an empty image", "a texture", "noise")

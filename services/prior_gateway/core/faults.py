@@ -10,6 +10,7 @@ from prior_sg.schemas.names import LONGEST_NAME, fault_of_name, fault_of_text
 from prior_sg.schemas.priors import LONGEST_PHRASE
 
 MOST_LISTED = 16  # objects or phrases of one region
+LEAST_SPREAD_DEG = 0.01
 LARGEST_CM, HIGHEST_CM = 10_000, 2_000  # sides of an object, and its lower edge above the floor
 
 
@@ -104,8 +105,8 @@ def faults_of_description(name: str, entry: Described) -> list[str]:
     if not 1 <= len(entry.objects) <= MOST_LISTED or len(entry.phrases) > MOST_LISTED:
         faults.append(f"{name!r}: give 1 to {MOST_LISTED} objects and as many phrases at most")
     faults += filter(None, (fault_of_text(f"{name!r}: the phrase", phrase, LONGEST_PHRASE) for phrase in entry.phrases))
-    if not (0 <= entry.inclination_deg <= 90 and 0 < entry.inclination_spread_deg <= 90):
-        faults.append(f"{name!r}: inclination must be 0 to 90 degrees, its spread above 0")
+    if not (0 <= entry.inclination_deg <= 90 and LEAST_SPREAD_DEG <= entry.inclination_spread_deg <= 90):
+        faults.append(f"{name!r}: inclination must be 0 to 90 degrees, its spread at least {LEAST_SPREAD_DEG:g}")
     if not 10 <= entry.scale_cm <= 10000:
         faults.append(f"{name!r}: scale_cm {entry.scale_cm:g} is no sensible distance in centimetres")
     return faults

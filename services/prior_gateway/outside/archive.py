@@ -59,11 +59,11 @@ class PriorShelf:
         """Where everything of one task lies."""
         return self.root / task_digest(environment, task, regions) if self.root else None
 
-    def put(self, prior: Prior, name: str, root: Prior | None = None, verdict: str = "") -> None:
-        """Keep a prior as the answer to a question, or as the preferred one of its task."""
-        if folder := self.folder(prior.environment, prior.task, prior.vocabulary):
-            entry = Entry(stamp_ns=time.time_ns(), prior=prior, root=root, verdict=verdict)
-            _write(folder / f"{name}.prior", encode(entry))
+    def put(self, prior: Prior, name: str, root: Prior | None = None, verdict: str = "") -> bool:
+        """Keep a prior as the answer to a question, or as the preferred one of its task; whether it is kept."""
+        folder = self.folder(prior.environment, prior.task, prior.vocabulary)
+        entry = Entry(stamp_ns=time.time_ns(), prior=prior, root=root, verdict=verdict)
+        return folder is not None and _write(folder / f"{name}.prior", encode(entry))
 
     def put_evidence(self, evidence: PriorEvidence) -> None:
         """Keep the newest evidence of one map."""
@@ -123,7 +123,8 @@ def _age(path: Path) -> float:
         return 0.0
 
 
-def _write(path: Path, content: bytes) -> None:
+def _write(path: Path, content: bytes) -> bool:
+    """Whether it is written; why not is told in the log."""
     beside = path.with_suffix(f".{os.getpid()}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -131,6 +132,8 @@ def _write(path: Path, content: bytes) -> None:
         beside.replace(path)
     except OSError as error:
         log.warning("the prior archive cannot be written", extra={"path": str(path), "why": str(error)})
+        return False
+    return True
 
 
 def open_recall(cfg: Config, identity: Identity) -> Callable[[Recall], Awaitable[Recalled]]:

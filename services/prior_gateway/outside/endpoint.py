@@ -31,7 +31,7 @@ from prior_sg.services.prior_gateway.outside.dialects import (
     excerpt,
     read_said,
 )
-from prior_sg.services.runtime.service import Identity, ServiceError
+from prior_sg.services.runtime.service import ServiceError
 
 log = logging.getLogger(__name__)
 NEAR = (".local", ".lan", ".internal", ".home.arpa")  # ends of names that no public network has
@@ -239,16 +239,3 @@ def read_key(cfg: Config) -> str:
     if parts.scheme != "https" and not is_here(parts.hostname or ""):
         raise ServiceError("prior_gateway.endpoint: a key is sent over https only, or to this machine")
     return key
-
-
-def open_endpoint(cfg: Config, identity: Identity) -> Callable[[ModelRequest], Awaitable[ModelReply]]:
-    """The errand that asks the configured model. Raises ServiceError when its key is missing."""
-    if cfg.provider == "library":
-
-        async def nobody(request: ModelRequest) -> ModelReply:
-            return ModelReply(
-                conversation=request.conversation, turn=request.turn, failure="none", reason="no model is configured"
-            )
-
-        return nobody
-    return Endpoint(cfg, read_key(cfg)).ask

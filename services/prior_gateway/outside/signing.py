@@ -5,17 +5,18 @@ fleet with keys, hosts sign what they publish (services/runtime/signatures.py), 
 """
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import msgspec
-from cryptography.exceptions import InvalidSignature
-from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
-from cryptography.hazmat.primitives.serialization import load_pem_private_key, load_pem_public_key
 
 from prior_sg.schemas.priors import Prior
 from prior_sg.services.folders import expanded
 from prior_sg.services.prior_gateway.core.config import Config
 from prior_sg.services.runtime.service import ServiceError
 from prior_sg.services.runtime.signatures import Signatures, signatures_in_force
+
+if TYPE_CHECKING:  # it comes with the first key
+    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
 
 PURPOSE = b"prior-sg prior "  # a signature of a prior is one of nothing else
 
@@ -61,6 +62,8 @@ class Signer:
         key = self._trusted.get(made.signer)
         if key is None:
             return False, f"signed by {made.signer!r}, whose key is not among the trusted ones"
+        from cryptography.exceptions import InvalidSignature
+
         try:
             key.verify(bytes.fromhex(made.signature), PURPOSE + prior.digest().encode())
         except (InvalidSignature, ValueError):
@@ -68,7 +71,10 @@ class Signer:
         return True, f"signed by {made.signer!r}, verified"
 
 
-def _private(path: Path) -> Ed25519PrivateKey:
+def _private(path: Path) -> "Ed25519PrivateKey":
+    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+    from cryptography.hazmat.primitives.serialization import load_pem_private_key
+
     try:
         key = load_pem_private_key(path.read_bytes(), password=None)
     except (OSError, ValueError, TypeError) as error:
@@ -78,7 +84,10 @@ def _private(path: Path) -> Ed25519PrivateKey:
     return key
 
 
-def _public(path: Path) -> Ed25519PublicKey:
+def _public(path: Path) -> "Ed25519PublicKey":
+    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
+    from cryptography.hazmat.primitives.serialization import load_pem_public_key
+
     try:
         key = load_pem_public_key(path.read_bytes())
     except (OSError, ValueError) as error:

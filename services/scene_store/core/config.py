@@ -22,3 +22,5 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
     def __post_init__(self) -> None:
         if _PASSWORD.search(self.path):  # settings are logged and recorded
             raise ValueError("path holds a password; leave it out and put it into PGPASSWORD or ~/.pgpass")
+        if self.checkpoint_pages < 1:
+            raise ValueError("checkpoint_pages must be at least 1")

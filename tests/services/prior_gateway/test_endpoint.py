@@ -12,11 +12,11 @@ from prior_sg.schemas.priors import ModelReply, ModelRequest, Prior, PriorReques
 from prior_sg.services.prior_gateway import service
 from prior_sg.services.prior_gateway.core.config import CallConfig, Config
 from prior_sg.services.prior_gateway.core.turns import SynthesisConfig
+from prior_sg.services.prior_gateway.outside.asking import open_endpoint
 from prior_sg.services.prior_gateway.outside.endpoint import (
     Endpoint,
     is_here,
     is_near,
-    open_endpoint,
     read_key,
     retry_after_s,
 )

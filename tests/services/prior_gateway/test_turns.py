@@ -173,7 +173,8 @@ FAULTS = {
     ),
     "no phrase": (is_description, put("hall", "phrases", value=["", " "]), "there is no phrase"),
     "an endless phrase": (is_description, put("hall", "phrases", value=["x" * 999]), "longer than"),
-    "a vertical spread": (is_description, put("hall", "inclination_spread_deg", value=0), "its spread above 0"),
+    "a vertical spread": (is_description, put("hall", "inclination_spread_deg", value=0), "its spread at least"),
+    "a spread beyond numbers": (is_description, put("hall", "inclination_spread_deg", value=1e-200), "at least 0.01"),
     "size in metres": (
         is_sizes,
         lambda answer: {name: {side: value / 100 for side, value in row.items()} for name, row in answer.items()},

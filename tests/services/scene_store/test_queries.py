@@ -384,3 +384,8 @@ def test_levels_are_asked_for_by_label_by_id_and_by_what_they_hold():
 )
 def test_levels_that_are_not_there_are_told(question, reason):
     assert answer(levelled(), question).reason.startswith(reason)
+
+
+def test_of_many_labels_some_are_named_and_the_others_counted():
+    labels = len(INDEX.labels("region")) + len(INDEX.labels("object"))
+    assert f" and {labels - 6} others" in answer(INDEX, q.ByLabel(label="xyzzy")).reason

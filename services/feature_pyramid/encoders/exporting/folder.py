@@ -12,13 +12,13 @@ from dataclasses import dataclass
 from importlib import import_module, metadata
 from pathlib import Path
 
-import cv2
 import msgspec
 import numpy as np
 
 from prior_sg.services.feature_pyramid.encoders import onnx
 from prior_sg.services.feature_pyramid.encoders.base import EncoderUnavailable, Options, package, reason, unit
 from prior_sg.services.feature_pyramid.encoders.exporting.model import ExportError, Model, TorchTowers
+from prior_sg.services.opencv import cv2
 
 FAMILIES = {  # how a choice begins -> module with `model_of(choice) -> Model`
     "open_clip/": "prior_sg.services.feature_pyramid.encoders.exporting.open_clip",

@@ -49,6 +49,7 @@ def region_beliefs(index: Index, question: BeliefsOf) -> RegionBeliefs:
         unknown=float(index.scene.unknown[rows].astype(np.float64).mean()),
         predicted_share=float(index.predicted[rows].mean()),
         places=len(rows),
+        total=len(index.scene.labels),
     )
 
 

@@ -11,7 +11,7 @@ from prior_sg.schemas.scene import Scene
 from prior_sg.services.scene_store.core.queries.index import Index
 from prior_sg.services.scene_store.core.queries.things import thing, things
 
-MOST_HINTS, MOST_IDS = 3, 30
+MOST_HINTS, MOST_NAMED, MOST_IDS = 3, 6, 30
 ALIKE = 0.5  # of `difflib`, from which a label is worth naming
 REGIONS_AND_OBJECTS: tuple[What, ...] = ("region", "object")
 PLURAL = {"place": "places", "region": "regions", "object": "objects"}
@@ -59,7 +59,9 @@ def nothing_called(index: Index, what: What | None, label: str) -> Things | None
     if not known:
         reason = f"no {named} has a label yet" + ("" if index.scene.task else f": {after_a_task(index.scene)}")
     else:
-        shown = ", ".join(hints or known[: 2 * MOST_HINTS])
+        shown = ", ".join(hints or known[:MOST_NAMED])
+        if not hints and len(known) > MOST_NAMED:
+            shown += f" and {len(known) - MOST_NAMED} others"
         reason = f"no {named} is labelled {label!r}; {'the nearest labels are' if hints else 'there are'}: {shown}"
     return Things(nearest_labels=hints, reason=reason)
 

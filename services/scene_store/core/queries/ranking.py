@@ -50,7 +50,7 @@ def ranking(index: Index, question: AnswersTo) -> Ranking:
     best = heapq.nsmallest(question.limit, found, key=lambda one: (-one.score, ORDER.index(one.what), one.row))
     reason = "" if best else _no_answer(index, question)
     listed = [thing(index, one.what, one.row, score=calibrated(one.score)) for one in best]
-    return Ranking(things=listed, note=note, reason=reason)
+    return Ranking(things=listed, note=note, reason=reason, total=len(found))
 
 
 def _no_answer(index: Index, question: AnswersTo) -> str:

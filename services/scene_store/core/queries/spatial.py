@@ -45,9 +45,9 @@ def nearest(index: Index, question: Nearest) -> Things:
     """The nearest of a kind."""
     if question.label and (unknown := nothing_called(index, question.what, question.label)):
         return unknown
-    rows, distances_m = _nearest(index, question)
+    rows, distances_m, total = _nearest(index, question)
     order = np.argsort(distances_m, kind="stable")[: question.limit]
-    return Things(things=things(index, question.what, rows[order], distances_m[order]), total=len(order))
+    return Things(things=things(index, question.what, rows[order], distances_m[order]), total=total)
 
 
 def distances_of(index: Index, what: What, point_m: Point) -> np.ndarray:
@@ -83,14 +83,14 @@ def _within(index: Index, what: What, question: InRadius) -> tuple[np.ndarray, n
     return rows[near], distances_m[near]
 
 
-def _nearest(index: Index, question: Nearest) -> tuple[np.ndarray, np.ndarray]:
-    """Rows (n,), in order, and their distances (n,): all that may be among the nearest."""
+def _nearest(index: Index, question: Nearest) -> tuple[np.ndarray, np.ndarray, int]:
+    """Rows (n,), in order, and their distances (n,): all that may be among the nearest; and how many there are."""
     what, count = question.what, min(question.limit, len(index.ids(question.what)))
     if what == "place" and not question.label and count:
         farthest_m = float(np.max(index.tree.query(question.point_m, count)[0]))
         reach = InRadius(point_m=question.point_m, radius_m=farthest_m * (1 + CLOSE), what=what)
-        return _within(index, what, reach)
+        return *_within(index, what, reach), len(index.ids(what))
     rows = chosen_rows(index, what, question.label)
     distances_m = distances_of(index, what, question.point_m)[rows]
     there = np.isfinite(distances_m)
-    return rows[there], distances_m[there]
+    return rows[there], distances_m[there], int(there.sum())

@@ -19,7 +19,7 @@ DIGITS = 2
 
 def outlook(index: Index, question: WhereToLook) -> Outlook:
     """Openings behind which a region of the label may be, the best to begin with first, and the way to the first."""
-    if index.scene.merged_of:
+    if not foretold(index.scene):
         return Outlook(label=question.label, reason=_of_robots(index.scene))
     foresight, label = index.scene.foresight, _known(index, question.label)
     if not label:
@@ -34,48 +34,72 @@ def outlook(index: Index, question: WhereToLook) -> Outlook:
     except NoSuchSpot as error:
         return Outlook(label=label, found=seen, reason=str(error))
     ways_m = lengths_m[rows]
-    prospects = _prospects(foresight, held, label, ways_m, index.points_m[rows])[: question.limit]
+    prospects, total = _prospects(foresight, held, label, ways_m, index.points_m[rows], limit=question.limit)
     missing = {entry.label: entry.probability for entry in foresight.missing}
     if not prospects:
         reason = f"no way leads to any opening behind which {label!r} is at all likely"
         return Outlook(label=label, probability=missing.get(label, 0.0), found=seen, reason=reason)
     goal = Spot(what="place", id=prospects[0].opening.place_id)
     way = route(index, RouteBetween(start=question.start, goal=goal, clearance_m=question.clearance_m))
-    return Outlook(label=label, prospects=prospects, probability=missing.get(label, 0.0), route=way, found=seen)
+    return Outlook(
+        label=label,
+        prospects=prospects,
+        probability=missing.get(label, 0.0),
+        route=way,
+        found=seen,
+        total=total,
+        look_m=foresight.look_m,
+    )
 
 
 def missing(index: Index, question: WhatIsMissing) -> Missing:
     """What is probably behind the openings."""
-    if index.scene.merged_of:
+    if not foretold(index.scene):
         return Missing(reason=_of_robots(index.scene))
     foresight = index.scene.foresight
     reason = "" if foresight.openings or index.scene.task else f"nothing is expected yet: {after_a_task(index.scene)}"
-    return Missing(labels=foresight.missing[: question.limit], openings=len(foresight.openings), reason=reason)
+    return Missing(
+        labels=foresight.missing[: question.limit],
+        openings=len(foresight.openings),
+        reason=reason,
+        total=len(foresight.missing),
+    )
+
+
+def foretold(scene: Scene) -> bool:
+    """Whether anything can be foretold of this map; of a merged one, nothing where its robots follow several tasks."""
+    return not scene.merged_of or bool(scene.foresight.openings)
 
 
 def _of_robots(scene: Scene) -> str:
-    return only_of_robots(scene.robot, scene.merged_of, "what has not been seen")
+    what = "what has not been seen, where robots follow several tasks or nothing is open,"
+    return only_of_robots(scene.robot, scene.merged_of, what)
 
 
 def _prospects(
-    foresight: Foresight, held: list[Opening], label: str, ways_m: np.ndarray, points_m: np.ndarray
-) -> list[Prospect]:
+    foresight: Foresight, held: list[Opening], label: str, ways_m: np.ndarray, points_m: np.ndarray, *, limit: int
+) -> tuple[list[Prospect], int]:
+    """The best of them, and how many there are: only of those that are told a whole search is thought through."""
     entries = [_entry(opening, label) for opening in held]
     chances = np.array([entry.within if entry else 0.0 for entry in entries])
     toward = np.array([entry.toward if entry else 0.0 for entry in entries])
     likely = np.flatnonzero(((chances > 0) | (toward > 0)) & np.isfinite(ways_m))
     ways_m, points_m, chances, toward = ways_m[likely], points_m[likely], chances[likely], toward[likely]
-    metres = expected_metres(ways_m, points_m, chances, foresight.look_m, foresight.elsewhere_m)
     worth = chances_per_metre(ways_m, toward if toward.any() else chances, foresight.look_m)
-    return [
+    best = np.argsort(-worth, kind="stable")[:limit]
+    metres = expected_metres(ways_m, points_m, chances, foresight.look_m, foresight.elsewhere_m, firsts=best)
+    prospects = [
         Prospect(
             opening=held[likely[at]],
             probability=float(chances[at]),
-            expected_m=round(float(metres[at]), DIGITS),
+            expected_m=round(float(metre), DIGITS),
             way_m=round(float(ways_m[at]), DIGITS),
+            toward=float(toward[at]),
+            per_metre=float(worth[at]),
         )
-        for at in np.argsort(-worth, kind="stable").tolist()
+        for at, metre in zip(best.tolist(), metres, strict=True)
     ]
+    return prospects, len(likely)
 
 
 def _entry(opening: Opening, label: str) -> ForeseenLabel | None:
