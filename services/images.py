@@ -1,10 +1,11 @@
 """Colour and depth of a keyframe, decoded, and what can be wrong with them (pure)."""
 
-import cv2
 import numpy as np
 
+from prior_sg.schemas.codec import File
 from prior_sg.schemas.frames import Intrinsics, Keyframe
-from prior_sg.services.headers import ImageError, image_size, trimmed
+from prior_sg.services.headers import ImageError, image_end, image_size
+from prior_sg.services.opencv import cv2
 
 MAX_PRINCIPAL_OFFSET = 0.45  # share of the image by which the principal point may be off its middle: crops
 
@@ -48,20 +49,20 @@ def blank_of(keyframe: Keyframe) -> tuple[np.ndarray, np.ndarray]:
     return np.zeros((*size, 3), np.uint8), np.zeros(size, np.float32)
 
 
-def _single_channel(data: bytes, camera: Intrinsics, name: str) -> np.ndarray:
+def _single_channel(data: File, camera: Intrinsics, name: str) -> np.ndarray:
     image = _decoded(data, camera, name, cv2.IMREAD_UNCHANGED)
     if image.ndim != 2:
         raise ImageFault(f"the {name} image has {image.shape[2]} channels instead of one")
     return image
 
 
-def _decoded(data: bytes, camera: Intrinsics, name: str, mode: int) -> np.ndarray:
+def _decoded(data: File, camera: Intrinsics, name: str, mode: int) -> np.ndarray:
     """Decodes only what its header says to be of the camera's size: others may be far larger than they look. OpenCV
     believes each part of a PNG how long it is, up to 2 GB, so one whose parts do not fit in is not given to it."""
     try:
         width_px, height_px, _ = image_size(data)
         _check_size(width_px, height_px, camera, name)
-        image = cv2.imdecode(np.frombuffer(trimmed(data), np.uint8), mode)
+        image = cv2.imdecode(np.frombuffer(data, np.uint8, image_end(data)), mode)
     except (cv2.error, ImageError):
         image = None
     if image is None:

@@ -41,6 +41,7 @@ from prior_sg.services.ingest.core.keeping import keep, keep_after
 from prior_sg.services.ingest.core.options import is_live
 from prior_sg.services.ingest.sources import LastingError, Source, SourceError, open_source
 from prior_sg.services.ingest.sources.base import Event
+from prior_sg.services.runtime import heap
 from prior_sg.services.runtime.service import Identity, Output, Service
 
 log = logging.getLogger(__name__)
@@ -142,6 +143,7 @@ async def drive(port: Port, cfg: Config) -> None:
     source = await _opened(port, cfg)
     if source is None:
         return
+    heap.give_back()  # what the images that were looked at took
     log.info("reading", extra={"source": cfg.source, "layout": source.layout, "frames": source.total})
     for note in source.notes:
         log.info("source", extra={"note": note})

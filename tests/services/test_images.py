@@ -9,6 +9,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from prior_sg.schemas.codec import copied
 from prior_sg.schemas.frames import MOST_PIXELS, Intrinsics, Keyframe
 from prior_sg.services.images import ImageFault, color_of, depth_of
 from tests.help.examples import EXAMPLES
@@ -63,8 +64,23 @@ def test_what_its_header_says_to_be_larger_than_the_camera_is_never_decoded(deco
     "data", [b"", b"no", GOOD.color[:20], b"\x89PNG\r\n\x1a\n", GOOD.depth[:30], b"BM" + b"\0" * 60]
 )
 def test_what_has_no_header_of_a_format_that_travels_cannot_be_decoded(data):
-    with pytest.raises(ImageFault, match="cannot be decoded"):
-        color_of(msgspec.structs.replace(GOOD, color=data))
+    damaged = msgspec.structs.replace(GOOD, color=data)
+    for frame in (damaged, copied(damaged)):  # as a source gives it, and as the bus does
+        with pytest.raises(ImageFault, match="cannot be decoded"):
+            color_of(frame)
+
+
+@pytest.mark.parametrize("extension", [".jpg", ".png"])
+def test_images_of_a_received_keyframe_are_decoded_as_they_were_sent(extension):
+    pixels = np.arange(36, dtype=np.uint8).reshape(3, 4, 3)
+    color = cv2.imencode(extension, pixels)[1].tobytes() + b"what follows the end"
+    mask = cv2.imencode(".png", np.eye(3, 4, dtype=np.uint8))[1].tobytes()
+    sent = msgspec.structs.replace(GOOD, color=color, mask=mask)
+    received = copied(sent)
+    assert isinstance(received.color, memoryview)
+    np.testing.assert_array_equal(color_of(received), color_of(sent))
+    np.testing.assert_array_equal(depth_of(received, 0.5), depth_of(sent, 0.5))
+    assert depth_of(received, 0.5)[0, 0] == 0 < depth_of(received, 0.5)[0, 1]
 
 
 def test_a_camera_has_no_more_pixels_than_memory_bears():

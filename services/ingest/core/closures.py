@@ -6,10 +6,10 @@ best that can be said is that it grew evenly with the way travelled since the la
 
 from collections.abc import Sequence
 
-import cv2
 import numpy as np
 
 from prior_sg.services.ingest.core.frames import View
+from prior_sg.services.opencv import cv2
 
 
 def spread(trail: Sequence[View], now: View, after_from_before: np.ndarray) -> list[np.ndarray]:

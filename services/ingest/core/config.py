@@ -29,3 +29,5 @@ class Config(ReadOptions, frozen=True, kw_only=True):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_posed(self.source, self.pose_source)
+        if self.window < 1:
+            raise ValueError(f"window is {self.window}: with less than 1 the source would wait for ever")

@@ -9,6 +9,8 @@ from typing import Literal
 
 import msgspec
 
+from prior_sg.schemas.codec import Signed
+
 PoseConvention = Literal["world_from_camera", "camera_from_world"]
 QuaternionOrder = Literal["xyzw", "wxyz"]
 CameraAxes = Literal["opencv", "opengl", "ros", "ned"]
@@ -27,14 +29,14 @@ class ReadOptions(msgspec.Struct, frozen=True, kw_only=True):
 
     source_robot: str = ""  # of a log with several robots: the one to read; empty = the first
     layout: str = ""  # name of a layout in docs/sources.md; empty = recognised by its files
-    world_up: list[float] = msgspec.field(default_factory=list)  # up in the source's world; empty = as the layout says
-    floor_m: float = 0.0  # height of the floor in the source's world, measured along world_up; becomes z = 0
+    world_up: list[Signed] = msgspec.field(default_factory=list)  # up in the source's world; empty = as the layout says
+    floor_m: Signed = 0.0  # height of the floor in the source's world, measured along world_up; becomes z = 0
     origin: str = ORIGIN_AUTO  # keep, auto (recentred when kilometres away), or x,y,z in the levelled world
     rate_hz: float = 0.0  # frames per second, in place of the source's stamps; 0 = by its stamps
     stamp_unit: Literal["", StampUnit] = ""  # of written stamps; empty = detected from their size and spacing
-    stamp_offset_s: float | None = None  # added to the stamps of separately stamped poses; none = detected
+    stamp_offset_s: Signed | None = None  # added to the stamps of separately stamped poses; none = detected
     depth_scale_m: float | None = None  # metres per depth unit; none = as the source says
-    depth_invalid: list[float] | None = None  # depth values that mean nothing, besides 0; none = 65535
+    depth_invalid: list[Signed] | None = None  # depth values that mean nothing, besides 0; none = 65535
     depth_min_m: float = 0.0  # nearer depth is no measurement
     depth_max_m: float = 0.0  # farther depth is no measurement; 0 = no limit
     poses: Literal["", PoseConvention] = ""  # what the written poses map
@@ -44,14 +46,14 @@ class ReadOptions(msgspec.Struct, frozen=True, kw_only=True):
     position_scale_m: float = 1.0  # metres per unit of written positions
     intrinsics: list[float] = msgspec.field(default_factory=list)  # fx fy cx cy, pixels; then width height, if other
     camera_model: Literal["", LensModel] = ""  # of the lens; opencv = radial and tangential, fisheye = Kannala-Brandt
-    distortion: list[float] = msgspec.field(default_factory=list)  # its coefficients, as OpenCV orders them
+    distortion: list[Signed] = msgspec.field(default_factory=list)  # its coefficients, as OpenCV orders them
     cameras: str = ""  # of a robot of ROS: all, or colour topics separated by commas; empty = one camera
     color_topic: str = ""  # of a ROS recording; empty = chosen by type, frame and name, as are the next three
     depth_topic: str = ""
     info_topic: str = ""  # the colour camera's info
     pose_topic: str = ""  # odometry, poses or transforms; empty = tf where it moves the camera, else one of them
     pose_source: str = ""  # of a camera: a file or FIFO that grows by lines of stamp tx ty tz qx qy qz qw, or ros2:/
-    body_from_camera: list[float] = msgspec.field(
+    body_from_camera: list[Signed] = msgspec.field(
         default_factory=list
     )  # of a camera: tx ty tz qx qy qz qw of it in the
     # frame whose poses come; empty = they are the camera's

@@ -3,10 +3,10 @@
 import io
 import tokenize
 
-import cv2
 import numpy as np
 
 from prior_sg.services.headers import ImageError, image_size, is_sized, trimmed
+from prior_sg.services.opencv import cv2
 
 NPY_MAGIC, EXR_MAGIC = b"\x93NUMPY", b"\x76\x2f\x31\x01"
 BITS = {"uint8": 8, "int8": 8, "bool": 8}

@@ -3,10 +3,10 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from prior_sg.schemas.frames import Intrinsics
+from prior_sg.services.opencv import cv2
 
 BLOCK_PX = 5
 STEPS_PX = 16  # disparities that SGBM takes are a multiple of this

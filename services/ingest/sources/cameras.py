@@ -3,13 +3,13 @@
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from prior_sg.schemas.frames import Intrinsics
 from prior_sg.services.ingest.core.options import ReadOptions, check_lens
 from prior_sg.services.ingest.sources.base import Camera, Found
 from prior_sg.services.ingest.sources.tables import SourceError
+from prior_sg.services.opencv import cv2
 
 ASPECT_TOLERANCE = 0.01
 EDGE = 0.45  # share of the image by which a principal point may be off its middle; a crop may have 0.4

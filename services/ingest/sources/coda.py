@@ -27,7 +27,6 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from prior_sg.schemas.frames import Intrinsics
@@ -49,6 +48,7 @@ from prior_sg.services.ingest.sources.base import (
     truth_beside,
 )
 from prior_sg.services.ingest.sources.tables import stamps_ns, table, text_of
+from prior_sg.services.opencv import cv2
 
 NAME = "coda"
 RAW, RECTIFIED, SCANS = "2d_raw", "2d_rect", "3d_comp/os1"

@@ -11,13 +11,13 @@ file.
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from prior_sg.services.ingest.core import stereo
 from prior_sg.services.ingest.core.mono.scale import INVERSE, KINDS
 from prior_sg.services.ingest.core.options import ReadOptions
 from prior_sg.services.ingest.sources.base import FrameError, SourceError
+from prior_sg.services.opencv import cv2
 from prior_sg.services.runtime import extras
 
 MULTIPLE_PX = 32

@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from prior_sg.schemas.frames import Intrinsics
+from prior_sg.services.errors import reason_of
 from prior_sg.services.ingest.core.detection import up_of
 from prior_sg.services.ingest.core.options import ReadOptions
 from prior_sg.services.ingest.sources import pose_lists
@@ -156,7 +157,7 @@ def _camera(path: Path, folder: Folder, options: ReadOptions) -> tuple[Camera, f
     except KeyError as error:
         raise SourceError(f"{file} is not a camera: it does not say {error.args[0]}") from error
     except (OSError, TypeError, ValueError, AttributeError) as error:
-        raise SourceError(f"{file} is not a camera: {error}") from error
+        raise SourceError(f"{file} is not a camera: {reason_of(error)}") from error
 
 
 def _images(file: Files, depthless: bool) -> Images:

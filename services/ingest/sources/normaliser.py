@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from prior_sg.schemas.frames import Intrinsics
@@ -19,6 +18,7 @@ from prior_sg.services.ingest.sources.base import (
     depth_pixels,
 )
 from prior_sg.services.ingest.sources.cameras import Sizes
+from prior_sg.services.opencv import cv2
 
 UNUSABLE = (FrameError, PoseError, ImageError)
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from prior_sg.services.errors import reason_of
 from prior_sg.services.ingest.core.pixels import stored
 from prior_sg.services.ingest.sources.pose_lists import PoseList
 from prior_sg.services.ingest.sources.tables import SourceError, read_json, text_of
@@ -31,7 +32,7 @@ def described(path: Path, listed: PoseList | None) -> tuple[Path | None, dict[st
         try:
             return files[0], fields_of(files[0])
         except (OSError, TypeError, ValueError, AttributeError) as error:
-            raise SourceError(f"{files[0]} is not a camera: {error}") from error
+            raise SourceError(f"{files[0]} is not a camera: {reason_of(error)}") from error
     if listed is not None and listed.camera:
         fields = _flat({name.lower(): value for name, value in listed.camera.items() if name != "scale"})
         return listed.path, fields
@@ -74,12 +75,26 @@ def _of_text(text: str, path: Path) -> dict[str, Any]:
     text = re.sub(rf":[ \t]*\n((?:\s*-[ \t]+{NUMBER}[ \t]*(?:\n|$))+)", _in_brackets, text)
     named = re.findall(rf"^[\s\-]*([A-Za-z_][\w.]*)\s*[:=]\s*({NUMBER}|[A-Za-z_]\w*)\s*,?\s*$", text, re.MULTILINE)
     fields = _flat({name.lower().rpartition(".")[2]: value for name, value in named})
-    listed = re.search(rf"(?:camera_matrix|\b[Kk]\b)[^\[]*\[((?:[\s,]|{NUMBER})+)\]", text)
     if "fx" not in fields:
-        numbers = listed[1] if listed else re.sub(r"^\s*#.*$", "", text, flags=re.MULTILINE)
-        fields |= _of_matrix([float(n) for n in re.findall(NUMBER, numbers)], path)
-    bent = re.search(rf"(?:distortion_coefficients|^\s*[Dd]\b)[^\[]*\[((?:[\s,]|{NUMBER})+)\]", text, re.MULTILINE)
-    return fields | ({"distortion": [float(n) for n in re.findall(NUMBER, bent[1])]} if bent else {})
+        numbers = in_brackets(text, r"(?:camera_matrix|\b[Kk]\b)[^\[]*")
+        if not numbers:
+            bare = re.sub(r"^\s*#.*$", "", text, flags=re.MULTILINE)
+            numbers = [float(n) for n in re.findall(NUMBER, bare)]
+        fields |= _of_matrix(numbers, path)
+    bent = in_brackets(text, r"(?:distortion_coefficients|^\s*[Dd]\b)[^\[]*")
+    if bent is None:
+        raise SourceError(f"{path} is not a camera: its distortion is no list of numbers")
+    return fields | ({"distortion": bent} if bent else {})
+
+
+def in_brackets(text: str, before: str) -> list[float] | None:
+    """The numbers in the first brackets behind a pattern; empty where there are none, None where they hold anything
+    else or are never closed."""
+    found = re.search(rf"{before}\[([^\[\]]*)(\]?)", text, re.MULTILINE | re.DOTALL)
+    words = found[1].replace(",", " ").split() if found else []
+    if found and not (found[2] and all(re.fullmatch(NUMBER, word) for word in words)):
+        return None
+    return [float(word) for word in words]
 
 
 def _in_brackets(found: re.Match[str]) -> str:

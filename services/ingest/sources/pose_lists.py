@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 
+from prior_sg.services.errors import reason_of
 from prior_sg.services.headers import ImageError
 from prior_sg.services.ingest.core.options import ReadOptions
 from prior_sg.services.ingest.core.pixels import array_of
@@ -151,7 +152,7 @@ def _array(path: Path) -> PoseList:
     try:
         array = array_of(path.read_bytes())
     except (ImageError, OSError) as error:
-        raise SourceError(f"{path} holds no poses: {error}") from error
+        raise SourceError(f"{path} holds no poses: {reason_of(error)}") from error
     size = int(np.prod(array.shape[1:])) if array.ndim > 1 else 0
     if array.ndim not in (2, 3) or size not in (STAMPED, QUATERNION, 12, 16):
         raise SourceError(f"{path} holds no poses: its array has the shape {array.shape} instead of (n, 4, 4)")

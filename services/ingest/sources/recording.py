@@ -26,6 +26,7 @@ from prior_sg.services.runtime.record import (
     contents,
     foreign_topics,
     is_whole,
+    loss,
     read_log,
 )
 
@@ -104,14 +105,22 @@ def _opened(path: Path, robot: str) -> tuple[Log, bool]:
         total = sum(content.messages for content in streams if content.key == key)
         if total == 0:
             raise SourceError(
-                f"{path} holds no keyframes{f' of {robot}' if robot else ''}{_robots(streams) or _foreign(path)}"
+                f"{path} holds no keyframes{f' of {robot}' if robot else ''}{_robots(streams) or _others(path, found)}"
             )
-        files = attachments(path)
-        truth = json.loads(files[REGIONS]) if REGIONS in files else None
+        truth, damaged = _truth(path)
     except ValueError as error:
         raise SourceError(f"the ground truth in {path} cannot be read: {error}") from error
-    recorded = Log(path, key, total, _first(path, key), truth, tuple(_notes(path, streams, key)))
+    recorded = Log(path, key, total, _first(path, key), truth, (*_notes(path, streams, key), *damaged))
     return recorded, any(content.topic == POSE_UPDATE.name for content in found)
+
+
+def _truth(path: Path) -> tuple[dict[str, Any] | None, list[str]]:
+    """The ground truth, and a note where it may be in a part that is damaged. Raises ValueError."""
+    try:
+        files = attachments(path)
+    except LogError as error:
+        return None, [f"it is read without ground truth: {error}"]
+    return json.loads(files[REGIONS]) if REGIONS in files else None, []
 
 
 def _samples(recorded: Log, convention: Convention) -> list[tuple[np.ndarray, Images]]:
@@ -130,7 +139,7 @@ def _samples(recorded: Log, convention: Convention) -> list[tuple[np.ndarray, Im
 
 
 def _images(keyframe: Keyframe) -> Images:
-    return Images(keyframe.color, keyframe.depth, keyframe.mask)
+    return Images(bytes(keyframe.color), bytes(keyframe.depth), bytes(keyframe.mask))
 
 
 def _frames(
@@ -193,7 +202,7 @@ def _first(path: Path, key: str) -> Keyframe:
             return decode(Keyframe, payload)
         except DecodeError:
             continue
-    raise SourceError(f"no keyframe in {path} can be read: they come from another version")
+    raise SourceError(f"no keyframe in {path} can be read: they are damaged, or of another version")
 
 
 def _notes(path: Path, streams: Sequence[Content], key: str) -> Iterator[str]:
@@ -204,15 +213,21 @@ def _notes(path: Path, streams: Sequence[Content], key: str) -> Iterator[str]:
     if len(counts) > 1:
         told = ", ".join(f"{other.split('/')[1]} ({count} keyframes)" for other, count in counts.items())
         yield f"it holds the robots {told}: {key.split('/')[1]} is read; --set ingest.source_robot=NAME reads another"
-    if not is_whole(path):
-        yield f"the log was cut off: the {counts[key]} keyframes that are complete are read"
+    if lost := loss(path):
+        yield f"of the log the {counts[key]} keyframes that are complete are read: {lost}"
 
 
-def _foreign(path: Path) -> str:
+def _others(path: Path, found: Sequence[Content]) -> str:
+    """What a log without keyframes holds instead, as the end of a sentence. Raises LogError."""
+    if ours := sorted({content.topic[:60] for content in found}):
+        return f"; of ours it holds {', '.join(ours[:5])}: record a system with its ingest"
     topics = foreign_topics(path)
     if not topics:
         return "; it holds no messages of ours" if is_whole(path) else ": it was cut off before its first complete part"
     told = ", ".join(topic[:60] for topic in topics[:5])
+    if not is_whole(path):
+        mend = f"`mcap recover {path.name} -o whole.mcap` keeps what is complete"
+        return f": it was written by another program (topics {told}), and its end is missing or damaged; {mend}"
     return f": it was written by another program (topics {told}); export its images, depth and poses into a folder"
 
 

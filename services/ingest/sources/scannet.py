@@ -16,7 +16,6 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from prior_sg.schemas.frames import Intrinsics
@@ -38,6 +37,7 @@ from prior_sg.services.ingest.sources.base import (
     truth_beside,
 )
 from prior_sg.services.ingest.sources.tables import text_of
+from prior_sg.services.opencv import cv2
 
 NAME = "scannet"
 COLOR_CAMERA, DEPTH_CAMERA = "intrinsic/intrinsic_color.txt", "intrinsic/intrinsic_depth.txt"

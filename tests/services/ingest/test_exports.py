@@ -315,6 +315,16 @@ def test_exports_damaged_by_hand_give_a_result_or_a_sentence(tmp_path, unpacks, 
             assert all(isinstance(frame, RawFrame | BadFrame) for frame in frames)
 
 
+@pytest.mark.timeout(20)
+def test_a_transform_that_is_cut_off_is_told_at_once(tmp_path, written):
+    path = shutil.copytree(written("rtabmap"), tmp_path / "d")
+    (path / "map_camera_poses.txt").rename(path / "map_poses.txt")
+    for file in (path / "map_calib").iterdir():
+        file.write_text(file.read_text().rpartition("]")[0])
+    with pytest.raises(SourceError, match="has no local_transform of 3 x 4 numbers"):
+        open_source(path)
+
+
 @pytest.mark.parametrize("name", ["rtabmap", "stray-scanner"])
 def test_check_understands_an_export(written, name):
     report = check(open_source(written(name)), Config(), brief=True)

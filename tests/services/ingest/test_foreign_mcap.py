@@ -132,6 +132,13 @@ def test_damaged_messages_cost_themselves_or_one_sentence(tmp_path, rng):
             assert 10 < len(str(error)) < 500 and "\n" not in str(error)
 
 
+def test_a_recording_of_another_program_that_was_cut_off_is_told_what_mends_it(tmp_path):
+    data = without_profile(tmp_path / "walk.mcap").read_bytes()
+    (tmp_path / "cut.mcap").write_bytes(data[:-30])
+    with pytest.raises(SourceError, match=r"its end is missing or damaged; `mcap recover cut\.mcap"):
+        open_source(tmp_path / "cut.mcap")
+
+
 def test_depth_lies_in_the_frames_of_a_foxglove_file(tmp_path):
     frames = [frame for frame in open_source(by_sdk(tmp_path / "a.mcap", True)) if isinstance(frame, RawFrame)]
     assert [frame.stamp_ns for frame in frames] == STAMPS_NS and frames[0].stamp_ns % MS

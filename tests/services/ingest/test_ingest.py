@@ -356,14 +356,7 @@ def test_a_log_that_was_cut_off_says_so(tmp_path):
 
 
 def test_a_damaged_part_of_a_log_costs_what_lies_in_it(tmp_path):
-    path = tmp_path / "a.mcap"
-    with LogWriter(path) as log:
-        for number in range(6):
-            raw = frame(number, number)
-            fields = {name: getattr(raw, name) for name in Keyframe.__struct_fields__ if hasattr(raw, name)}
-            keyframe = Keyframe(robot="a", **fields)
-            log.add(KEYFRAME, KEYFRAME.key_of(keyframe), encode(keyframe), "w", number, sent_ns=0, received_ns=number)
-            log.flush()
+    path = log_in_parts(tmp_path / "a.mcap", 6)
     data = bytearray(path.read_bytes())
     at = len(data) // 2
     data[at : at + 8] = b"\xff" * 8
@@ -374,7 +367,44 @@ def test_a_damaged_part_of_a_log_costs_what_lies_in_it(tmp_path):
     assert "damaged" in lost[0].reason
 
 
+def log_in_parts(path, frames):
+    """A log with a chunk for each keyframe."""
+    with LogWriter(path) as log:
+        for number in range(frames):
+            raw = frame(number, number)
+            fields = {name: getattr(raw, name) for name in Keyframe.__struct_fields__ if hasattr(raw, name)}
+            keyframe = Keyframe(robot="a", **fields)
+            log.add(KEYFRAME, KEYFRAME.key_of(keyframe), encode(keyframe), "w", number, sent_ns=0, received_ns=number)
+            log.flush()
+        log.attach("regions.json", "application/json", b'{"regions": []}')
+    return path
+
+
+def test_of_a_log_that_was_cut_off_and_damaged_all_that_can_be_read_is(tmp_path):
+    path = log_in_parts(tmp_path / "a.mcap", 6)
+    data = bytearray(path.read_bytes())
+    at = len(data) // 2
+    data[at : at + 8] = b"\xff" * 8
+    path.write_bytes(data[:-100])
+    source = open_source(path)
+    found = [f.frame_id for f in source]
+    assert len(found) == 5 and found[:2] == [0, 1] and found[-1] == 5
+    assert any("damaged parts left out: 1" in note for note in source.notes)
+
+
+def test_a_damaged_attachment_costs_the_ground_truth_alone(tmp_path):
+    path = log_in_parts(tmp_path / "a.mcap", 3)
+    path.write_bytes(path.read_bytes().replace(b'{"regions"', b'{"regiona"'))
+    source = open_source(path)
+    assert len(list(source)) == 3 and source.ground_truth is None
+    assert any("without ground truth" in note for note in source.notes)
+
+
 def test_logs_without_keyframes_are_told_apart(tmp_path):
+    with LogWriter(tmp_path / "task.mcap") as log:
+        log.add(POSE_UPDATE, "psg/a/pose_update", b"", "w", 0, sent_ns=0, received_ns=0)
+    with pytest.raises(SourceError, match="holds no keyframes; of ours it holds POSE_UPDATE: record a system"):
+        open_source(tmp_path / "task.mcap")
     with LogWriter(tmp_path / "empty.mcap"):
         pass
     with pytest.raises(SourceError, match="holds no keyframes; it holds no messages of ours"):

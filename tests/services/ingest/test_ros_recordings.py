@@ -2,6 +2,8 @@
 
 import json
 import shutil
+import sqlite3
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -287,6 +289,16 @@ def test_damaged_recordings_give_frames_or_one_sentence(bags, tmp_path, kind):
             sentences += 1
             assert "\n" not in str(error)
     assert sentences
+
+
+def test_messages_that_only_the_index_knows_are_told(bags, tmp_path):
+    shutil.copytree(bags["sqlite3"], tmp_path / "walk")
+    (file,) = (tmp_path / "walk").glob("*.db3")
+    with closing(sqlite3.connect(file)) as database, database:
+        where = "topic_id = (SELECT id FROM topics WHERE name = ?)"
+        database.execute(f"DELETE FROM messages WHERE id = (SELECT max(id) FROM messages WHERE {where})", (DEPTH,))
+    source = open_source(tmp_path / "walk")
+    assert any(f"1 messages of {DEPTH} are missing, though its index counts them" in note for note in source.notes)
 
 
 def test_our_own_logs_stay_ours_and_files_alone_are_read(bags):

@@ -183,3 +183,28 @@ def test_lines_of_a_replica_trajectory_belong_to_the_images_in_order(tmp_path, n
         (tmp_path / f"results/depth{number(i):06d}.png").write_bytes(png(depth))
     for frame, (pose, _, _) in zip(open_source(tmp_path), WALK, strict=True):
         np.testing.assert_allclose(frame.world_from_camera, pose, atol=1e-6)
+
+
+@pytest.mark.timeout(20)
+@pytest.mark.parametrize("end", ["", ", .inf]", ", fy]"])
+def test_a_list_in_brackets_that_is_none_is_one_sentence_at_once(tmp_path, end):
+    own(tmp_path, intrinsics=False)
+    numbers = "525.000000, 0.000000, 319.500000, 0.000000, 525.000000, 239.500000, 0.000000, 0.000000"
+    (tmp_path / "camera.yaml").write_text(f"width: 80\nheight: 60\nK: [{numbers}{end}\n")
+    with pytest.raises(SourceError, match=r"camera.yaml is not a camera: it has 10 numbers instead of a matrix"):
+        open_source(tmp_path)
+
+
+@pytest.mark.timeout(20)
+def test_a_distortion_that_is_cut_off_is_not_left_out_in_silence(tmp_path):
+    own(tmp_path, intrinsics=False)
+    numbers = "fx: 60\nfy: 60\ncx: 39.5\ncy: 29.5\ndistortion_coefficients: [-0.28340811, 0.07395907, 0.0001"
+    (tmp_path / "camera.yaml").write_text(f"width: 80\nheight: 60\n{numbers}")
+    with pytest.raises(SourceError, match=r"camera.yaml is not a camera: its distortion is no list of numbers"):
+        open_source(tmp_path)
+
+
+def test_a_recording_that_lists_no_frame_and_has_no_stamps_has_none(tmp_path):
+    (tmp_path / "associations.txt").touch()
+    (tmp_path / "traj.gt.freiburg").write_text("1 0 0 0 0 0 0 1\n")
+    assert open_source(tmp_path).total == 0

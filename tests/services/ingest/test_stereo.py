@@ -216,6 +216,10 @@ def later(path):
         (no_right, "depth needs cam0 and cam1"),
         (exchanged, "exchange them"),
         (without("intrinsics"), "intrinsics with 4 numbers"),
+        (
+            with_lens("distortion_model: radtan\ndistortion_coefficients: [-0.28340811, 0.07395907"),
+            "coefficients with nothing but",
+        ),
         (without("data:"), "T_BS with 16 numbers"),
         (lambda path: shutil.rmtree(path / "mav0/state_groundtruth_estimate0"), "has no poses"),
         (without("1", "state_groundtruth_estimate0/data.csv"), "no pose that can be used|no list of poses"),

@@ -9,7 +9,6 @@ those of the measured pixels, as in joint bilateral upsampling (Kopf et al. 2007
 is linear in the image on every flat surface: a plain average makes stairs of a floor between two rings.
 """
 
-import cv2
 import numpy as np
 from scipy.spatial import Delaunay, QhullError
 
@@ -17,6 +16,7 @@ from prior_sg.schemas.frames import Intrinsics
 from prior_sg.services.compiled import compiled
 from prior_sg.services.geometry import project
 from prior_sg.services.ingest.core.lidar import draw_triangles
+from prior_sg.services.opencv import cv2
 
 NEAR_M = 0.2  # nothing nearer to the camera is drawn
 HIDDEN = 0.1  # a point this share behind its neighbours on two sides is seen through them

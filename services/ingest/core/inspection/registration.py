@@ -2,11 +2,11 @@
 
 from collections.abc import Sequence
 
-import cv2
 import numpy as np
 
 from prior_sg.services.ingest.core.inspection.findings import Finding, note, ok, problem
 from prior_sg.services.ingest.core.inspection.sample import Shot
+from prior_sg.services.opencv import cv2
 
 WIDTH_PX = 160  # images are compared at about this width
 STEP = 0.06  # of depth, relative, that is an edge

@@ -14,10 +14,10 @@ their epipolar lines, at least NOISE_PX. A picture in which half of the points a
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from prior_sg.schemas.frames import Intrinsics
+from prior_sg.services.opencv import cv2
 
 MOST_POINTS, QUALITY, APART_PX = 400, 0.005, 9
 WINDOW, LEVELS = (21, 21), 4

@@ -3,34 +3,35 @@
 import struct
 from typing import Any
 
-import cv2
 import numpy as np
 
 from prior_sg.services.headers import ImageError, is_sized, trimmed
 from prior_sg.services.ingest.core.pixels import encoded, stored
 from prior_sg.services.ingest.core.ros.rvl import unrolled
+from prior_sg.services.opencv import cv2
 
 COLOR, GREY, DEPTH = "colour", "grey", "depth"  # what an image shows
-LAYOUTS = {  # of sensor_msgs/Image: what it shows, type and number of channels, and OpenCV's way to blue, green, red
-    "bgr8": (COLOR, "u1", 3, None),
-    "8UC3": (COLOR, "u1", 3, None),  # OpenCV's own name, whose order is OpenCV's
-    "rgb8": (COLOR, "u1", 3, cv2.COLOR_RGB2BGR),
-    "bgra8": (COLOR, "u1", 4, cv2.COLOR_BGRA2BGR),
-    "8UC4": (COLOR, "u1", 4, cv2.COLOR_BGRA2BGR),
-    "rgba8": (COLOR, "u1", 4, cv2.COLOR_RGBA2BGR),
-    "yuv422": (COLOR, "u1", 2, cv2.COLOR_YUV2BGR_UYVY),
-    "uyvy": (COLOR, "u1", 2, cv2.COLOR_YUV2BGR_UYVY),
-    "yuv422_yuy2": (COLOR, "u1", 2, cv2.COLOR_YUV2BGR_YUY2),
-    "yuyv": (COLOR, "u1", 2, cv2.COLOR_YUV2BGR_YUY2),
-    "bayer_rggb8": (COLOR, "u1", 1, cv2.COLOR_BayerBG2BGR),  # OpenCV names the pattern by its second row
-    "bayer_bggr8": (COLOR, "u1", 1, cv2.COLOR_BayerRG2BGR),
-    "bayer_gbrg8": (COLOR, "u1", 1, cv2.COLOR_BayerGR2BGR),
-    "bayer_grbg8": (COLOR, "u1", 1, cv2.COLOR_BayerGB2BGR),
-    "mono8": (GREY, "u1", 1, None),
-    "8UC1": (GREY, "u1", 1, None),
-    "16UC1": (DEPTH, "u2", 1, None),  # millimetres
-    "mono16": (DEPTH, "u2", 1, None),
-    "32FC1": (DEPTH, "f4", 1, None),  # metres
+# Of sensor_msgs/Image: what it shows, type and number of channels, and OpenCV's name of the way to blue, green, red.
+LAYOUTS = {
+    "bgr8": (COLOR, "u1", 3, ""),
+    "8UC3": (COLOR, "u1", 3, ""),  # OpenCV's own name, whose order is OpenCV's
+    "rgb8": (COLOR, "u1", 3, "COLOR_RGB2BGR"),
+    "bgra8": (COLOR, "u1", 4, "COLOR_BGRA2BGR"),
+    "8UC4": (COLOR, "u1", 4, "COLOR_BGRA2BGR"),
+    "rgba8": (COLOR, "u1", 4, "COLOR_RGBA2BGR"),
+    "yuv422": (COLOR, "u1", 2, "COLOR_YUV2BGR_UYVY"),
+    "uyvy": (COLOR, "u1", 2, "COLOR_YUV2BGR_UYVY"),
+    "yuv422_yuy2": (COLOR, "u1", 2, "COLOR_YUV2BGR_YUY2"),
+    "yuyv": (COLOR, "u1", 2, "COLOR_YUV2BGR_YUY2"),
+    "bayer_rggb8": (COLOR, "u1", 1, "COLOR_BayerBG2BGR"),  # OpenCV names the pattern by its second row
+    "bayer_bggr8": (COLOR, "u1", 1, "COLOR_BayerRG2BGR"),
+    "bayer_gbrg8": (COLOR, "u1", 1, "COLOR_BayerGR2BGR"),
+    "bayer_grbg8": (COLOR, "u1", 1, "COLOR_BayerGB2BGR"),
+    "mono8": (GREY, "u1", 1, ""),
+    "8UC1": (GREY, "u1", 1, ""),
+    "16UC1": (DEPTH, "u2", 1, ""),  # millimetres
+    "mono16": (DEPTH, "u2", 1, ""),
+    "32FC1": (DEPTH, "f4", 1, ""),  # metres
 }
 COMPRESSED_DEPTH = "compressedDepth"
 DEPTH_HEADER = struct.Struct("<iff")  # format, and the two numbers A and B of the quantisation of inverse depth
@@ -67,7 +68,7 @@ def color_file(message: Any) -> bytes:
     if shows == DEPTH:
         raise ImageError(f"its encoding {message.encoding} is one of depth, not of colour")
     try:
-        return encoded(pixels if conversion is None else cv2.cvtColor(pixels, conversion), ".png")
+        return encoded(cv2.cvtColor(pixels, getattr(cv2, conversion)) if conversion else pixels, ".png")
     except cv2.error as error:
         raise ImageError(f"its {pixels.shape[1]} x {pixels.shape[0]} pixels cannot be {message.encoding}") from error
 

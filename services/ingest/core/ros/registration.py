@@ -1,10 +1,10 @@
 """Depth of one camera, drawn into another (pure)."""
 
-import cv2
 import numpy as np
 
 from prior_sg.schemas.frames import Intrinsics
 from prior_sg.services.geometry import transform
+from prior_sg.services.opencv import cv2
 
 
 def rays(camera: Intrinsics, model: str, distortion: tuple[float, ...]) -> np.ndarray:

@@ -4,7 +4,6 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 
-import cv2
 import numpy as np
 
 from prior_sg.schemas.frames import Intrinsics
@@ -17,6 +16,7 @@ from prior_sg.services.ingest.core.pixels import encoded
 from prior_sg.services.ingest.core.poses import PoseError
 from prior_sg.services.ingest.sources.base import Camera, Entry, FrameError, Images, SourceError, color_pixels
 from prior_sg.services.ingest.sources.cameras import straight_maps
+from prior_sg.services.opencv import cv2
 
 Posed = Callable[[int], np.ndarray]  # world_from_sensor (4, 4) at a stamp, ns; raises PoseError
 TRIED = 20  # sweeps that are looked at for the views that see something

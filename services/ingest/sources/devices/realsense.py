@@ -16,12 +16,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from prior_sg.schemas.frames import Intrinsics
 from prior_sg.services.ingest.sources.base import Camera, FrameError, SourceError
 from prior_sg.services.ingest.sources.devices.device import Capture, DeviceGone
+from prior_sg.services.opencv import cv2
 from prior_sg.services.runtime import extras
 
 SCHEME = "realsense:"

@@ -40,7 +40,7 @@ from prior_sg.services.ingest.sources.base import (
     read_bytes,
     truth_beside,
 )
-from prior_sg.services.ingest.sources.own_cameras import NUMBER
+from prior_sg.services.ingest.sources.own_cameras import in_brackets
 from prior_sg.services.ingest.sources.tables import lines_of, text_of, words_of
 
 NAME = "euroc"
@@ -176,10 +176,9 @@ def _sensor(path: Path) -> tuple[stereo.Lens, np.ndarray]:
 
 def _numbers(text: str, key: str, count: int) -> list[float]:
     """Numbers in brackets behind a key; 0 = however many. Raises ValueError."""
-    found = re.search(rf"^{key}:\s*\[((?:[\s,]|{NUMBER})*)\]", text, re.DOTALL | re.MULTILINE)
-    numbers = [float(number) for number in re.findall(NUMBER, found[1])] if found else []
-    if count and len(numbers) != count:
-        raise ValueError(f"it has no {key.split(':', maxsplit=1)[0]} with {count} numbers")
+    numbers = in_brackets(text, rf"^{key}:\s*")
+    if numbers is None or (count and len(numbers) != count):
+        raise ValueError(f"it has no {key.split(':', maxsplit=1)[0]} with {count or 'nothing but'} numbers")
     return numbers
 
 

@@ -3,11 +3,11 @@
 import weakref
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from prior_sg.services.ingest.sources.base import FrameError
 from prior_sg.services.ingest.sources.tables import SourceError
+from prior_sg.services.opencv import cv2
 
 UNKNOWN = 1 << 62  # where a film is that could not be read: it is jumped in before the next picture
 NEAR = 30  # pictures ahead that are passed over rather than jumped to

@@ -2,12 +2,12 @@
 
 from collections.abc import Callable
 
-import cv2
 import numpy as np
 
 from prior_sg.services.headers import ImageError
 from prior_sg.services.ingest.core.pixels import encoded, stored
 from prior_sg.services.ingest.sources.base import FrameError, Images
+from prior_sg.services.opencv import cv2
 
 UP = (0.0, 1.0, 0.0)  # of ARKit's world
 FINER = 3  # pixels of a picture for one of depth, along each side: encoders see little in 256 x 192 pixels

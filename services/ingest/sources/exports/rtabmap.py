@@ -32,7 +32,7 @@ from prior_sg.services.ingest.sources.base import (
     read_bytes,
     truth_beside,
 )
-from prior_sg.services.ingest.sources.own_cameras import NUMBER, fields_of
+from prior_sg.services.ingest.sources.own_cameras import fields_of, in_brackets
 from prior_sg.services.ingest.sources.tables import lines_of, text_of
 
 NAME = "rtabmap"
@@ -172,12 +172,10 @@ def _stamp(word: str) -> float:
 
 def _local_transform(calibration: Path) -> np.ndarray:
     """body_from_camera (4, 4). Raises SourceError."""
-    text = text_of(calibration)
-    found = re.search(rf"^local_transform:.*?data:\s*\[((?:[\s,]|{NUMBER})+)\]", text, re.DOTALL | re.MULTILINE)
-    numbers = re.findall(NUMBER, found[1]) if found else []
-    if len(numbers) != 12:
+    numbers = in_brackets(text_of(calibration), r"^local_transform:.*?data:\s*")
+    if numbers is None or len(numbers) != 12:
         raise SourceError(f"{calibration} has no local_transform of 3 x 4 numbers: {AGAIN}")
-    return np.vstack((np.array(numbers, np.float64).reshape(3, 4), (0, 0, 0, 1)))
+    return np.vstack((np.array(numbers).reshape(3, 4), (0, 0, 0, 1)))
 
 
 def _pose(poses: dict[str, np.ndarray | PoseError], stem: str, convention: Convention) -> np.ndarray:

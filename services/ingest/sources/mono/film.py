@@ -10,7 +10,6 @@ from dataclasses import replace
 from functools import partial
 from typing import Protocol
 
-import cv2
 import msgspec
 import numpy as np
 
@@ -26,6 +25,7 @@ from prior_sg.services.ingest.sources.base import Camera, Entry, Found, FrameErr
 from prior_sg.services.ingest.sources.cameras import Sizes, camera_of_images, straight_maps
 from prior_sg.services.ingest.sources.depth_models import Seer
 from prior_sg.services.ingest.sources.normaliser import UNUSABLE
+from prior_sg.services.opencv import cv2
 
 MOVED_M = (0.06, 0.18)  # how far the camera went to the pictures that are looked at, on either side
 TOO_FAR_M, TURNED_DEG = 0.6, 25.0  # beyond, too little is in both pictures

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from prior_sg.services.geometry import rotation_angle_rad
@@ -28,6 +27,7 @@ from prior_sg.services.ingest.sources.base import (
 )
 from prior_sg.services.ingest.sources.cameras import straight_maps
 from prior_sg.services.ingest.sources.tables import LastingError
+from prior_sg.services.opencv import cv2
 
 NEARLY = 1e-3  # difference of focal lengths that is none
 

@@ -42,9 +42,10 @@ class Recorded:
         self._transforms: dict[bool, list[Stamped]] = {True: [], False: []}
         self._unread: dict[str, int] = {}
         infos = [info.name for info in (choice.color_info, choice.depth_info) if info is not None]
-        for name, received_ns, data in bag.messages(
-            [*dict.fromkeys((choice.color.name, choice.depth.name, *infos, *self._tf, *self.poses))]
-        ):
+        wanted = [*dict.fromkeys((choice.color.name, choice.depth.name, *infos, *self._tf, *self.poses))]
+        self._missing = {topic.name: topic.count for topic in topics if topic.name in wanted}
+        for name, received_ns, data in bag.messages(wanted):
+            self._missing[name] = self._missing.get(name, 0) - 1
             try:
                 self._take(name, received_ns, data)
             except FrameError:
@@ -69,8 +70,15 @@ class Recorded:
         return Rig(self.bag.path, self.choice, self.options, self.infos, self.tree, middle_ns, self.within_ns)
 
     def lost(self) -> list[str]:
-        """Notes on messages that could not be read."""
-        return [f"{count} messages of {name} cannot be read: they are left out" for name, count in self._unread.items()]
+        """Notes on messages that could not be read, or that the recording tells of and does not hold."""
+        return [
+            *(f"{count} messages of {name} cannot be read: they are left out" for name, count in self._unread.items()),
+            *(
+                f"{count} messages of {name} are missing, though its index counts them: a part is damaged"
+                for name, count in self._missing.items()
+                if count > 0
+            ),
+        ]
 
     def _take(self, name: str, received_ns: int, data: bytes) -> None:
         for topic, index in ((self.choice.color, self.colors), (self.choice.depth, self.depths)):
