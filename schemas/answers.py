@@ -1,5 +1,6 @@
 """Answers to questions about a scene graph (`schemas/queries.py`). Positions are in the world, metres, z up."""
 
+from collections.abc import Sequence
 from typing import Literal
 
 from prior_sg.schemas.codec import Part
@@ -125,6 +126,7 @@ class RegionBeliefs(Part, frozen=True, kw_only=True, tag="region_beliefs"):
     predicted_share: float = 0.0  # of its places, whose labels rest on their surroundings
     places: int = 0
     reason: str = ""
+    total: int = 0  # labels that it may have; may be more than what is listed
 
 
 class Words(Part, frozen=True, kw_only=True, tag="words"):
@@ -141,11 +143,12 @@ class Words(Part, frozen=True, kw_only=True, tag="words"):
 
 
 class Ranking(Part, frozen=True, kw_only=True, tag="ranking"):
-    """What answers a text, the best first; every thing has a score."""
+    """What answers a text, the best first; every thing has a score. `total` may be more than what is listed."""
 
     things: list[Thing] = []
     note: str = ""  # what stands in for the embedding space, where something does
     reason: str = ""
+    total: int = 0
 
 
 class NodeWithRegions(Part, frozen=True, kw_only=True):
@@ -185,10 +188,12 @@ class Prospect(Part, frozen=True, kw_only=True):
     probability: float  # that such a region begins behind it, within REACH_M of schemas/foresight.py
     expected_m: float  # metres until one is found if this opening comes first; a score, as sure as the probabilities
     way_m: float  # to the opening
+    toward: float = 0.0  # that the nearest such region is come to through it; 0 throughout = not told
+    per_metre: float = 0.0  # what prospects come in order of: `toward`, or `probability`, over way_m and a look behind
 
 
 class Outlook(Part, frozen=True, kw_only=True, tag="outlook"):
-    """Where a region may be that has not been seen: predictions."""
+    """Where a region may be that has not been seen: predictions. `total` may be more than the prospects listed."""
 
     label: str = ""
     prospects: list[Prospect] = []
@@ -196,14 +201,17 @@ class Outlook(Part, frozen=True, kw_only=True, tag="outlook"):
     route: Route | None = None  # to the first of them
     found: list[Thing] = []  # regions of the label that have been seen already
     reason: str = ""
+    total: int = 0
+    look_m: float = 0.0  # what is walked behind an opening to see what is there
 
 
 class Missing(Part, frozen=True, kw_only=True, tag="missing"):
-    """What is probably still to be found: predictions, the most probable first."""
+    """What is probably still to be found: predictions, the most probable first. `total` may be more than is listed."""
 
     labels: list[MissingLabel] = []
     openings: int = 0  # that it may be behind
     reason: str = ""
+    total: int = 0
 
 
 Answer = (
@@ -220,3 +228,24 @@ Answer = (
     | Outlook
     | Missing
 )
+
+
+def listed_of(answer: Answer) -> tuple[Sequence[Part], int]:
+    """What an answer lists, and how much there is; of one that lists nothing, nothing."""
+    listed: Sequence[Part]
+    match answer:
+        case Things() | Ranking():
+            listed = answer.things
+        case Nodes():
+            listed = answer.nodes
+        case Markers():
+            listed = answer.markers
+        case RegionBeliefs():
+            listed = answer.beliefs
+        case Outlook():
+            listed = answer.prospects
+        case Missing():
+            listed = answer.labels
+        case _:
+            return [], 0
+    return listed, max(len(listed), answer.total)  # stores of before told no total

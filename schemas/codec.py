@@ -2,7 +2,7 @@
 
 A message is MessagePack of a frozen msgspec struct. Arrays travel inside it as extension type 1: one byte dtype code,
 one byte number of dimensions, the dimensions as little-endian uint32, then the raw little-endian buffer. Decoding maps
-the array onto the received buffer: no copy, and read-only.
+the array onto the received buffer: no copy, and read-only. So are files, of fields that are declared as `File`.
 
 A field declares its array with `Annotated[np.ndarray, Shape("float32", "place", 3)]`; a word names a dimension, and
 equal names within one message must have equal length. Decoding checks all of it, so that a malformed message fails at
@@ -14,7 +14,7 @@ import struct
 import threading
 from collections.abc import Iterator
 from functools import cache
-from typing import Annotated, Any, ClassVar, TypeVar, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, TypeVar, get_args, get_origin, get_type_hints
 
 import msgspec
 import numpy as np
@@ -45,6 +45,14 @@ LAST_NUMBER = 2**62  # so that the next one, and sums of two, fit 64 bits
 Number = Annotated[int, msgspec.Meta(ge=0, le=LAST_NUMBER)]  # of a frame, an epoch or a revision; how many
 NumberOrNone = Annotated[int, msgspec.Meta(ge=-1, le=LAST_NUMBER)]  # the same; -1 = none yet
 Stamp = Annotated[int, msgspec.Meta(ge=-LAST_NUMBER, le=LAST_NUMBER)]  # nanoseconds of some clock
+Positive = Annotated[float, msgspec.Meta(gt=0)]
+AtLeastOne = Annotated[int, msgspec.Meta(ge=1)]
+Signed = Annotated[float, msgspec.Meta(extra={"signed": True})]  # a setting that may be negative, as no other may
+
+if TYPE_CHECKING:
+    File = bytes | memoryview
+else:
+    File = memoryview  # what msgspec decodes without a copy; whoever makes a message gives either
 
 
 class DecodeError(ValueError):
@@ -117,6 +125,9 @@ class Message(msgspec.Struct, frozen=True, kw_only=True, eq=False):
 
     def __hash__(self) -> int:
         return hash(encode(self))
+
+    def __reduce__(self) -> tuple[Any, ...]:  # views cannot be pickled
+        return decode, (type(self), encode(self))
 
 
 M = TypeVar("M", bound=Message)
@@ -191,6 +202,12 @@ def versions() -> dict[str, int]:
     return {kind.__name__: kind.VERSION for kind in message_types() if kind.VERSION > 1}
 
 
+@cache
+def _head(dimensions: int) -> struct.Struct:
+    """What stands before an array's numbers."""
+    return struct.Struct(f"<BB{dimensions}I")
+
+
 def _pack_array(array: np.ndarray) -> msgspec.msgpack.Ext:
     code = CODES.get(array.dtype)
     if code is None:
@@ -198,7 +215,7 @@ def _pack_array(array: np.ndarray) -> msgspec.msgpack.Ext:
             raise TypeError(f"arrays of dtype {array.dtype} do not travel; use one of {', '.join(DTYPES)}")
         return _pack_array(array.astype(array.dtype.newbyteorder("<")))
     little = np.ascontiguousarray(array)
-    head = struct.pack(f"<BB{array.ndim}I", code, array.ndim, *array.shape)
+    head = _head(array.ndim).pack(code, array.ndim, *array.shape)
     return msgspec.msgpack.Ext(ARRAY_EXT_CODE, b"".join((head, little.data.cast("B") if little.size else b"")))
 
 
@@ -206,15 +223,14 @@ def _unpack_array(data: memoryview) -> np.ndarray:
     if len(data) < 2:
         raise ValueError("array header cut off")
     code, ndim = data[0], data[1]
-    if code >= len(DTYPES) or ndim > MAX_DIMENSIONS or len(data) < 2 + 4 * ndim:
+    start = 2 + 4 * ndim
+    if code >= len(DTYPES) or ndim > MAX_DIMENSIONS or len(data) < start:
         raise ValueError("array header damaged")
-    shape = struct.unpack_from(f"<{ndim}I", data, 2)
-    dtype, start = LITTLE[code], 2 + 4 * ndim
+    _, _, *shape = _head(ndim).unpack_from(data)
+    dtype = LITTLE[code]
     if len(data) - start != math.prod(shape) * dtype.itemsize:
         raise ValueError("array length does not fit its shape")
-    array: np.ndarray = np.ndarray(shape, dtype, data, start)
-    array.flags.writeable = False
-    return array
+    return np.ndarray(shape, dtype, data if data.readonly else data.toreadonly(), start)
 
 
 def _enc_hook(value: Any) -> Any:
@@ -223,12 +239,6 @@ def _enc_hook(value: Any) -> Any:
     if isinstance(value, np.generic):
         return value.item()
     raise TypeError(f"{type(value).__name__} cannot be sent")
-
-
-def _dec_hook(expected: type, value: Any) -> Any:
-    if expected is np.ndarray and isinstance(value, np.ndarray):
-        return value
-    raise ValueError(f"expected {expected.__name__}")
 
 
 def _ext_hook(code: int, data: memoryview) -> Any:
@@ -250,7 +260,7 @@ def _decoder(message_type: Any) -> msgspec.msgpack.Decoder[Any]:
         with _building:
             found = _decoders.get(message_type)
             if found is None:
-                found = msgspec.msgpack.Decoder(message_type, dec_hook=_dec_hook, ext_hook=_ext_hook)
+                found = msgspec.msgpack.Decoder(message_type, ext_hook=_ext_hook)
                 _decoders[message_type] = found
     return found
 
@@ -271,7 +281,7 @@ def encode(message: Message) -> bytes:
 
 
 def decode(message_type: type[M], payload: bytes | memoryview) -> M:
-    """The message in `payload`, validated; its arrays point into `payload`. Raises DecodeError."""
+    """The message in `payload`, validated; its arrays and files point into `payload`. Raises DecodeError."""
     if isinstance(payload, Refused):
         raise DecodeError(payload.reason)
     try:
@@ -297,5 +307,5 @@ def encode_plain(fields: dict[str, Any]) -> bytes:
 
 
 def copied(message: M) -> M:
-    """The same message with arrays of its own, for state that must not keep a whole received buffer alive."""
+    """The same message with arrays and files of its own, for state that must not keep a whole received buffer alive."""
     return decode(type(message), encode(message))

@@ -4,6 +4,20 @@ from prior_sg.schemas.codec import Part
 
 Point = tuple[float, float, float]  # world, metres
 REACH_M = 6.0  # of way behind an opening that `within` tells of
+ROUNDING = 1e-3  # by which a chance may miss 0 and 1
+LONGEST_M = 1e9  # of a way
+
+
+def _check_chances(**chances: float) -> None:
+    for name, chance in chances.items():
+        if not -ROUNDING <= chance <= 1 + ROUNDING:
+            raise ValueError(f"{name}: {chance:g} is no probability")
+
+
+def _check_metres(**lengths_m: float) -> None:
+    for name, length_m in lengths_m.items():
+        if not 0 <= length_m <= LONGEST_M:
+            raise ValueError(f"{name}: {length_m:g} is no length of a way")
 
 
 class ForeseenLabel(Part, frozen=True, kw_only=True):
@@ -18,6 +32,10 @@ class ForeseenLabel(Part, frozen=True, kw_only=True):
     found: int = 0  # regions of this label that the map holds
     met: int = 0  # borders in the map between regions of these two labels
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _check_chances(next=self.next, within=self.within, toward=self.toward)
+
 
 class Opening(Part, frozen=True, kw_only=True):
     """Frontiers of neighbouring places that lead to the same unobserved space, and what lies behind."""
@@ -30,6 +48,11 @@ class Opening(Part, frozen=True, kw_only=True):
     same: float  # probability that this region goes on behind it, or nothing is; with all `next` it sums to one
     labels: list[ForeseenLabel] = []  # the most probable first; others left out
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _check_chances(same=self.same)
+        _check_metres(width_m=self.width_m)
+
 
 class MissingLabel(Part, frozen=True, kw_only=True):
     """A label that is probably still to be found behind the openings."""
@@ -37,6 +60,10 @@ class MissingLabel(Part, frozen=True, kw_only=True):
     label: str
     probability: float  # that one more region of it is behind any opening
     found: int = 0  # regions of it that the map holds
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _check_chances(probability=self.probability)
 
 
 class Foresight(Part, frozen=True, kw_only=True):
@@ -47,3 +74,7 @@ class Foresight(Part, frozen=True, kw_only=True):
     steps: int = 0  # regions behind an opening that `within` reached before REACH_M was its limit; 0 since
     look_m: float = 0.0  # what is walked behind an opening to see what is there
     elsewhere_m: float = 0.0  # what is walked to find what is behind none of the openings
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _check_metres(look_m=self.look_m, elsewhere_m=self.elsewhere_m)

@@ -9,7 +9,7 @@ from typing import Annotated
 import msgspec
 import numpy as np
 
-from prior_sg.schemas.codec import Message, Number, NumberOrNone, Shape, Stamp
+from prior_sg.schemas.codec import File, Message, Number, NumberOrNone, Shape, Stamp
 from prior_sg.schemas.status import Loss
 
 Pose = Annotated[np.ndarray, Shape("float64", 4, 4)]
@@ -69,10 +69,10 @@ class Keyframe(Message, frozen=True, kw_only=True):
     stamp_ns: Stamp
     intrinsics: Intrinsics
     world_from_camera: Pose
-    color: bytes  # a JPEG or PNG file, 8 bit RGB; empty = the sensor sees no colour
-    depth: bytes  # a PNG file, 16 bit, 0 = no measurement; depth along the optical axis
+    color: File  # a JPEG or PNG file, 8 bit RGB; empty = the sensor sees no colour
+    depth: File  # a PNG file, 16 bit, 0 = no measurement; depth along the optical axis
     depth_scale_m: float  # metres per depth unit
-    mask: bytes = b""  # a PNG file, 8 bit, not 0 = something that moves, kept out of the map; empty = nothing does
+    mask: File = b""  # a PNG file, 8 bit, not 0 = something that moves, kept out of the map; empty = nothing does
     space: str = ""  # of an encoding job: the embedding space wanted; empty = every space that has workers
     origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # where this world has its zero in the source's, levelled
     camera: str = ""  # which of a robot's cameras took it; empty = its only one

@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 
 from prior_sg.schemas.codec import Message, Part, Shape
-from prior_sg.schemas.names import LONGEST_NAME, LONGEST_TEXT
+from prior_sg.schemas.names import LONGEST_NAME, fault_of_names, fault_of_text
 
 LevelName = Literal["zone", "floor", "building", "district"]
 NamedLevel = Literal["zone", "building", "district"]  # by a prior; floors are found from the geometry
@@ -48,12 +48,10 @@ class LevelPrior(Message, frozen=True, kw_only=True, omit_defaults=True):
     def check(self) -> None:
         """Whoever sent it."""
         where, names = f"level {self.name}", self.names
-        if not 0 < len(names) <= MOST_ENTRIES or len(set(names)) != len(names):
-            raise ValueError(f"{where}: needs between 1 and {MOST_ENTRIES} entries of different names")
-        if not all(len(name.strip()) > 0 and len(name) <= LONGEST_NAME for name in names):
-            raise ValueError(f"{where}: a name is empty or too long")
-        if len(self.task) > LONGEST_TEXT:
-            raise ValueError(f"{where}: its task is too long")
+        if not names:
+            raise ValueError(f"{where}: needs at least one entry")
+        if fault := fault_of_names("entry", names, MOST_ENTRIES) or fault_of_text("the task", self.task):
+            raise ValueError(f"{where}: {fault}")
         existence = [entry.existence for entry in self.entries]
         if not all(map(math.isfinite, existence)) or min(existence) <= 0 or abs(sum(existence) - 1) > SUM_TOLERANCE:
             raise ValueError(f"{where}: existence must be positive and sum to one")

@@ -35,9 +35,10 @@ def shown(text: str) -> str:
 
 def fault_of_text(kind: str, text: str, longest: int = LONGEST_TEXT) -> str:
     """What is wrong with a text of this kind, as a sentence; empty when nothing is."""
-    if any("\ud800" <= c <= "\udfff" for c in text):
+    odd = "" if text.isprintable() else text  # characters one by one only where some are
+    if any("\ud800" <= c <= "\udfff" for c in odd):
         return f"{kind} {_quoted(text)} is not valid Unicode: give it as UTF-8"
-    if any(_unprintable(c) for c in text):
+    if any(_unprintable(c) for c in odd):
         return f"{kind} {_quoted(text)} holds control characters: leave them out"
     if len(text) > longest:
         return f"{kind} {_quoted(text)} is longer than {longest} characters: shorten it"

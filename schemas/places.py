@@ -6,7 +6,9 @@ import msgspec
 import numpy as np
 
 from prior_sg.schemas.codec import Message, Number, NumberOrNone, Shape, Stamp
+from prior_sg.schemas.members import fault_of_merging
 
+LARGEST_FLOAT32 = float(np.finfo(np.float32).max)
 _NO_IDS = msgspec.field(default_factory=lambda: np.zeros(0, np.int64))
 _NO_LENGTHS = msgspec.field(default_factory=lambda: np.zeros(0, np.float32))
 _NO_CORNERS = msgspec.field(default_factory=lambda: np.zeros((0, 2), np.float32))
@@ -35,7 +37,8 @@ class PlaceDelta(Message, frozen=True, kw_only=True):
     edges: Annotated[np.ndarray, Shape("int64", "edge", 2)]  # place ids, smaller first
     clearances_m: Annotated[np.ndarray, Shape("float32", "edge")]  # smallest obstacle distance along the edge
     removed_edges: Annotated[np.ndarray, Shape("int64", "removed_edge", 2)]
-    camera_m: tuple[float, float, float] | None = None  # camera centre of the keyframe, world; None in snapshots
+    # Camera centre of the keyframe, world. Of the deltas that a large keyframe causes, the first has it, no snapshot.
+    camera_m: tuple[float, float, float] | None = None
     event: str = ""  # what was wrong with the keyframe or the pose update, one sentence; empty = nothing
     # Snapshots: the keyframes so far and their camera centres; else those that a pose update moved.
     past_frame_ids: Annotated[np.ndarray, Shape("int64", "past")] = _NO_IDS
@@ -56,6 +59,10 @@ class PlaceDelta(Message, frozen=True, kw_only=True):
     def check(self) -> None:
         if (self.hull_counts < 0).any() or self.hull_counts.sum() != len(self.hulls_m):
             raise ValueError("hull_counts do not add up to the points of hulls_m")
+        if fault := fault_of_merging(self.robot, self.merged_of):
+            raise ValueError(fault)
+        if self.camera_m is not None and max(map(abs, self.camera_m)) > LARGEST_FLOAT32:
+            raise ValueError("camera_m: does not fit 32 bits, in which scenes hold it")
 
 
 class SnapshotRequest(Message, frozen=True, kw_only=True):

@@ -9,13 +9,14 @@ import numpy as np
 
 from prior_sg.schemas.codec import Message, Number, NumberOrNone, Shape, Stamp, encode
 from prior_sg.schemas.levels import LevelPrior, check_levels, zones_of
-from prior_sg.schemas.names import LONGEST_NAME, fault_of_names, fault_of_text, key_part
+from prior_sg.schemas.names import fault_of_names, fault_of_text, key_part
 
 SUM_TOLERANCE = 1e-3
 # No prior that somebody means is larger; a message beyond is refused wherever it arrives.
 MOST_REGIONS, MOST_OBJECTS, MOST_PHRASES = 64, 512, 64
 MOST_PIECES = 256  # regions of one map that evidence tells of
 LONGEST_PHRASE = 240
+LEAST_STD_RAD = 1e-6  # of an inclination: the concentration of what is sharper is beyond numbers
 LARGEST_M, MOST_SPREAD = 1000.0, 2.0  # of an object's sides, and of their logarithm
 
 
@@ -157,15 +158,19 @@ class Prior(Message, frozen=True, kw_only=True, omit_defaults=True):
             raise ValueError("a prior needs at least one region")
         if len(self.regions) > MOST_REGIONS or len(self.objects) > MOST_OBJECTS:
             raise ValueError(f"a prior has at most {MOST_REGIONS} regions and {MOST_OBJECTS} objects")
+        if fault := fault_of_task(self.environment, self.task, self.vocabulary):
+            raise ValueError(fault)
         described = [(r.name, r.phrases) for r in self.regions] + [(o.name, o.phrases) for o in self.objects]
         for kind, names in (("region", [r.name for r in self.regions]), ("object", [o.name for o in self.objects])):
-            if len(set(names)) != len(names):
-                raise ValueError(f"{kind} names are not unique")
+            if fault := fault_of_names(kind, names, MOST_OBJECTS):
+                raise ValueError(fault)
         for name, phrases in described:
-            if not name or not phrases or not all(phrases):
-                raise ValueError(f"{name or 'an unnamed entry'} has no phrases")
-            if len(name) > LONGEST_NAME or max(map(len, phrases)) > LONGEST_PHRASE or len(phrases) > MOST_PHRASES:
-                raise ValueError(f"{name[:LONGEST_NAME]}: the name, a phrase or the list of phrases is too long")
+            if not all(phrases) or not 0 < len(phrases) <= MOST_PHRASES:
+                raise ValueError(f"{name} has no phrases, an empty one or more than {MOST_PHRASES}")
+            if fault := next(filter(None, (fault_of_text("the phrase", one, LONGEST_PHRASE) for one in phrases)), ""):
+                raise ValueError(f"{name}: {fault}")
+        if fault := next(filter(None, (fault_of_text("the zone", region.parent) for region in self.regions)), ""):
+            raise ValueError(fault)
 
     def _check_matrices(self) -> None:
         if self.containment.shape != (len(self.regions), len(self.objects)):
@@ -220,8 +225,8 @@ def _check_region(region: RegionPrior) -> None:
         raise ValueError(f"{region.name}: not finite")
     if region.existence <= 0:
         raise ValueError("existence must be positive and sum to one")
-    if not (0 <= region.inclination_mean_rad <= math.pi / 2 and region.inclination_std_rad > 0):
-        raise ValueError(f"{region.name}: inclination must lie between 0 and a right angle, its spread above 0")
+    if not (0 <= region.inclination_mean_rad <= math.pi / 2 and region.inclination_std_rad >= LEAST_STD_RAD):
+        raise ValueError(f"{region.name}: inclination must lie between 0 and a right angle, its spread well above 0")
     if not 0 < region.query_radius_m <= 100:
         raise ValueError(f"{region.name}: the query radius must lie between 0 and 100 m")
 

@@ -22,8 +22,9 @@ AskedPoint = tuple[Coordinate, Coordinate, Coordinate]
 Metres = Annotated[float, msgspec.Meta(ge=0.0, le=1e9)]
 Text = Annotated[str, msgspec.Meta(max_length=LONGEST_TEXT)]
 Probability = Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
-Limit = Annotated[int, msgspec.Meta(ge=1, le=100_000)]  # at most so many come back
-MOST_LISTED, MOST_RANKED = 100, 10
+MOST_LISTED, MOST_RANKED = 100, 10  # where nothing is said
+MOST_ASKED = 100_000
+Limit = Annotated[int, msgspec.Meta(ge=1, le=MOST_ASKED)]  # at most so many come back
 
 
 class ById(Part, frozen=True, kw_only=True, tag="by_id"):

@@ -161,6 +161,7 @@ class ServiceStatus(Message, frozen=True, kw_only=True):
     topics: list[TopicCount]
     losses: list[Loss] = []  # most frequent first
     step_s: float = 0.0  # since when it has been at one input
+    step_compiling_s: float = 0.0  # of that, in which it compiled inner loops, as a first run does
     clock_ns: Stamp = 0  # of its host when it answered; 0 = not told
     release: str = ""  # of the program it runs
     cpu_s: float = 0.0  # processor time since it started

@@ -13,6 +13,8 @@ from fnmatch import fnmatchcase
 from functools import lru_cache
 from typing import Any, Protocol
 
+import msgspec
+
 from prior_sg.schemas.codec import DecodeError, decode
 from prior_sg.schemas.topics import Topic
 from prior_sg.services.errors import PriorSgError
@@ -28,8 +30,7 @@ class BusError(PriorSgError):
     """The bus cannot do what was asked; the message says what to do."""
 
 
-@dataclass(frozen=True)
-class Sample:
+class Sample(msgspec.Struct, frozen=True):
     """One received sample, not decoded yet. `writer` is empty when the sender did not say who it is.
 
     The payload is of this program's version of the message; one that cannot be brought to it is refused when decoded.

@@ -1,17 +1,29 @@
 """Configuration in layers: defaults in the code, then a TOML file, then the environment, then the command line."""
 
+import math
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from types import UnionType
+from types import NoneType, UnionType
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin
 
 import msgspec
 
-from prior_sg.services.errors import PriorSgError
+from prior_sg.schemas.codec import REAL, AtLeastOne, Positive, Signed
+from prior_sg.services.errors import PriorSgError, reason_of
 
 LONGEST_LINE = 10_000  # characters; the time to read a name of many parts grows with their square
 ENVIRONMENT_PREFIX = "PSG_"
+IN_WORDS: Mapping[Any, str] = {  # what a field of a type takes
+    str: "a text",
+    bool: "true or false",
+    int: "a whole number that is not negative",
+    float: "a finite number that is not negative",
+    AtLeastOne: "a whole number from 1 on",
+    Positive: "a finite number above 0",
+    Signed: "a finite number",
+    NoneType: "null",
+}
 C = TypeVar("C", bound=msgspec.Struct)
 
 
@@ -29,7 +41,7 @@ def read_file(path: str | Path | None) -> dict[str, dict[str, Any]]:
             raise ConfigError(f"cannot read the configuration {path}: break its line of {longest} characters")
         return tomllib.loads(text)
     except (OSError, ValueError, RecursionError) as error:
-        raise ConfigError(f"cannot read the configuration {path}: {error}") from error
+        raise ConfigError(f"cannot read the configuration {path}: {reason_of(error)}") from error
 
 
 def from_environment(environment: Mapping[str, str]) -> dict[str, dict[str, str]]:
@@ -124,12 +136,56 @@ def _checked(config_type: type, section: str, values: Mapping[str, Any]) -> dict
             inner.setdefault(field, {})[rest] = value
         else:
             found[field] = _decoded(f"{section}.{field}", value, fields[field])
+            _check_fits(f"{section}.{field}", found[field], fields[field])
     for field, rest_values in inner.items():
         found[field] = {**found.get(field, {}), **rest_values}
     for field, value in found.items():
         if _is_group(fields[field]) and isinstance(value, Mapping):
             found[field] = _checked(fields[field], f"{section}.{field}", value)
     return found
+
+
+def _check_fits(name: str, value: Any, kind: Any) -> None:
+    """Raise ConfigError, which says what the field takes, unless the value is of its type and its numbers can be
+    meant: all are finite, and none is negative unless its type is Signed. Groups are looked at field by field."""
+    if _is_group(kind):
+        if not isinstance(value, Mapping | kind):
+            raise ConfigError(f"{name} is a group of settings; name one of them, as {name}.{kind.__struct_fields__[0]}")
+        return
+    try:
+        fits = _can_be_meant(msgspec.convert(value, kind, strict=False), _holds_signed(kind))
+    except msgspec.ValidationError:
+        fits = False
+    if not fits:
+        given = repr(value)
+        raise ConfigError(f"{name} takes {_said(kind)}; got {given if len(given) <= 80 else given[:77] + '...'}")
+
+
+def _can_be_meant(value: Any, signed: bool) -> bool:
+    if isinstance(value, Mapping):
+        value = list(value.values())
+    if isinstance(value, list | tuple):
+        return all(_can_be_meant(one, signed) for one in value)
+    return not isinstance(value, REAL) or (math.isfinite(value) and (signed or value >= 0))
+
+
+def _holds_signed(kind: Any) -> bool:
+    return kind == Signed or any(map(_holds_signed, get_args(kind)))
+
+
+def _said(kind: Any) -> str:
+    """What a field of this type takes, in words."""
+    origin, parts = get_origin(kind), get_args(kind)
+    if origin in (Union, UnionType):
+        return " or ".join(map(_said, parts))
+    if origin is Literal:
+        return f"one of {', '.join(map(repr, parts))}"
+    if origin is dict:
+        return f"names, each with {_said(parts[1])}"
+    if origin in (list, tuple):
+        count = f" of {len(parts)}" if origin is tuple and ... not in parts else ""
+        return f"a list{count}, of which each is {_said(parts[0])}"
+    return IN_WORDS[kind]
 
 
 def _is_group(kind: Any) -> bool:

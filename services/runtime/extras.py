@@ -68,6 +68,14 @@ def require(extra: str, user: str) -> None:
     require_modules([name for one in (extra, *CONTAINS.get(extra, ())) if one for name in MODULES[one]], user, extra)
 
 
+def load(extra: str) -> None:
+    """Load what an extra brings that needs libraries of the system, if it brings any. Raises OpenCvBroken."""
+    if any("cv2" in MODULES[one] for one in (extra, *CONTAINS.get(extra, ())) if one):
+        from prior_sg.services import opencv
+
+        opencv.require()
+
+
 def require_modules(modules: Iterable[str], user: str, extra: str) -> None:
     """Raise ExtraMissing on behalf of `user` unless these packages, which an extra brings, are there."""
     if absent := [name for name in modules if not _is_there(name)]:

@@ -6,7 +6,8 @@ An MCAP message carries the writer's sequence number and two times: `publish_tim
 
 Messages of an older version are read as ours; those of a newer one, or of another program, are refused.
 
-A log whose process was killed has no index at its end. It is read up to its last complete chunk.
+A log whose process was killed has no index at its end. It is read up to its last complete chunk. Chunks that are
+damaged are told of and passed over, with an index or without.
 """
 
 import json
@@ -31,7 +32,16 @@ from prior_sg.schemas.codec import DecodeError, decode, schema_name
 from prior_sg.schemas.migrations import current
 from prior_sg.schemas.topics import TOPICS, Topic
 from prior_sg.services.errors import PriorSgError
-from prior_sg.services.runtime.chunks import DAMAGE, bounded, index_of, indexed_chunks, records
+from prior_sg.services.runtime.chunks import (
+    DAMAGE,
+    appended,
+    bounded,
+    index_of,
+    indexed_chunks,
+    is_ended,
+    records,
+    unread,
+)
 
 CHUNK_BYTES = 1 << 20
 FLUSH_NS = 1_000_000_000  # of received time: what a killed process can lose
@@ -243,6 +253,31 @@ def is_whole(path: str | Path) -> bool:
         return index_of(file) is not None
 
 
+def loss(path: str | Path) -> str:
+    """What of a log without a sound index is not read, as a clause; empty = it is whole. Raises LogError."""
+    with _opened(path) as file:
+        if index_of(file) is not None:
+            return ""
+        faults: list[LogError] = []
+        for _ in _messages(file, path, set(), faults.append):
+            pass
+        said = _unread(file)
+        return f"{said}; damaged parts left out: {len(faults)}" if faults else said
+
+
+def _unread(file: BinaryIO) -> str:
+    """What is wrong with a log that has no sound index, as a clause."""
+    rest = unread(file)
+    if rest.another is not None:
+        behind = file.seek(0, 2) - rest.another
+        mend = f"`tail -c +{rest.another + 1}` makes it a file of its own"
+        return f"another log begins at byte {rest.another}, whose {behind} bytes are not read; {mend}"
+    if rest.ended and rest.size_bytes:
+        return f"the {rest.size_bytes} bytes behind its end are none of it, and not read"
+    fault = "its index is damaged" if rest.ended or is_ended(file) else "it was cut off"
+    return f"{fault}; its last {rest.size_bytes} bytes are not read" if rest.size_bytes else fault
+
+
 def _channels(path: str | Path) -> list[tuple[Channel, int]]:
     """Channels of an MCAP file of any program and how many messages each has."""
     with _opened(path) as file:
@@ -251,7 +286,7 @@ def _channels(path: str | Path) -> list[tuple[Channel, int]]:
             channels, counts = index.channels, Counter(index.statistics.channel_message_counts)
         else:
             channels, counts = {}, Counter()
-            for channel, _, _ in _messages(file, path, None):
+            for channel, _, _ in _messages(file, path, None, lambda fault: logger.warning("%s", fault)):
                 channels[channel.id] = channel
                 counts[channel.id] += 1
     return [(channels[i], counts[i]) for i in sorted(channels)]
@@ -268,13 +303,13 @@ def summary(path: str | Path) -> dict[str, int]:
 def attachments(path: str | Path) -> dict[str, bytes]:
     """Attached files by name. Raises LogError."""
     with _opened(path) as file:
-        return {record.name: record.data for record in _whole_records(file, path, Opcode.ATTACHMENT)}
+        return {record.name: record.data for record in _appended(file, path, Opcode.ATTACHMENT)}
 
 
 def metadata(path: str | Path) -> dict[str, dict[str, str]]:
     """Named text fields. Raises LogError."""
     with _opened(path) as file:
-        return {record.name: record.metadata for record in _whole_records(file, path, Opcode.METADATA)}
+        return {record.name: record.metadata for record in _appended(file, path, Opcode.METADATA)}
 
 
 @contextmanager
@@ -297,14 +332,16 @@ def _messages(
     channels: dict[int, Channel] = {} if index is None else dict(index.channels)
     schemas: dict[int, str] = {} if index is None else {i: schema.name for i, schema in index.schemas.items()}
     if index is None:
-        _say_cut_off(str(path))
+        _say_cut_off(str(path), _unread(file))
+    torn: LogError | None = None
     for read in records(file, Opcode.CHUNK) if index is None else indexed_chunks(file, index, wanted):
+        if torn is not None:
+            _tell(torn, damaged)
+            torn = None
         try:
             found = breakup_chunk(bounded(read()), validate_crc=True)
         except DAMAGE as error:
-            if index is None:
-                return
-            _tell(LogError(f"the log {path} is damaged: a chunk cannot be read ({error})"), damaged)
+            torn = LogError(f"the log {path} is damaged: a chunk cannot be read ({error})")
             continue
         for record in found:
             if isinstance(record, Channel):
@@ -320,12 +357,14 @@ def _messages(
                     break
                 if wanted is None or channel.metadata.get("topic") in wanted:
                     yield channel, schemas.get(channel.schema_id, ""), record
+    if torn is not None and is_ended(file):  # the last chunk of a log that was cut off is expected to be torn
+        _tell(torn, damaged)
 
 
 @cache
-def _say_cut_off(path: str) -> None:
+def _say_cut_off(path: str, why: str) -> None:
     """Once, however often the log is read."""
-    logger.warning("the log %s was cut off: reading the part that is complete", path)
+    logger.warning("the log %s is read without its index: %s", path, why)
 
 
 def _tell(fault: LogError, damaged: Callable[[LogError], None] | None) -> None:
@@ -334,9 +373,9 @@ def _tell(fault: LogError, damaged: Callable[[LogError], None] | None) -> None:
     damaged(fault)
 
 
-def _whole_records(file: BinaryIO, path: str | Path, wanted: Opcode) -> list[Any]:
-    """All records of one kind. Raises LogError."""
+def _appended(file: BinaryIO, path: str | Path, wanted: Opcode) -> list[Any]:
+    """All attachments or metadata records. Raises LogError."""
     try:
-        return [read() for read in records(file, wanted)]
+        return [read() for read in appended(file, index_of(file), wanted)]
     except DAMAGE as error:
         raise LogError(f"the log {path} is damaged: its {wanted.name.lower()} cannot be read ({error})") from error

@@ -15,7 +15,7 @@ from prior_sg.schemas.status import JobDone
 from prior_sg.schemas.topics import Query, Topic
 from prior_sg.services.refusals import NotYet
 from prior_sg.services.runtime.bus import key_matches
-from prior_sg.services.runtime.service import Ask, Errand, Identity, Service
+from prior_sg.services.runtime.service import Ask, Errand, Identity, Pause, Service
 
 Published = tuple[Topic, Message]
 Answerer = Union["Runner", Callable[[Any], Message | None]]
@@ -94,6 +94,8 @@ class Runner:
         published: list[Published] = []
         asks: list[Ask] = []
         for output in self.service.step(self.state, copied(message) if self.wire else message, self.cfg):
+            if isinstance(output, Pause):
+                continue  # nobody else can ask meanwhile
             if isinstance(output, Ask):
                 self.service.check_ask(output)
                 asks.append(output)

@@ -65,7 +65,12 @@ class Ask:
     request: Message
 
 
-Output = tuple[Topic, Message] | Ask
+@dataclass(frozen=True)
+class Pause:
+    """An output of a step that goes on, whose state is one to answer questions from: those that wait are answered."""
+
+
+Output = tuple[Topic, Message] | Ask | Pause
 
 
 @dataclass(frozen=True)
@@ -83,7 +88,8 @@ class Handover(Generic[State, Config]):
 class Service(Generic[State, Config]):
     """One service: what it reads, writes and answers, and the functions that do it, over its own state and config.
 
-    `step(state, message, cfg)` takes one input and yields outputs; it may change `state` and does nothing else.
+    `step(state, message, cfg)` takes one input and yields outputs; it may change `state` and does nothing else. A long
+    one yields `Pause` where `answers` may be called before it goes on.
     Inputs are messages of `reads`, of `job`, replies to its questions and errands, and `Tick` every `tick_s` seconds.
     `answers` maps a query to `f(state, request, cfg) -> reply`, which must not change the state.
     `reads_of`, where it is given, names the robots whose messages of `reads` come in, instead of its own.

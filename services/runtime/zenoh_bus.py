@@ -168,7 +168,8 @@ class ZenohBus:
 
     def _hold(self, key: str) -> None:
         """Keep the number that stands for a key within this process as long as the session. Zenoh gives it up with the
-        last subscription to the key, and a sample that is just then under way to another one, by that number, is lost.
+        last subscription to the key, or the last server of it, and a sample or a call that is just then under way to
+        another one, by that number, is lost.
         """
         with self._lock:
             if key and key not in self._held:
@@ -187,6 +188,7 @@ class ZenohBus:
 
     def serve(self, key: str, on_request: OnRequest) -> Callable[[], None]:
         """Answer calls on a key expression."""
+        self._hold(fixed_part(key))
         return self._kept(
             self._session.declare_queryable(key, lambda query: on_request(ZenohRequest(query)), complete=True)
         )

@@ -1,6 +1,8 @@
 """The wire format, against the independent implementation `msgpack`."""
 
+import copy
 import math
+import pickle
 import struct
 from typing import Annotated
 
@@ -25,6 +27,7 @@ from prior_sg.schemas.codec import (
     schema_name,
 )
 from prior_sg.schemas.topics import ENCODE, KEYFRAME, QUERIES, TOPICS, topic_of
+from tests.help import world
 
 CAMERA = frames.Intrinsics(640, 480, 525.5, 526.5, 319.5, 239.5)
 POSE = np.array([[0.0, -1, 0, 1.5], [1, 0, 0, -2.5], [0, 0, 1, 3.5], [0, 0, 0, 1]])
@@ -254,6 +257,29 @@ def test_round_trip_and_truncation(message):
             decode(type(message), payload[:cut])
 
 
+def test_files_are_views_into_what_was_received_and_of_their_own_in_a_copy():
+    sent = GOLDEN[0]
+    payload = encode(sent)
+    received = decode(frames.Keyframe, payload)
+    assert received.color.obj is received.depth.obj is received.mask.obj is payload
+    assert (received.color, received.depth, received.mask) == (sent.color, sent.depth, sent.mask)
+    assert received == sent and hash(received) == hash(sent) and encode(received) == payload
+    without_color = copied(msgspec.structs.replace(received, color=b""))
+    assert without_color.depth == sent.depth and len(without_color.depth.obj) == len(payload) - len(sent.color)
+
+
+@pytest.mark.parametrize("message", GOLDEN, ids=lambda m: type(m).__name__)
+def test_what_was_received_can_be_pickled_and_copied(message):
+    received = decode(type(message), encode(message))
+    assert pickle.loads(pickle.dumps(received)) == copy.deepcopy(received) == message
+
+
+def test_arrays_from_memory_that_can_be_written_to_are_read_only():
+    received = decode(frames.Keyframe, bytearray(encode(GOLDEN[0])))
+    with pytest.raises(ValueError, match="read-only"):
+        received.world_from_camera[0, 0] = 2.0
+
+
 @hypothesis.given(
     hnp.arrays(
         st.sampled_from([np.dtype(name) for name in DTYPES]),
@@ -365,10 +391,10 @@ def test_prior_check_names_the_fault():
         ({"adjacency": np.array([[0.0]], np.float32)}, "adjacency"),
         ({"containment": np.array([[1.5]], np.float32)}, "containment"),
         ({"regions": []}, "at least one region"),
-        ({"regions": [good.regions[0]] * 2, "containment": np.ones((2, 1), np.float32)}, "unique"),
+        ({"regions": [good.regions[0]] * 2, "containment": np.ones((2, 1), np.float32)}, "same name"),
     ]:
         fields = {name: getattr(good, name) for name in good.__struct_fields__} | change
-        if why == "unique":
+        if why == "same name":
             fields["adjacency"] = np.ones((2, 2), np.float32)
         if why == "at least one region":
             fields |= {"containment": np.ones((0, 1), np.float32), "adjacency": np.ones((0, 0), np.float32)}
@@ -382,11 +408,17 @@ def test_prior_check_names_the_fault():
         ("existence", float("nan"), "not finite"),
         ("inclination_mean_rad", 2.0, "right angle"),
         ("inclination_std_rad", 0.0, "above 0"),
+        ("inclination_std_rad", 1e-200, "above 0"),
         ("query_radius_m", float("inf"), "not finite"),
         ("query_radius_m", 0.0, "query radius"),
-        ("phrases", ["x" * 1000], "too long"),
+        ("phrases", ["x" * 1000], "longer than"),
+        ("phrases", ["a\x1b[31m"], "control characters"),
         ("phrases", [""], "no phrases"),
-        ("name", "x" * 100, "too long"),
+        ("parent", "a\u202eb", "control characters"),
+        ("name", "x" * 100, "longer than"),
+        ("name", " ", "is empty"),
+        ("name", "a\nb", "control characters"),
+        ("name", "\x1b[2J", "control characters"),
     ],
 )
 def test_a_prior_is_checked_alike_wherever_it_comes_from(field, value, why):
@@ -397,6 +429,43 @@ def test_a_prior_is_checked_alike_wherever_it_comes_from(field, value, why):
     raw["regions"] = [msgspec.to_builtins(region)]
     with pytest.raises(DecodeError, match=why):
         decode(priors.Prior, msgpack.packb(raw))
+
+
+@pytest.mark.parametrize(
+    ("robots", "why"),
+    [
+        (["ada", world.ROBOT], "merged of itself"),
+        ([f"s{number}" for number in range(257)], "at most 256"),
+        (["a/b"], "holds '/'"),
+        ([""], "is empty"),
+    ],
+)
+def test_a_map_is_merged_of_other_robots_and_of_no_more_than_take_a_task_at_once(robots, why):
+    with pytest.raises(ValueError, match=why):
+        world.no_places(merged_of=robots)
+    assert world.no_places(merged_of=[f"s{number}" for number in range(256)])
+
+
+@pytest.mark.parametrize("names", [("Kitchen", "kitchen"), ("hall", " hall"), ("café", "cafe\u0301")])
+def test_names_of_a_prior_that_are_the_same_are_refused_as_a_tasks_are(names):
+    rooms = world.prior(["a", "b"])
+    renamed = [msgspec.structs.replace(one, name=name) for one, name in zip(rooms.regions, names, strict=True)]
+    with pytest.raises(ValueError, match="same name"):
+        msgspec.structs.replace(rooms, regions=renamed)
+    one, other = (levels.Entry(name=name, existence=0.5) for name in names)
+    with pytest.raises(ValueError, match="same name"):
+        levels.LevelPrior(
+            name="zone",
+            entries=[one, other],
+            parents=np.eye(2, dtype=np.float32),
+            adjacency=np.ones((2, 2), np.float32),
+        )
+
+
+@pytest.mark.parametrize("changes", [{"task": "x" * 3000}, {"environment": "home\x00"}, {"vocabulary": ["a", "A"]}])
+def test_a_prior_answers_only_what_may_be_asked(changes):
+    with pytest.raises(ValueError, match=r"longer than|control characters|same name"):
+        msgspec.structs.replace(GOLDEN[3], **changes)
 
 
 def test_a_signature_or_a_field_added_later_changes_no_digest():

@@ -9,6 +9,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from prior_sg.schemas.codec import LAST_NUMBER, DecodeError, Number, NumberOrNone, Stamp, decode, encode
+from prior_sg.schemas.places import PlaceDelta
 from prior_sg.schemas.topics import QUERIES, TOPICS
 from tests.help.absurd import absurd
 from tests.help.examples import EXAMPLES
@@ -93,3 +94,9 @@ def test_what_is_let_in_has_one_plain_key_or_none():
 
     look()
     assert min(seen.values()) >= 10
+
+
+def test_a_camera_that_no_scene_can_hold_is_refused():
+    example = next(entry for entry in EXAMPLES if type(entry) is PlaceDelta)
+    with pytest.raises(DecodeError, match="camera_m: does not fit 32 bits"):
+        decode(PlaceDelta, packed(example, "camera_m", [0.0, -1e300, 0.0]))

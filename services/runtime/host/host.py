@@ -19,6 +19,7 @@ from prior_sg.schemas.status import JobDone, ServiceStatus, Started, StatusReque
 from prior_sg.schemas.succession import Bequest, Succession, TakesOver
 from prior_sg.schemas.topics import DELTAS, Query, Topic, alive_key, status_key, worker_keys, yield_key
 from prior_sg.services.refusals import InputRefused
+from prior_sg.services.runtime import heap
 from prior_sg.services.runtime.bus import Bus, Request, Sample
 from prior_sg.services.runtime.extras import release
 from prior_sg.services.runtime.host.admission import Admission
@@ -38,7 +39,7 @@ from prior_sg.services.runtime.host.timing import Timing
 from prior_sg.services.runtime.host.trail import Trail
 from prior_sg.services.runtime.host.workplace import Workplace
 from prior_sg.services.runtime.host.yielding import Yielding
-from prior_sg.services.runtime.service import Ask, Identity, Service
+from prior_sg.services.runtime.service import Ask, Identity, Pause, Service
 from prior_sg.services.runtime.signatures import signatures_in_force
 
 log = logging.getLogger(__name__)
@@ -99,6 +100,7 @@ class Host:
     async def run(self) -> None:
         """Build the state, join the bus, and work until stopped."""
         self._state = await self._on_thread(self.service.init, self.cfg, self.identity)
+        heap.give_back()
         for errand in self.service.errands:
             self._asks.can_do(errand, errand.open(self.cfg, self.identity))
         if self.service.handover is not None and (self._standby is not None or self._follows):
@@ -321,11 +323,19 @@ class Host:
         started_s = self._timing.begins()
         with self.trail.passing(message, name, self.inbox.waited_s, sample):
             for output in self.service.step(self._state, message, self.cfg):
-                if isinstance(output, Ask):
-                    self._ask(output)
-                else:
-                    self._publish(*output)
+                match output:
+                    case Pause():
+                        self._answer_waiting()
+                    case Ask():
+                        self._ask(output)
+                    case _:
+                        self._publish(*output)
         self._timing.stepped(started_s)
+
+    def _answer_waiting(self) -> None:
+        """Answer the questions that wait, amid a step."""
+        while (question := self.inbox.take_first(Question)) is not None:
+            self._handle(question)
 
     def _publish(self, topic: Topic, message: Message) -> None:
         self.service.check_write(topic)

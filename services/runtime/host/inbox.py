@@ -12,11 +12,12 @@ from collections import OrderedDict
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field
 from itertools import count
-from typing import Any
+from typing import Any, TypeVar
 
 from prior_sg.services.runtime.bus import Sample
 from prior_sg.services.runtime.host.limits import Limits
 
+T = TypeVar("T")
 log = logging.getLogger(__name__)
 MOST_WAITING = 20_000  # inputs: hours of a stream, seconds of a flood
 MOST_WRITERS = 4096  # whose newest sequence numbers are known, by key
@@ -105,6 +106,15 @@ class Inbox:
             since_s, item = self._waiting.popitem(last=False)[1]
         self.waited_s = time.monotonic() - since_s
         return item
+
+    def take_first(self, kind: type[T]) -> T | None:
+        """The oldest item, if it is of this kind."""
+        with self._lock:
+            place = next(iter(self._waiting), None)
+            if place is None or not isinstance(item := self._waiting[place][1], kind):
+                return None
+            del self._waiting[place]
+            return item
 
     def waiting(self) -> list[Any]:
         """What waits, oldest first."""

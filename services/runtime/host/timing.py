@@ -9,6 +9,7 @@ from typing import NamedTuple
 import psutil
 
 from prior_sg.schemas.status import STEP_BOUNDS_S
+from prior_sg.services.compiling import CLOCK
 
 RECENT_STEPS = 512
 WINDOW_S = 10.0
@@ -22,6 +23,7 @@ class Figures(NamedTuple):
     step_ms_p50: float
     step_ms_p99: float
     step_s: float
+    step_compiling_s: float
     step_counts: list[int]
     step_sum_s: float
     cpu_s: float
@@ -34,6 +36,7 @@ class Timing:
     def __init__(self) -> None:
         self._started_s = time.monotonic()
         self._began_s: float | None = None
+        self._compiled_s = 0.0  # before that
         self._steps: deque[tuple[float, float]] = deque(maxlen=RECENT_STEPS)  # (end, duration), seconds
         self._counts = [0] * (len(STEP_BOUNDS_S) + 1)
         self._sum_s = 0.0
@@ -41,6 +44,7 @@ class Timing:
 
     def begins(self) -> float:
         """A step begins; its time."""
+        self._compiled_s = CLOCK.seconds()
         self._began_s = time.monotonic()
         return self._began_s
 
@@ -62,6 +66,7 @@ class Timing:
         busy_s = sum(duration_s for end_s, duration_s in steps if end_s > now_s - window_s)
         began_s = self._began_s
         step_s = now_s - began_s if began_s is not None else 0.0
+        compiling_s = min(step_s, CLOCK.seconds() - self._compiled_s)
         counts, sum_s = list(self._counts), self._sum_s
         times, memory = self._process.cpu_times(), self._process.memory_info()
         return Figures(
@@ -70,6 +75,7 @@ class Timing:
             step_ms_p50=cuts[49],
             step_ms_p99=cuts[98],
             step_s=step_s,
+            step_compiling_s=compiling_s,
             step_counts=counts,
             step_sum_s=sum_s,
             cpu_s=times.user + times.system,

@@ -28,11 +28,12 @@ from prior_sg.schemas.topics import (
     worker_keys,
 )
 from prior_sg.services.refusals import InputRefused, fault_of_stamp
+from prior_sg.services.runtime import heap
 from prior_sg.services.runtime.bus import BusError, Hub, LocalBus, pack_header
 from prior_sg.services.runtime.client import BusClient
 from prior_sg.services.runtime.host.host import Host
 from prior_sg.services.runtime.jobs.pool import JobPool
-from prior_sg.services.runtime.service import Ask, Identity, Service, UndeclaredError
+from prior_sg.services.runtime.service import Ask, Identity, Pause, Service, UndeclaredError
 from prior_sg.services.runtime.zenoh_bus import ZenohBus
 from prior_sg.services.runtime.zenoh_session import client_config
 
@@ -171,6 +172,23 @@ def test_a_source_waits_for_its_first_reader_and_worker(new_bus):
     asyncio.run(main())
 
 
+def test_what_a_start_has_freed_is_given_back_before_the_first_input(monkeypatch):
+    happened = []
+    monkeypatch.setattr(heap, "give_back", lambda: happened.append("given back"))
+    hub = Hub()
+
+    def init(cfg, me):
+        happened.append("built")
+        return []
+
+    async def main():
+        service = Service("reader", "", "robot", Config, init, reader_step, reads=(KEYFRAME,))
+        async with running(lambda: LocalBus(hub), (service, Config(), "a")):
+            assert happened == ["built", "given back"]
+
+    asyncio.run(main())
+
+
 def test_bad_input_is_counted_and_stops_nothing(new_bus):
     async def main():
         async with running(new_bus, (READER, Config(), "a")) as (reader,):
@@ -276,6 +294,52 @@ def test_a_question_is_repeated_until_somebody_can_answer(new_bus):
             async with running(new_bus, (ANSWERER, Config(), "b")):
                 await until(lambda: asker._state)
             assert set(asker._state) == {0.25}
+
+    asyncio.run(main())
+
+
+PARTS = 40
+
+
+def sliced_step(state, message, cfg):
+    for part in range(PARTS):
+        time.sleep(0.01)
+        state.append((message.frame_id, part))
+        yield Pause()
+
+
+def how_far(state, request, cfg):
+    return VoxelMap(robot="r", voxel_m=float(len(state)), free=np.zeros((0, 3), np.int16), occupied=NO_VOXELS)
+
+
+NO_VOXELS = np.zeros((0, 3), np.int16)
+SLICED = Service(
+    "sliced", "", "robot", Config, lambda cfg, me: [], sliced_step, reads=(KEYFRAME,), answers={VOXEL_MAP: how_far}
+)  # fmt: skip
+
+
+def test_questions_are_answered_where_a_step_pauses_and_inputs_wait_for_its_end(new_bus):
+    async def main():
+        async with running(new_bus, (SLICED, Config(), "a")) as (sliced,):
+            bus = await asyncio.to_thread(new_bus)
+            entries, answers = [], []
+            bus.subscribe(JOURNAL, JOURNAL.pattern("r"), entries.append, lambda *_: None)
+            for number in (1, 2):
+                of_frame = keyframe(number)
+                bus.put(KEYFRAME, KEYFRAME.key_of(of_frame), encode(of_frame), pack_header("w", number, 0))
+            await until(lambda: len(sliced._state) > 2)
+            bus.call(VOXEL_MAP.key_of(MapRequest(robot="r")), encode(MapRequest(robot="r")), 5.0, answers.append)
+            await until(lambda: answers)
+            assert 2 < decode(VoxelMap, answers[0].payload).voxel_m < PARTS
+            assert not [e for e in entries if decode(Consumed, e.payload).topic == "KEYFRAME"]
+            await until(lambda: len(sliced._state) == 2 * PARTS)
+            assert sliced._state == [(number, part) for number in (1, 2) for part in range(PARTS)]
+            bus.put(KEYFRAME, KEYFRAME.key_of(keyframe(3)), encode(keyframe(3)), pack_header("w", 3, 0))
+            await until(lambda: len(sliced._state) > 2 * PARTS)
+        await until(lambda: decode(Consumed, entries[-1].payload).topic == "STOP")
+        assert len(sliced._state) == 3 * PARTS  # who is stopped finishes what it has begun
+        assert [decode(Consumed, e.payload).frame_id for e in entries[-4:]] == [1, 2, 3, -1]
+        await asyncio.to_thread(bus.close)
 
     asyncio.run(main())
 

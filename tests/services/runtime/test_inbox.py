@@ -23,6 +23,14 @@ def test_a_flood_fills_no_memory_and_what_is_lost_is_counted(monkeypatch):
     assert [one.sequence for one in newest] == [49]
 
 
+def test_only_what_comes_first_is_taken_out_by_its_kind():
+    inbox = Inbox(wake=lambda: None)
+    inbox.put(1)
+    assert inbox.take_first(str) is None
+    inbox.put("a question", first=True)
+    assert inbox.take_first(str) == "a question" and inbox.take_first(str) is None and inbox.take() == 1
+
+
 def test_writers_that_never_come_again_are_forgotten_and_the_busy_one_is_not(monkeypatch):
     monkeypatch.setattr(inboxes, "MOST_WRITERS", 4)
     inbox = Inbox(wake=lambda: None)

@@ -10,13 +10,23 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mcap.opcode import Opcode
 from mcap.reader import make_reader
 
 from prior_sg.schemas.codec import decode, encode
 from prior_sg.schemas.frames import CameraState, IngestState
 from prior_sg.schemas.migrations import MIGRATIONS
 from prior_sg.schemas.topics import CAMERA_STATE, INGEST_STATE, KEYFRAME, TOPICS
-from prior_sg.services.runtime.record import LogError, LogWriter, attachments, contents, metadata, read_log, summary
+from prior_sg.services.runtime.record import (
+    LogError,
+    LogWriter,
+    attachments,
+    contents,
+    loss,
+    metadata,
+    read_log,
+    summary,
+)
 from tests.help import reading
 from tests.help.paths import ROOT
 
@@ -153,6 +163,95 @@ def test_a_damaged_chunk_of_a_complete_log_is_reported(tmp_path):
     path.write_bytes(whole)
     with pytest.raises(LogError, match="damaged"):
         as_dicts(path)
+
+
+def places(data):
+    """Kind, beginning and end of each record of a log."""
+    found, at = [], 8
+    while at + 17 <= len(data):
+        end = at + 9 + int.from_bytes(data[at + 1 : at + 9], "little")
+        found.append((data[at], at, end))
+        at = end
+    return found
+
+
+def chunks_of(data):
+    return [(begin, end) for kind, begin, end in places(data) if kind == Opcode.CHUNK]
+
+
+def with_zeros(data, begin, length=64):
+    return data[:begin] + bytes(length) + data[begin + length :]
+
+
+def read_despite(path):
+    faults = []
+    return [(m.writer, m.sequence) for m in read_log(path, damaged=faults.append)], faults
+
+
+def test_a_damaged_chunk_of_a_log_without_an_index_hides_nothing_behind_it(tmp_path):
+    path, entries = tmp_path / "a.mcap", mixed_entries()
+    write(path, entries)
+    whole = path.read_bytes()
+    (begin, end), last = chunks_of(whole)[1], chunks_of(whole)[-1]
+    path.write_bytes(with_zeros(whole, (begin + end) // 2)[: last[0] + 50])
+    found, faults = read_despite(path)
+    assert len(faults) == 1 and "damaged" in str(faults[0])
+    assert any(sequence < 10 for _, sequence in found) and any(sequence > 25 for _, sequence in found)
+    assert loss(path) == "it was cut off; its last 50 bytes are not read; damaged parts left out: 1"
+    with pytest.raises(LogError, match="damaged"):
+        as_dicts(path)
+
+
+def test_a_chunk_that_was_zeroed_is_told_of(tmp_path):
+    path = tmp_path / "a.mcap"
+    write(path, mixed_entries())
+    whole = path.read_bytes()
+    begin, end = chunks_of(whole)[2]
+    path.write_bytes(with_zeros(whole, begin, end - begin))
+    found, faults = read_despite(path)
+    assert len(faults) == 1 and 0 < len(found) < 40
+
+
+@pytest.mark.parametrize("cut", [0, 30])
+def test_a_log_behind_another_is_told_of(tmp_path, cut):
+    path, entries = tmp_path / "a.mcap", mixed_entries()
+    write(path, entries)
+    whole = path.read_bytes()
+    first = whole[: -cut or None]
+    path.write_bytes(first + whole)
+    found, _ = read_despite(path)
+    assert found == [(e["writer"], e["sequence"]) for e in entries]
+    assert loss(path).startswith(f"another log begins at byte {len(first)}, whose {len(whole)} bytes are not read")
+    (tmp_path / "b.mcap").write_bytes(path.read_bytes()[len(first) :])
+    assert loss(tmp_path / "b.mcap") == ""
+
+
+def test_bytes_behind_the_end_and_a_damaged_index_are_told_apart(tmp_path):
+    path, entries = tmp_path / "a.mcap", mixed_entries()
+    write(path, entries)
+    whole = path.read_bytes()
+    assert loss(path) == ""
+    path.write_bytes(whole + b"more")
+    assert loss(path) == "the 4 bytes behind its end are none of it, and not read"
+    statistics = next(begin for kind, begin, _ in places(whole) if kind == Opcode.STATISTICS)
+    path.write_bytes(whole[: statistics + 9] + b"\x07" + whole[statistics + 10 :])
+    assert loss(path) == "its index is damaged"
+    assert as_dicts(path) == entries and summary(path) == {"INGEST_STATE": 10, "CAMERA_STATE": 30}
+
+
+def test_a_changed_attachment_is_told_of_and_others_are_found_behind_damage(tmp_path):
+    path = tmp_path / "a.mcap"
+    with LogWriter(path) as log:
+        log.add(**entry(0, 1))
+        log.flush()
+        log.attach("regions.json", "application/json", b'{"regions": []}')
+    whole = path.read_bytes()
+    (begin, _) = chunks_of(whole)[0]
+    path.write_bytes(whole[: begin + 1] + b"\xff" * 4 + whole[begin + 5 :])  # the chunk's length
+    assert attachments(path) == {"regions.json": b'{"regions": []}'}
+    path.write_bytes(whole.replace(b'"regions"', b'"religion"'[:9]))
+    with pytest.raises(LogError, match="attachment cannot be read"):
+        attachments(path)
 
 
 KILLED_WRITER = """

@@ -134,8 +134,7 @@ def test_two_nodes_talk_find_each_other_and_remember_latched_messages(endpoint):
         assert reply.sum == 42
         with pytest.raises(RosError, match="/add gives no answer: its 2 bytes are no"):
             client.call(b"xy")
-        kinds = [entity.kind for entity in listener.entities()]
-        assert sorted(kinds) == ["MP", "MP", "MP", "NN", "SS"]
+        wait_for(lambda: sorted(one.kind for one in listener.entities()) == ["MP", "MP", "MP", "NN", "SS"])
         assert ("/talker", wire.SERVER, True) in seen
         assert [service for service, _ in faults] == ["/add"]
 
