@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from prior_sg.deploy.api.errors import NotInSceneError
-from prior_sg.deploy.api.spots import spot_in
+from prior_sg.deploy.api.listed import Listed
+from prior_sg.deploy.api.spots import FARTHEST_M, spot_in
 from prior_sg.deploy.api.vectors import RecentVectors
 from prior_sg.schemas.answers import (
     Answer,
@@ -23,6 +24,7 @@ from prior_sg.schemas.answers import (
     Route,
     Thing,
     What,
+    listed_of,
 )
 from prior_sg.schemas.foresight import MissingLabel
 from prior_sg.schemas.levels import LevelName
@@ -61,7 +63,8 @@ SpotLike = str | Spot | Thing | Region | SceneObject | SceneMarker | PointLike
 class Asking(ABC):
     """Questions as methods. What cannot be understood in this scene, such as a label that nothing carries, raises
     NotInSceneError, whose message names what is nearest; what has no answer, such as an empty box, gives an empty list.
-    `label` narrows to what carries it, whatever its case; `what` is "place", "region" or "object".
+    `label` narrows to what carries it, whatever its case; `what` is "place", "region" or "object". Of a list that
+    `limit` or `k` cuts, `total` says how much there is.
     """
 
     @abstractmethod
@@ -80,10 +83,11 @@ class Asking(ABC):
 
     def near(
         self, point_m: PointLike, k: int = 1, what: What = "object", label: str = "", radius_m: float | None = None
-    ) -> list[Thing]:
+    ) -> Listed[Thing]:
         """The nearest `k` of a kind, the nearest first; with `radius_m`, none that is farther."""
-        found = self._things(Nearest(point_m=_point(point_m), what=what, label=label, limit=k))
-        return [one for one in found if radius_m is None or (one.distance_m or 0.0) <= radius_m]
+        if radius_m is not None:
+            return self.within(point_m, min(radius_m, FARTHEST_M), what, label, k)
+        return self._listed(Nearest(point_m=_point(point_m), what=what, label=label, limit=k), k)
 
     def within(
         self,
@@ -92,10 +96,11 @@ class Asking(ABC):
         what: What | None = None,
         label: str = "",
         limit: int = MOST_LISTED,
-    ) -> list[Thing]:
+    ) -> Listed[Thing]:
         """What is no farther than `radius_m`, the nearest first; without `what`, regions and objects."""
         point = _point(point_m)
-        return self._things(InRadius(point_m=point, radius_m=radius_m, what=what, label=label, limit=limit))
+        question = InRadius(point_m=point, radius_m=radius_m, what=what, label=label, limit=limit)
+        return self._listed(question, limit)
 
     def in_box(
         self,
@@ -104,18 +109,18 @@ class Asking(ABC):
         what: What | None = None,
         label: str = "",
         limit: int = MOST_LISTED,
-    ) -> list[Thing]:
+    ) -> Listed[Thing]:
         """What lies in an axis-aligned box; without `what`, regions and objects."""
         low, high = _point(min_m), _point(max_m)
-        return self._things(InBox(min_m=low, max_m=high, what=what, label=label, limit=limit))
+        return self._listed(InBox(min_m=low, max_m=high, what=what, label=label, limit=limit), limit)
 
-    def labelled(self, label: str, what: What | None = None, limit: int = MOST_LISTED) -> list[Thing]:
+    def labelled(self, label: str, what: What | None = None, limit: int = MOST_LISTED) -> Listed[Thing]:
         """What carries a label, the most probable first; without `what`, regions and objects."""
-        return self._things(ByLabel(label=label, what=what, limit=limit))
+        return self._listed(ByLabel(label=label, what=what, limit=limit), limit)
 
-    def objects_in(self, region: str = "", label: str = "", limit: int = MOST_LISTED) -> list[Thing]:
+    def objects_in(self, region: str = "", label: str = "", limit: int = MOST_LISTED) -> Listed[Thing]:
         """Objects of a label that stand in regions of a label, the most probable first."""
-        return self._things(ObjectsInRegions(object_label=label, region_label=region, limit=limit))
+        return self._listed(ObjectsInRegions(object_label=label, region_label=region, limit=limit), limit)
 
     def describe(self, what: What, number: int) -> Details:
         """Everything about one place, region or object."""
@@ -145,21 +150,19 @@ class Asking(ABC):
         number: int | None = None,
         region: int | None = None,
         limit: int = MOST_LISTED,
-    ) -> list[NodeWithRegions]:
+    ) -> Listed[NodeWithRegions]:
         """Zones, floors, buildings and districts with their regions, from below: of one level, of a label, of a number
         within its level, or those that hold a region."""
         question = NodesOf(level=level, label=label, id=number, region=region, limit=limit)
-        found: list[NodeWithRegions] = self._understood(question).nodes
-        return found
+        return self._listed(question, limit)
 
     def markers(
         self, number: int | None = None, dictionary: str = "", limit: int = MOST_LISTED
-    ) -> list[MarkerInRegion]:
+    ) -> Listed[MarkerInRegion]:
         """Where printed markers are, each with the region that it hangs in, by dictionary and number: all, or those of
         a number. Of one with a `doubt` nothing may be concluded."""
         question = MarkersOf(id=number, dictionary=dictionary, limit=limit)
-        found: list[MarkerInRegion] = self._understood(question).markers
-        return found
+        return self._listed(question, limit)
 
     def where_to_look(
         self, label: str, start: SpotLike = "here", clearance_m: float = 0.0, limit: int = MOST_RANKED
@@ -171,17 +174,16 @@ class Asking(ABC):
         outlook: Outlook = self._understood(question)
         return outlook
 
-    def missing(self, limit: int = MOST_RANKED) -> list[MissingLabel]:
+    def missing(self, limit: int = MOST_RANKED) -> Listed[MissingLabel]:
         """Labels that are probably still to be found behind the map's openings, the most probable first."""
-        labels: list[MissingLabel] = self._understood(WhatIsMissing(limit=limit)).labels
-        return labels
+        return self._listed(WhatIsMissing(limit=limit), limit)
 
     def candidates(self, region: int, limit: int = MOST_RANKED) -> RegionBeliefs:
         """What a region may be: labels with their probabilities, what is unknown, and how much is a prediction."""
         beliefs: RegionBeliefs = self._understood(BeliefsOf(region=region, limit=limit))
         return beliefs
 
-    def find(self, text: str, what: What | None = None, limit: int = MOST_RANKED) -> list[Thing]:
+    def find(self, text: str, what: What | None = None, limit: int = MOST_RANKED) -> Listed[Thing]:
         """What answers a text such as "somewhere to sit and eat", the best first; at a score of 0.5 it is as likely
         right as not. Without `what`, regions, objects, and the best place of each region.
 
@@ -196,7 +198,7 @@ class Asking(ABC):
             warnings.warn(ranking.reason, stacklevel=2)
         if missing:
             warnings.warn(f"{ranking.note}: {missing}" if ranking.note else missing, stacklevel=2)
-        return list(ranking.things)
+        return Listed[Any](*listed_of(ranking)).told(limit, callers=2)
 
     def likeness(self, text: str) -> tuple[dict[str, float], dict[str, float], str]:
         """How probably regions and objects of each label answer a text, by label, both empty where nothing embeds it;
@@ -220,9 +222,9 @@ class Asking(ABC):
         """What was embedded for searches so far."""
         return RecentVectors()
 
-    def _things(self, question: Question) -> list[Thing]:
-        things: list[Thing] = self._understood(question).things
-        return things
+    def _listed(self, question: Question, limit: int) -> Listed[Any]:
+        found, total = listed_of(self._understood(question))
+        return Listed(found, total).told(limit, callers=3)
 
     def _understood(self, question: Question) -> Any:
         answer: Any

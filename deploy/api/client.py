@@ -12,20 +12,21 @@ from typing import Any, Self
 
 import numpy as np
 
+from prior_sg.deploy.api.arrivals import Arrivals
 from prior_sg.deploy.api.asking import Asking
 from prior_sg.deploy.api.errors import NotInSceneError, PosesError, TaskError
 from prior_sg.deploy.api.kept import kept
 from prior_sg.deploy.api.scene import Scene
+from prior_sg.deploy.api.together import given_each, not_above, told_once
 from prior_sg.deploy.settings import DEFAULT_CONNECT, DEFAULT_ROBOT, ROUTER_WAIT_S
 from prior_sg.schemas.answers import Answer, Difference
 from prior_sg.schemas.codec import DecodeError, Message
 from prior_sg.schemas.features import TextEmbeddings, TextRequest
 from prior_sg.schemas.frames import PoseUpdate
 from prior_sg.schemas.members import follows_robots, only_of_robots
-from prior_sg.schemas.objects import ObjectDelta
 from prior_sg.schemas.priors import Prior, PriorList, PriorRequest, Task
 from prior_sg.schemas.queries import ChangedSince, Question, SceneAnswer, SceneQuery, WordsInUse, checked
-from prior_sg.schemas.regions import PosteriorReply, PosteriorRequest, RegionDelta
+from prior_sg.schemas.regions import PosteriorReply, PosteriorRequest
 from prior_sg.schemas.scene import HistoryRequest, RevisionList, SceneRequest, StoredRevision
 from prior_sg.schemas.scene import Scene as SceneMessage
 from prior_sg.schemas.status import Consumed, ServiceStatus
@@ -49,6 +50,7 @@ from prior_sg.services.runtime.zenoh_bus import ZenohBus
 
 STORE_POLL_S = 0.1
 NAMES_WAIT_S = 5.0  # for the objects' names, which follow a task's regions
+MERGE_WAIT_S = 10.0  # for a merged map, which follows its robots once a second
 MOST_CHANGES = 4096  # that wait for a follower
 MOST_PRIORS = 16  # that a client keeps
 DELTAS = (PLACE_DELTA, REGION_DELTA, OBJECT_DELTA)
@@ -115,6 +117,7 @@ class Client(Asking):
 
     def __init__(self, connect: str = DEFAULT_CONNECT, robot: str = DEFAULT_ROBOT, *, bus: Bus | None = None) -> None:
         self.robot = robot
+        self._above: tuple[str, ...] = ()  # merged maps for whose robots this one is asked
         self._client = BusClient(ZenohBus(connect, ROUTER_WAIT_S) if bus is None else bus)
         self._lock = threading.Lock()
         self._priors: dict[str, Prior] = {}  # by digest
@@ -209,12 +212,14 @@ class Client(Asking):
     ) -> Switch:
         """As `task`, with all that came of it. `waiting` is told why there is no prior yet, `on_prior` the prior.
 
-        Objects get their names a moment after the regions; the scene has them, unless that takes long.
+        Objects get their names a moment after the regions; the scene has them, unless that takes long. A merged map's
+        task is given to each of its robots; the prior is the first one's.
         """
         before: Any
         (before,) = self.ask(WordsInUse())
         if before.merged_of:
-            raise TaskError(follows_robots(self.robot, before.merged_of, "the task"))
+            told: dict[str, Any] = {"waiting": waiting, "on_prior": told_once(on_prior)}
+            return self._switch_each(before.merged_of, text, environment, regions, timeout_s, **told)
         environment = environment or before.environment
         if not environment:
             raise TaskError(f"{self.robot} has no environment yet; name one (--environment) with the task")
@@ -225,7 +230,7 @@ class Client(Asking):
             task=text,
             regions=list(regions or ()),
         )
-        arrivals = _Arrivals(task)
+        arrivals = Arrivals(task)
         with contextlib.ExitStack() as listening:
             for topic in (REGION_DELTA, OBJECT_DELTA):
                 listening.enter_context(self._client.listening(topic, self.robot, arrivals.see))
@@ -244,6 +249,25 @@ class Client(Asking):
                 named = self._stored(lambda now: arrivals.are_in(now, digest), end_s) if arrived else None
                 scene = named or self.scene()
         return Switch(scene, prior, seconds)
+
+    def _switch_each(self, robots: Sequence[str], *asked: Any, **told: Any) -> Switch:
+        """Of a merged map: `switch` each of its robots, and wait until the map follows them."""
+        given = given_each(robots, lambda one: self._below(one).switch(*asked, **told))
+        task, digests = given[0].scene.task, {one.prior.digest() for one in given}
+        end_s = time.monotonic() + MERGE_WAIT_S
+        scene = self._stored(lambda now: now.task == task and now.prior_digest in digests, end_s)
+        if scene is None:
+            raise TaskError(
+                f"{', '.join(robots)} follow the task, and their merged map {self.robot} does not within "
+                f"{MERGE_WAIT_S:.0f} s; see `prior-sg health`"
+            )
+        return Switch(scene, given[0].prior, max(one.seconds for one in given))
+
+    def _below(self, robot: str) -> "Client":
+        """Of one of the robots that this map is merged of. Raises TaskError where that is a map merged of this one."""
+        one = Client(robot=robot, bus=self._client.bus)
+        one._above = not_above(robot, (*self._above, self.robot))
+        return one
 
     def _stored(self, is_it: Callable[[SceneMessage], bool], end_s: float) -> Scene | None:
         """The scene once the store has taken what is waited for; None when it has not by then."""
@@ -332,50 +356,3 @@ class Client(Asking):
             except BusError as error:
                 silent[instance] = str(error)
         return Health(processes, silent)
-
-
-class _Arrivals:
-    """When the regions of a task arrived, by the prior they follow, and what names its objects got."""
-
-    def __init__(self, task: Task) -> None:
-        self._task, self._given_ns = task, time.time_ns()
-        self._since_s = time.monotonic()
-        self._found_s: dict[str, float] = {}
-        self._names: dict[str, dict[int, str]] = {}  # by object, by prior
-        self._changed = threading.Condition()
-
-    def see(self, sample: Sample) -> None:
-        """A delta sent after the task was given counts; the history may hold older ones of the same task."""
-        with contextlib.suppress(DecodeError):
-            delta: RegionDelta | ObjectDelta = message_in(sample)
-            if sample.sent_ns <= self._given_ns:
-                return
-            with self._changed:
-                if isinstance(delta, ObjectDelta):
-                    told = {item.id: item.label for item in delta.objects}
-                    self._names[delta.prior_digest] = self._names.get(delta.prior_digest, {}) | told
-                elif delta.task == self._task.task:
-                    self._found_s.setdefault(delta.prior_digest, time.monotonic())
-                self._changed.notify()
-
-    def seconds(self) -> float:
-        """Since the task was given."""
-        return time.monotonic() - self._since_s
-
-    def wait(self, prior_digest: str, end_s: float) -> float | None:
-        """Seconds from the task to the first regions of this prior; None when there are none by then."""
-        return self._found_s[prior_digest] - self._since_s if self._wait(prior_digest, self._found_s, end_s) else None
-
-    def wait_for_names(self, prior_digest: str, end_s: float) -> bool:
-        """Whether objects got names of this prior by then."""
-        return self._wait(prior_digest, self._names, end_s)
-
-    def are_in(self, scene: SceneMessage, prior_digest: str) -> bool:
-        """Whether the objects of a scene have the names of this prior that have arrived."""
-        with self._changed:
-            names = dict(self._names[prior_digest])
-        return all(names.get(item.id, item.label) == item.label for item in scene.objects)
-
-    def _wait(self, prior_digest: str, arrived: Mapping[str, object], end_s: float) -> bool:
-        with self._changed:
-            return self._changed.wait_for(lambda: prior_digest in arrived, max(end_s - time.monotonic(), 0))

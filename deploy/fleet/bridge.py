@@ -30,6 +30,7 @@ from prior_sg.schemas.topics import (
     SCENE,
     topic_of,
 )
+from prior_sg.services.errors import reason_of
 from prior_sg.services.runtime.service import Ask, Errand, Identity, Output, Service, ServiceError
 from prior_sg.services.scene_store.core import graph as scenes
 
@@ -74,9 +75,19 @@ def step(state: State, message: Message, cfg: Config) -> Iterator[Output]:
 
 
 def _keeper(cfg: Config, identity: Identity) -> Callable[[KeepNumbers], Awaitable[Message]]:
+    told = ""  # why the numbers are not on disk; said once, not with each of them
+
     async def keeps(request: KeepNumbers) -> NumbersKept:
-        if cfg.memory:
+        nonlocal told
+        try:
             keep(cfg.memory, request.content)
+            told = ""
+        except OSError as error:
+            if told != (told := reason_of(error)):
+                log.warning(
+                    f"{cfg.memory} cannot be written ({told}): the map goes on, and after a restart its numbers since "
+                    "then are given anew; the next new one that can be written keeps them all"
+                )
         return NumbersKept(robot=request.robot)
 
     return keeps

@@ -7,11 +7,13 @@ import msgspec
 import numpy as np
 
 from prior_sg.deploy.errors import UserError
+from prior_sg.deploy.fleet.core.doubting import fault_of_scene
 from prior_sg.deploy.fleet.core.ids import KINDS, Ids, Kind, Name, Session, Sessions
 from prior_sg.deploy.fleet.core.levels import Levels
 from prior_sg.deploy.fleet.core.members import Member, member_of_scene
 from prior_sg.deploy.fleet.core.merging import Memory
 from prior_sg.deploy.fleet.core.update import Numbers
+from prior_sg.schemas.names import fault_of_robot
 from prior_sg.services.runtime.service import ServiceError
 from prior_sg.services.segmenter.core.layers.layer_map import LayerMap
 
@@ -82,6 +84,8 @@ def stored_members(named: Sequence[str], sessions: Sessions) -> list[Member]:
             scene = read_material(path, robot).scene
         except UserError as error:
             raise ServiceError(str(error)) from error
+        if fault := fault_of_robot(robot) or fault_of_scene(msgspec.structs.replace(scene, robot=robot)):
+            raise ServiceError(f"{path} cannot be merged: {fault}")
         spots_m = dict(zip(scene.place_ids.tolist(), scene.positions_m.tolist(), strict=True))
         name = sessions.name_of(robot, spots_m)
         found.append(member_of_scene(msgspec.structs.replace(scene, robot=robot), name.session))

@@ -24,6 +24,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from prior_sg.deploy.errors import UserError
 from prior_sg.schemas.names import fault_of_robot
+from prior_sg.services.errors import reason_of
 from prior_sg.services.runtime.keys import ABOUT_FILE, CA_FILE, CERTIFICATE_FILE, KEY_FILE, About, Participant, Role
 
 CA_KEY_FILE, LIST_FILE, BUNDLES = "ca.key", "participants.json", "bundles"
@@ -48,7 +49,9 @@ class Authority:
         except FileNotFoundError as error:
             raise KeysError(f"{folder} holds no keys yet; run `prior-sg keys init`") from error
         except (OSError, ValueError) as error:
-            raise KeysError(f"the keys in {folder} cannot be read ({error}); restore them from a copy") from error
+            raise KeysError(
+                f"the keys in {folder} cannot be read ({reason_of(error)}); restore them from a copy"
+            ) from error
         assert isinstance(key, ec.EllipticCurvePrivateKey)
         self._key = key
         self.participants = {one.name: one for one in listed}

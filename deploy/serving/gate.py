@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
-from prior_sg.deploy.errors import UserError
+from prior_sg.deploy.errors import UsageError, UserError
+from prior_sg.services.errors import reason_of
 
 Scope = MutableMapping[str, Any]
 Receive = Callable[[], Awaitable[MutableMapping[str, Any]]]
@@ -23,6 +24,7 @@ App = Callable[[Scope, Receive, Send], Awaitable[None]]
 LOOPBACK_NAMES = ("localhost", "127.0.0.1", "::1")
 SHORTEST_TOKEN, LONGEST_TOKEN = 16, 512  # characters
 PROBLEM = "application/problem+json"
+PIECE_B = 2**16  # of an answer: what a connection that takes nothing holds in memory
 BODY_S = 30.0  # in which the body of a request has to arrive
 HOST = re.compile(rb"(\[[0-9a-f:.]+\]|[\w.-]+)(:\d{1,5})?", re.IGNORECASE)
 
@@ -44,7 +46,9 @@ def entrance(host: str, token_file: Path | None) -> Entrance:
     """How a server may be entered. Raises UserError where it would stand open to others."""
     token = "" if token_file is None else read_token(token_file)
     if not token and not is_loopback(host):
-        raise UserError(f"{host} can be reached from other machines: give --token-file FILE with a secret, or leave it")
+        raise UsageError(
+            f"{host} can be reached from other machines: give --token-file FILE with a secret, or leave it"
+        )
     return Entrance(host, token)
 
 
@@ -53,7 +57,7 @@ def read_token(path: Path) -> str:
     try:
         token = path.read_text().strip()
     except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f"cannot read the token in {path} ({error})") from error
+        raise UserError(f"cannot read the token in {path} ({reason_of(error)})") from error
     if not SHORTEST_TOKEN <= len(token) <= LONGEST_TOKEN or not token.isascii() or not token.isprintable():
         raise UserError(f"the token in {path} must be one line of {SHORTEST_TOKEN} to {LONGEST_TOKEN} ASCII characters")
     return token
@@ -93,7 +97,7 @@ class Gate:
             return await send({"type": "websocket.close", "code": 1008})
         if (fault := self._fault(_headers(scope["headers"]))) is not None:
             return await refuse(send, *fault)
-        return await self._app(scope, patiently(receive), send)
+        return await self._app(scope, patiently(receive), in_pieces(send))
 
     def _fault(self, headers: dict[bytes, list[bytes]]) -> tuple[int, str] | None:
         hosts, origins = headers.get(b"host", []), headers.get(b"origin", [])
@@ -146,6 +150,20 @@ def patiently(receive: Receive) -> Receive:
         return message
 
     return received
+
+
+def in_pieces(send: Send) -> Send:
+    """What sends a large body piece by piece, so that the next one waits until the connection has taken the last."""
+
+    async def sent(message: MutableMapping[str, Any]) -> None:
+        rest = memoryview(message.get("body", b""))
+        while len(rest) > PIECE_B:
+            await send({"type": message["type"], "body": bytes(rest[:PIECE_B]), "more_body": True})
+            rest = rest[PIECE_B:]
+            message = {**message, "body": rest}
+        await send({**message, "body": bytes(rest)} if "body" in message else message)
+
+    return sent
 
 
 def problem(status: int, detail: str) -> dict[str, Any]:

@@ -19,12 +19,12 @@ from prior_sg.deploy.serving.changing_tools import CHANGING
 from prior_sg.deploy.serving.gate import App, Entrance, Gate
 from prior_sg.deploy.serving.planner_text import lean_json
 from prior_sg.deploy.serving.system import EVERYWHERE, MOST_LIMIT, System
-from prior_sg.deploy.showing.text import scene_text
 from prior_sg.schemas.answers import What, Words
 from prior_sg.schemas.queries import InBox, Question, WordsInUse
 from prior_sg.schemas.scene import SceneRevision
 from prior_sg.services.errors import PriorSgError
 
+MOST_SESSIONS = 2000  # of clients over HTTP; one that has asked for nothing for half an hour is forgotten
 NEWS_PERIOD_S = 2.0  # between two notices of the same resource
 INSTRUCTIONS = (
     "These tools ask the scene graph of a robot: regions (rooms and other areas), objects in them, and places, between "
@@ -61,7 +61,9 @@ def planner(system: System) -> MCPServer[None]:
 def planner_app(system: System, entrance: Entrance) -> App:
     """The server over streamable HTTP, under /mcp, behind its gate."""
     guarded_by_gate = TransportSecuritySettings(enable_dns_rebinding_protection=False)
-    app = planner(system).streamable_http_app(host=entrance.host, transport_security=guarded_by_gate)
+    app = planner(system).streamable_http_app(
+        host=entrance.host, transport_security=guarded_by_gate, max_sessions=MOST_SESSIONS
+    )
     return Gate(app, entrance)  # type: ignore[arg-type]
 
 
@@ -80,7 +82,7 @@ def resources(system: System) -> list[FunctionResource]:
 
     async def scene() -> str:
         with _told():
-            return scene_text((await system.scene(robot)).message)
+            return (await system.told(robot, await system.tag(robot))).decode()
 
     def listing(what: What) -> Callable[[], Any]:
         return _answer_to(system, InBox(**EVERYWHERE, what=what, limit=MOST_LIMIT))

@@ -12,8 +12,8 @@ from prior_sg.deploy.api.errors import NotInSceneError
 from prior_sg.deploy.api.spots import ENDS, spot_in
 from prior_sg.deploy.serving.errors import FaultyRequestError
 from prior_sg.deploy.serving.parameters import FAULTS, Coordinate, Count, Distance, Label, Robot, system_of
-from prior_sg.deploy.serving.system import EVERYWHERE, LONGEST_SEARCH, MOST_QUESTIONS
-from prior_sg.schemas.answers import Answer, Details, Markers, Neighbourhood, RegionBeliefs, What
+from prior_sg.deploy.serving.system import EVERYWHERE, LONGEST_SEARCH, MOST_LIMIT, MOST_QUESTIONS
+from prior_sg.schemas.answers import Answer, Details, Markers, Neighbourhood, RegionBeliefs, What, listed_of
 from prior_sg.schemas.levels import LevelName
 from prior_sg.schemas.names import LONGEST_NAME
 from prior_sg.schemas.queries import (
@@ -54,6 +54,7 @@ class Answered(msgspec.Struct, frozen=True):
     revision: int
     stamp_ns: int
     answer: Answer
+    note: str = ""  # how much the answer does not list, and how to get it
 
 
 class RegionInFull(msgspec.Struct, frozen=True):
@@ -65,6 +66,7 @@ class RegionInFull(msgspec.Struct, frozen=True):
     details: Details
     candidates: RegionBeliefs
     neighbours: Neighbourhood
+    note: str = ""  # as in Answered, of the candidates
 
 
 class Alive(msgspec.Struct, frozen=True):
@@ -116,17 +118,18 @@ async def objects(state: State, robot: Robot, label: Label = "", limit: Count = 
 
 
 @get("/v1/{robot:str}/regions/{number:int}", responses=FAULTS)
-async def region(state: State, robot: Robot, number: FromPath[int]) -> RegionInFull:
-    """One region: its outline and ways out, what else it may be, and where one can go from it."""
+async def region(state: State, robot: Robot, number: FromPath[int], limit: Count = MOST_RANKED) -> RegionInFull:
+    """One region: its outline and ways out, what else it may be (`limit` labels), and where one can go from it."""
     questions = (
         _asked(ById, what="region", id=number),
-        _asked(BeliefsOf, region=number),
+        _asked(BeliefsOf, region=number, limit=limit),
         _asked(NeighboursOf, what="region", id=number),
     )
     found = await system_of(state).answers(robot, *questions)
     details, candidates, around = found.answers
     _there(details)
-    return RegionInFull(found.robot, found.revision, found.stamp_ns, details, candidates, around)  # type: ignore[arg-type]
+    note = _left_out(candidates, "limit")
+    return RegionInFull(found.robot, found.revision, found.stamp_ns, details, candidates, around, note)  # type: ignore[arg-type]
 
 
 @get("/v1/{robot:str}/objects/{number:int}", responses=FAULTS)
@@ -163,9 +166,9 @@ async def markers(state: State, robot: Robot, limit: Count = MOST_LISTED) -> Ans
 
 
 @get("/v1/{robot:str}/markers/{number:int}", responses=FAULTS)
-async def marker(state: State, robot: Robot, number: FromPath[int]) -> Answered:
+async def marker(state: State, robot: Robot, number: FromPath[int], limit: Count = MOST_LISTED) -> Answered:
     """The printed marker of a number; of several dictionaries, one of each."""
-    found = await _one(state, robot, _asked(MarkersOf, id=number))
+    found = await _one(state, robot, _asked(MarkersOf, id=number, limit=limit))
     if isinstance(found.answer, Markers) and not found.answer.markers:
         raise NotInSceneError(found.answer.reason)
     return found
@@ -184,7 +187,7 @@ async def near(
     k: Count = 1,
 ) -> Answered:
     """The nearest `k` of a kind, the nearest first."""
-    return await _one(state, robot, _asked(Nearest, point_m=(x, y, z), what=what, label=label, limit=k))
+    return await _one(state, robot, _asked(Nearest, point_m=(x, y, z), what=what, label=label, limit=k), "k")
 
 
 @get("/v1/{robot:str}/within", responses=FAULTS)
@@ -228,7 +231,7 @@ async def search(
 ) -> Answered:
     """What answers a text such as "somewhere to sit and eat", the best first; at a score of 0.5 it is as likely right
     as not. `note` says so where only words were compared."""
-    return _first(await system_of(state).find(robot, q, what, k))
+    return _first(await system_of(state).find(robot, q, what, k), "k")
 
 
 @get("/v1/{robot:str}/unseen", responses=FAULTS)
@@ -241,8 +244,8 @@ async def unseen(
     clearance_m: Distance = 0.0,
     limit: Count = MOST_RANKED,
 ) -> Answered:
-    """Behind which openings a region of a label that has not been seen is likely found first, and the way to the first.
-    All of it is predicted."""
+    """Behind which openings a region of a label that has not been seen is likely found first, the best to begin with
+    first (by `per_metre`), and the way to the first. All of it is predicted."""
     begin = _asked(spot_in, text=start)
     return await _one(state, robot, _asked(WhereToLook, label=label, start=begin, clearance_m=clearance_m, limit=limit))
 
@@ -304,12 +307,22 @@ def _asked(kind: Callable[..., Q], **fields: Any) -> Q:
         raise FaultyRequestError(str(error)) from error
 
 
-async def _one(state: State, robot: str, question: Question) -> Answered:
-    return _first(await system_of(state).answers(robot, question))
+async def _one(state: State, robot: str, question: Question, limit: str = "limit") -> Answered:
+    return _first(await system_of(state).answers(robot, question), limit)
 
 
-def _first(found: SceneAnswer) -> Answered:
-    return Answered(found.robot, found.revision, found.stamp_ns, found.answers[0])
+def _first(found: SceneAnswer, limit: str) -> Answered:
+    """`limit` is what the request calls the number of things that it wants."""
+    answer = found.answers[0]
+    return Answered(found.robot, found.revision, found.stamp_ns, answer, _left_out(answer, limit))
+
+
+def _left_out(answer: Answer, limit: str) -> str:
+    listed, total = listed_of(answer)
+    if len(listed) == total:
+        return ""
+    more = "lists all" if total <= MOST_LIMIT else "lists the most; the whole scene (scene.json) has all"
+    return f"{len(listed)} of {total} are listed; {limit}={min(total, MOST_LIMIT)} {more}"
 
 
 async def _listed(state: State, robot: str, what: What, label: str, limit: int) -> Answered:

@@ -14,7 +14,8 @@ from prior_sg.deploy.running.serve import parent_gone
 from prior_sg.deploy.serving.gate import App
 
 BACKLOG = 128
-GRACE_S = 2  # for answers that are under way at the end
+GRACE_S = 2.0  # for answers that are under way at the end; then their connections are cut
+FORCE_S = 2  # for what goes on without a connection; then it is cancelled
 IDLE_CHECK_S, LONGEST_IDLE_S = 1.0, 30.0  # in which a connection has to ask for something, or to have asked
 MOST_CONNECTIONS = 1000
 STUCK_MS = 30_000  # after which a connection is given up whose other end takes nothing
@@ -56,7 +57,7 @@ class Server(uvicorn.Server):
             log_config=None,
             server_header=False,
             proxy_headers=False,
-            timeout_graceful_shutdown=GRACE_S,
+            timeout_graceful_shutdown=int(GRACE_S + FORCE_S),
             limit_concurrency=MOST_CONNECTIONS,
             ws="none",
         )
@@ -66,7 +67,9 @@ class Server(uvicorn.Server):
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         """As its base, which waits for open connections."""
         self._closing()
+        cutting = asyncio.create_task(self._cut())
         await super().shutdown(sockets)
+        cutting.cancel()
 
     async def main_loop(self) -> None:
         """As its base."""
@@ -88,6 +91,13 @@ class Server(uvicorn.Server):
             for (connection, _), begun_s in since_s.items():
                 if now() - begun_s > LONGEST_IDLE_S and connection.transport is not None:
                     connection.transport.close()
+
+    async def _cut(self) -> None:
+        """Cut the connections whose other end takes nothing."""
+        await asyncio.sleep(GRACE_S)
+        for connection in list(self.server_state.connections):
+            if connection.transport is not None:
+                connection.transport.abort()
 
     async def _stop_with_parent(self) -> None:
         await parent_gone(self._parent)

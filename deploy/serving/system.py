@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import itertools
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
@@ -9,6 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, TypeVar
+from weakref import WeakValueDictionary
 
 import msgspec
 import numpy as np
@@ -17,12 +19,21 @@ from prior_sg.deploy.api.client import Client, Health
 from prior_sg.deploy.api.errors import NotInSceneError, TaskError
 from prior_sg.deploy.api.scene import Scene
 from prior_sg.deploy.serving.errors import BusyError, FaultyRequestError
+from prior_sg.deploy.showing.text import USUAL_TOKENS, scene_text
 from prior_sg.schemas.answers import What
 from prior_sg.schemas.codec import DecodeError
 from prior_sg.schemas.frames import IngestState
 from prior_sg.schemas.names import fault_of_robot, normal
 from prior_sg.schemas.priors import Prior, fault_of_task
-from prior_sg.schemas.queries import MOST_RANKED, AnswersTo, ChangedSince, Question, RouteBetween, SceneAnswer
+from prior_sg.schemas.queries import (
+    MOST_RANKED,
+    AnswersTo,
+    ChangedSince,
+    Question,
+    RouteBetween,
+    SceneAnswer,
+    WhereToLook,
+)
 from prior_sg.schemas.scene import Scene as SceneMessage
 from prior_sg.schemas.scene import SceneRevision
 from prior_sg.schemas.topics import INGEST_STATE, SCENE_REVISION
@@ -30,9 +41,10 @@ from prior_sg.services.runtime.bus import Bus, Sample, message_in
 
 MOST_ROBOTS = 64  # whose clients are kept
 MOST_WRITTEN = 8  # forms of scenes that are kept
-READERS, WRITERS = 16, 4  # threads
+READERS, WRITERS, PORTERS = 16, 4, 2  # threads that ask, that change, and that write whole scenes
 MOST_QUESTIONS, MOST_POSES, MOST_LIMIT = 64, 10_000, 10_000
-MOST_LABOUR = 8  # routes and comparisons of revisions at once: the store takes nothing else meanwhile
+MOST_LABOUR = 8  # routes, outlooks and comparisons of revisions at once: the store takes nothing else meanwhile
+LABOUR = (RouteBetween, WhereToLook, ChangedSince)
 LONGEST_SEARCH = 500  # characters
 EVERYWHERE: dict[str, Any] = {"min_m": (-1e9,) * 3, "max_m": (1e9,) * 3}
 T = TypeVar("T")
@@ -48,6 +60,15 @@ class TaskGiven:
     note: str = ""  # why there is no scene, or why another one will follow
 
 
+@dataclass(frozen=True)
+class Written:
+    """A scene in one form. `begun` is when it was asked for, in the count of all that ask."""
+
+    tag: str
+    begun: int
+    body: bytes
+
+
 class System:
     """Asks with one connection. What changes something gets one of its own, for as long as it takes: a publisher tells
     late readers what it has sent as long as it lives, also when others have corrected that since."""
@@ -57,12 +78,17 @@ class System:
         self._open_bus, self._bus = open_bus, open_bus()
         self._own = Client(robot=robot, bus=self._bus)
         self._clients: OrderedDict[str, Client] = OrderedDict()  # of other robots
-        self._written: OrderedDict[tuple[str, str, str], bytes] = OrderedDict()
+        self._written: OrderedDict[tuple[str, str], Written] = OrderedDict()  # by robot and form
+        self._writes: WeakValueDictionary[tuple[str, str], asyncio.Lock] = (
+            WeakValueDictionary()
+        )  # each lives while used
+        self._asked = itertools.count(1)
         self._lock = threading.Lock()
         self._seen = {robot}
         self._changing: set[str] = set()
         self._reading = ThreadPoolExecutor(READERS, "reader")
         self._writing = ThreadPoolExecutor(WRITERS, "writer")
+        self._carrying = ThreadPoolExecutor(PORTERS, "porter")
         self.on_revision: list[Callable[[SceneRevision], None]] = []  # each is called on a foreign thread
         self._sources: dict[str, IngestState] = {}  # by robot
         for topic, saw in ((SCENE_REVISION, self._saw), (INGEST_STATE, self._saw_source)):
@@ -72,6 +98,7 @@ class System:
         """Leave the system; what waits for it ends."""
         self._reading.shutdown(wait=False, cancel_futures=True)
         self._writing.shutdown(wait=False, cancel_futures=True)
+        self._carrying.shutdown(wait=False, cancel_futures=True)
         self._bus.close()
 
     def robots(self) -> list[str]:
@@ -86,8 +113,10 @@ class System:
             )
         if sum(getattr(question, "limit", 0) for question in questions) > MOST_LIMIT:
             raise FaultyRequestError(f"the limit is above {MOST_LIMIT}: ask for fewer")
-        if sum(isinstance(question, RouteBetween | ChangedSince) for question in questions) > MOST_LABOUR:
-            raise FaultyRequestError(f"more than {MOST_LABOUR} routes and changes are asked for at once: ask for fewer")
+        if sum(isinstance(question, LABOUR) for question in questions) > MOST_LABOUR:
+            raise FaultyRequestError(
+                f"more than {MOST_LABOUR} routes, outlooks and changes are asked for at once: ask for fewer"
+            )
         found: SceneAnswer = await self._read(robot, lambda client: client.answers(*questions))
         if found.revision < 0:
             raise NotInSceneError(f"nothing is stored of a robot {robot!r}")
@@ -110,19 +139,28 @@ class System:
         """The scene as stored now. Raises as `answers`."""
         return await self._read(robot, lambda client: client.scene())
 
+    async def told(self, robot: str, tag: str, budget_tokens: int = USUAL_TOKENS) -> bytes:
+        """The scene in few words, within a budget. Raises as `answers`."""
+        return await self.written(robot, tag, f"text {budget_tokens}", partial(_text, budget_tokens=budget_tokens))
+
     async def tag(self, robot: str) -> str:
         """Another one whenever the scene is another. Raises as `answers`."""
         now = await self.answers(robot)
         return f"{now.revision}-{now.stamp_ns}"
 
     async def written(self, robot: str, tag: str, form: str, write: Callable[[SceneMessage], bytes]) -> bytes:
-        """The scene as `write` puts it, once for each tag and form. Raises as `answers`."""
-        key = (robot, tag, form)
-        if key not in self._written:
-            self._written[key] = await self._read(robot, lambda client: write(client.scene().message))
-            while len(self._written) > MOST_WRITTEN:
-                self._written.popitem(last=False)
-        return self._written[key]
+        """The scene as `write` puts it, once for each tag and form; those who ask meanwhile share what was begun after
+        they came. Raises as `answers`."""
+        key, asked = (robot, form), next(self._asked)
+        lock = self._writes.setdefault(key, asyncio.Lock())
+        async with lock:
+            kept = self._written.get(key)
+            if kept is None or (kept.tag != tag and kept.begun < asked):
+                kept = Written(tag, next(self._asked), await self._carry(robot, write))
+                self._written[key] = kept
+                while len(self._written) > MOST_WRITTEN:
+                    self._written.popitem(last=False)
+            return kept.body
 
     async def health(self) -> Health:
         """What every process says of itself. Raises BusError."""
@@ -162,6 +200,12 @@ class System:
     async def _read(self, robot: str, ask: Callable[[Client], T]) -> T:
         client = self._client(robot)
         return await asyncio.get_running_loop().run_in_executor(self._reading, ask, client)
+
+    async def _carry(self, robot: str, write: Callable[[SceneMessage], bytes]) -> bytes:
+        """A whole scene, written on threads that those who ask small questions do not wait for."""
+        client = self._client(robot)
+        job = partial(_written_by, client, write)
+        return await asyncio.get_running_loop().run_in_executor(self._carrying, job)
 
     async def _change(self, robot: str, change: Callable[[Client], T]) -> T:
         """One change of a robot at a time."""
@@ -205,6 +249,14 @@ class System:
             state: IngestState = message_in(sample)
             if state.robot in self._sources or len(self._sources) < MOST_ROBOTS:
                 self._sources[state.robot] = state
+
+
+def _text(scene: SceneMessage, budget_tokens: int) -> bytes:
+    return scene_text(scene, budget_tokens).encode()
+
+
+def _written_by(client: Client, write: Callable[[SceneMessage], bytes]) -> bytes:
+    return write(client.scene().message)
 
 
 def _check_robot(robot: str) -> None:

@@ -1,6 +1,6 @@
 """Whole scenes over HTTP, in several forms, and their changes as they come."""
 
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable
 from typing import Annotated, Any
 
 import msgspec
@@ -15,7 +15,7 @@ from prior_sg.deploy.serving.events import Event
 from prior_sg.deploy.serving.parameters import FAULTS, Robot, Tokens, system_of
 from prior_sg.deploy.serving.system import EVERYWHERE, MOST_LIMIT
 from prior_sg.deploy.showing.export import scene_json
-from prior_sg.deploy.showing.text import USUAL_TOKENS, scene_text
+from prior_sg.deploy.showing.text import USUAL_TOKENS
 from prior_sg.schemas.answers import Things, Words
 from prior_sg.schemas.codec import encode
 from prior_sg.schemas.queries import InBox, WordsInUse
@@ -66,11 +66,8 @@ async def scene_told(
     state: State, robot: Robot, request: Plain, budget_tokens: Tokens = USUAL_TOKENS
 ) -> Response[bytes]:
     """The scene in few words, for language models: the most useful first, within a budget of tokens."""
-
-    def write(found: Scene) -> bytes:
-        return scene_text(found, budget_tokens).encode()
-
-    return await _written(state, robot, request, f"text/plain; budget={budget_tokens}", write)
+    system = system_of(state)
+    return await _answered(state, robot, request, "text/plain", lambda tag: system.told(robot, tag, budget_tokens))
 
 
 @get("/v1/{robot:str}/events", responses=FAULTS, media_type="text/event-stream")
@@ -104,15 +101,21 @@ def _message(event: Event | None) -> ServerSentEventMessage:
     return ServerSentEventMessage(json_text(event.data, indent=None), event=event.name, id=event.revision)
 
 
-async def _written(
-    state: State, robot: str, request: Plain, form: str, write: Callable[[Scene], bytes]
+async def _answered(
+    state: State, robot: str, request: Plain, media_type: str, write: Callable[[str], Awaitable[bytes]]
 ) -> Response[bytes]:
-    """A whole scene, unless whoever asks has it."""
+    """A whole scene as written for a tag, unless whoever asks has it."""
     tag = await system_of(state).tag(robot)
     if _is_known(request, tag):
         return Response(b"", status_code=304, headers=_tagged(tag))
-    body = await system_of(state).written(robot, tag, form, write)
-    return Response(body, media_type=form.partition(";")[0], headers=_tagged(tag))
+    return Response(await write(tag), media_type=media_type, headers=_tagged(tag))
+
+
+async def _written(
+    state: State, robot: str, request: Plain, form: str, write: Callable[[Scene], bytes]
+) -> Response[bytes]:
+    system = system_of(state)
+    return await _answered(state, robot, request, form, lambda tag: system.written(robot, tag, form, write))
 
 
 def _json(found: Scene) -> bytes:

@@ -1,5 +1,7 @@
 """A scene graph as a Spark-DSG graph."""
 
+import errno
+import json
 from pathlib import Path
 from typing import Any
 
@@ -68,8 +70,26 @@ def spark_dsg_graph(scene: Scene) -> spark_dsg.DynamicSceneGraph:
 
 
 def save_spark_dsg(scene: Scene, path: str | Path) -> None:
-    """Write a file that `DynamicSceneGraph.load` reads: JSON, or binary when the name ends in `.sparkdsg`."""
-    spark_dsg_graph(scene).save(str(path), include_mesh=False)
+    """Write a file that `DynamicSceneGraph.load` reads: JSON, or binary when the name ends in `.sparkdsg`.
+
+    Raises OSError, also where Spark-DSG says nothing: it takes no notice of a full disk.
+    """
+    graph = spark_dsg_graph(scene)
+    Path(path).open("wb").close()  # what cannot be written at all is told as such
+    graph.save(str(path), include_mesh=False)
+    if not _is_whole(Path(path), graph):
+        raise OSError(errno.ENOSPC, "it was cut off, as on a full disk")
+
+
+def _is_whole(path: Path, graph: spark_dsg.DynamicSceneGraph) -> bool:
+    content = path.read_bytes()
+    if path.suffix == ".sparkdsg":
+        return content.endswith(graph.to_binary())
+    try:
+        json.loads(content)
+    except ValueError:
+        return False
+    return True
 
 
 def _add_places(

@@ -40,8 +40,12 @@ def draw_title(view: View, scene: Scene) -> None:
     view.text(_fitted(under, 19, room_px), (left, SUPERSAMPLING * 94), 19, MUTED)
 
 
-def draw_legend(view: View, scene: Scene, colors: dict[str, Color], *, with_truth: bool, with_walls: bool) -> None:
-    """The regions, the largest first, with probability and area; below them what the other marks mean."""
+def draw_legend(
+    view: View, scene: Scene, colors: dict[str, Color], nameless: int, *, with_truth: bool, with_walls: bool
+) -> None:
+    """The regions, the largest first, with probability and area; below them what the other marks mean. So many objects
+    are `nameless` for want of room.
+    """
     left = view.shape[1] - SUPERSAMPLING * (LEGEND_PX + MARGIN_PX)
     top = SUPERSAMPLING * (TITLE_PX + MARGIN_PX)
     symbols = 4 + with_truth + 2 * with_walls + bool(scene.objects)
@@ -60,11 +64,20 @@ def draw_legend(view: View, scene: Scene, colors: dict[str, Color], *, with_trut
     if len(shown) < len(regions):
         top += SUPERSAMPLING * 36
         view.text(f"and {len(regions) - len(shown)} smaller ones", (left, top), 20, MUTED)
-    _draw_symbols(view, scene, left, top + SUPERSAMPLING * 30, with_truth=with_truth, with_walls=with_walls)
+    top += SUPERSAMPLING * 30
+    _draw_symbols(view, scene, (left, top), nameless, with_truth=with_truth, with_walls=with_walls)
 
 
-def _draw_symbols(view: View, scene: Scene, left: int, top: int, *, with_truth: bool, with_walls: bool) -> None:
+def object_row(nameless: int) -> str:
+    """What stands beside the mark of objects."""
+    return f"object ({nameless} names left out)" if nameless else "object"
+
+
+def _draw_symbols(
+    view: View, scene: Scene, corner: tuple[int, int], nameless: int, *, with_truth: bool, with_walls: bool
+) -> None:
     """What the other marks mean."""
+    left, top = corner
     step, middle = SUPERSAMPLING * 32, SUPERSAMPLING * 11
     x = np.array([left, left + SUPERSAMPLING * 22])
 
@@ -85,7 +98,7 @@ def _draw_symbols(view: View, scene: Scene, left: int, top: int, *, with_truth: 
     row("free, in no place" if not (scene.place_regions < 0).any() else "free, not labelled")
     _swatch(view, left, top, UNLABELLED if (scene.place_regions < 0).any() else FREE)
     if scene.objects:
-        start, end = row("object")
+        start, end = row(object_row(nameless))
         half = np.array((0, middle / 2))
         low, high = np.round((start - half, end + half)).astype(int).tolist()
         cv2.rectangle(view.canvas, low, high, MUTED, SUPERSAMPLING // 2, cv2.LINE_AA)

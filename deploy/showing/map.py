@@ -61,9 +61,9 @@ def draw_map(scene: Scene, voxel_map: VoxelMap | None, outlines_m: list[np.ndarr
     for outline_m in outlines_m:
         _draw_dashed(view, plane(outline_m, turned))
     taken = _draw_names(view, scene, turned)
-    _draw_object_names(view, shown, taken)
+    nameless = _draw_object_names(view, shown, taken)
     draw_title(view, scene)
-    draw_legend(view, scene, colors, with_truth=bool(outlines_m), with_walls=voxel_map is not None)
+    draw_legend(view, scene, colors, nameless, with_truth=bool(outlines_m), with_walls=voxel_map is not None)
     draw_scale(view, turned)
     encoded, data = cv2.imencode(".png", cv2.cvtColor(view.finished(), cv2.COLOR_RGB2BGR))
     if not encoded:
@@ -145,8 +145,9 @@ def _draw_objects(view: View, marks: list[_Mark]) -> None:
 
 def _draw_object_names(
     view: View, marks: list[_Mark], taken: list[tuple[float, float, float, float]], size: int = 13
-) -> None:
-    """Small names in the middle of their boxes, the largest first; one that would cover another name is left out."""
+) -> int:
+    """Small names in the middle of their boxes, the largest first; how many are left out, for want of room."""
+    left_out = 0
     for mark in sorted(marks, key=lambda mark: -float(np.ptp(mark.corners_m, axis=0).prod())):
         if not mark.label:
             continue
@@ -154,9 +155,11 @@ def _draw_object_names(
         x, y = view.pixels(mark.corners_m.mean(axis=0)[None])[0] - (width / 2, -height / 3)
         box = (float(x), float(y), float(width), float(height))
         if any(_overlap(box, other) for other in taken):
+            left_out += 1
             continue
         taken.append(box)
         _outlined_text(view, mark.label, box, size, rim=1)
+    return left_out
 
 
 def _draw_graph(view: View, scene: Scene, turned: bool) -> None:

@@ -6,12 +6,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from prior_sg.deploy.api.history import open_history
 from prior_sg.deploy.errors import UserError
 from prior_sg.deploy.showing import moments
 from prior_sg.deploy.showing.material import Material
 from prior_sg.deploy.showing.scene_reading import scene_of_json
-from prior_sg.schemas.codec import DecodeError, decode
+from prior_sg.schemas.codec import DecodeError, decode, encode
 from prior_sg.schemas.places import VoxelMap
 from prior_sg.schemas.priors import Prior
 from prior_sg.schemas.scene import Scene
@@ -25,6 +27,9 @@ SCORES = ("scores.json", "metrics.json")
 
 class SourceUnreadable(UserError):
     """A source holds no scene; the message says what would."""
+
+
+OTHERWISE = (ArithmeticError, AttributeError, LookupError, TypeError, ValueError)  # what content of other types raises
 
 
 def read_material(path: str | Path, robot: str, *, moments_wanted: int = 0, cloud_wanted: bool = False) -> Material:
@@ -46,7 +51,14 @@ def read_material(path: str | Path, robot: str, *, moments_wanted: int = 0, clou
 
 def _scores(folder: Path) -> dict[str, float | None]:
     file = next((folder / name for name in SCORES if (folder / name).exists()), None)
-    told: dict[str, Any] = {} if file is None else json.loads(file.read_text())
+    if file is None:
+        return {}
+    try:
+        told = json.loads(file.read_bytes())
+    except (OSError, ValueError, RecursionError) as error:
+        raise SourceUnreadable(f"{file} cannot be read: {error}; mend it, or move it away") from error
+    if not isinstance(told, dict):
+        raise SourceUnreadable(f"{file} holds no scores by name: mend it, or move it away")
     return {name: value for name, value in told.items() if value is None or isinstance(value, int | float)}
 
 
@@ -76,8 +88,8 @@ def _read_graph(path: Path) -> Material:
             raise SourceUnreadable(f"{path} is not JSON ({error})") from error
     if isinstance(told, dict) and "embedding_space" in told:
         try:
-            return Material(scene_of_json(told), losses=told.get("losses"))
-        except (KeyError, TypeError, ValueError) as error:
+            return Material(_sound(scene_of_json(told)), losses=told.get("losses"))
+        except OTHERWISE as error:
             raise SourceUnreadable(
                 f"{path} is not in the layout of scene.json: {type(error).__name__} {error}"
             ) from error
@@ -85,9 +97,21 @@ def _read_graph(path: Path) -> Material:
     from prior_sg.deploy.showing.dsg_reading import load_spark_dsg
 
     try:
-        return Material(load_spark_dsg(path))
-    except ValueError as error:
-        raise SourceUnreadable(f"{error}; our own layout is that of scene.json") from error
+        return Material(_sound(load_spark_dsg(path)))
+    except OTHERWISE as error:
+        raise SourceUnreadable(f"{path} tells no scene: {error}; our own layout is that of scene.json") from error
+
+
+def _sound(scene: Scene) -> Scene:
+    """The scene, whose fields are of their types and whose columns name places that there are. Raises ValueError."""
+    scene = decode(Scene, encode(scene))
+    known = scene.place_ids
+    if (np.diff(known) <= 0).any():
+        raise ValueError("its places are not sorted by id, each once")
+    for what in ("edges", "frontier_ids", "surface_ids", "predicted_ids"):
+        if (unknown := np.setdiff1d(getattr(scene, what), known)).size:
+            raise ValueError(f"its {what} name place {unknown[0]}, which it does not hold")
+    return scene
 
 
 def _read_log(path: Path, robot: str, moments_wanted: int, cloud_wanted: bool) -> Material:

@@ -8,8 +8,9 @@ Names and tasks come from outside: they are written on one line, without control
 """
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 
@@ -24,11 +25,11 @@ from prior_sg.services.geometry import pose_from_quaternion, rows_before
 MOST_TOKENS, LEAST_TOKENS = 100_000, 200
 USUAL_TOKENS = 2000
 LONGEST_NAME, LONGEST_TASK = 15, 40  # tokens
-FOR_OMISSIONS = 60  # tokens that are kept for saying what was left out
+FOR_OMISSIONS = 70  # tokens that are kept for saying what was left out
 CANDIDATES, LEAST_BELIEF = 3, 0.05
 MOST_IDS = 8  # of objects with one label in one region
-MOST_MARKERS = 10  # whose lines leave room for what is expected and for openings
-MOST_EXPECTED, LEAST_EXPECTED = 6, 0.2  # labels that are expected and not seen
+FIRST_MARKERS = slice(10)  # whose lines leave room for what is expected and for openings, which the others follow
+FIRST_EXPECTED, LEAST_EXPECTED = slice(6), 0.2  # labels that are expected and not seen, likewise
 REGIONS = "Regions, with the width of the ways out of them:\n"
 PIECES = re.compile(r"[A-Za-z]+|[^ ]")
 
@@ -44,15 +45,10 @@ class Budget:
         """Whether the text still fits; if so, it is paid for. `kind` is what it is, in the plural."""
         cost = tokens_of(text)
         if cost > self.left:
-            self.leave(1, kind)
+            self.omitted[kind] = self.omitted.get(kind, 0) + 1
             return False
         self.left -= cost
         return True
-
-    def leave(self, count: int, kind: str) -> None:
-        """So many pieces of a kind are left out."""
-        if count:
-            self.omitted[kind] = self.omitted.get(kind, 0) + count
 
 
 def scene_text(scene: Scene, budget_tokens: int = USUAL_TOKENS) -> str:
@@ -61,7 +57,16 @@ def scene_text(scene: Scene, budget_tokens: int = USUAL_TOKENS) -> str:
         raise ValueError(f"a budget lies between {LEAST_TOKENS} and {MOST_TOKENS} tokens, not at {budget_tokens}")
     head = "".join(_head(scene))
     budget = Budget(budget_tokens - tokens_of(head) - FOR_OMISSIONS)
-    parts = (_camera, _regions, _elsewhere, _markers, _expected, _frontiers)
+    parts: tuple[Callable[[Scene, Budget], Iterable[str]], ...] = (
+        _camera,
+        _regions,
+        _elsewhere,
+        partial(_markers, rows=FIRST_MARKERS),
+        partial(_expected, rows=FIRST_EXPECTED),
+        _frontiers,
+        partial(_markers, rows=slice(FIRST_MARKERS.stop, None)),
+        partial(_expected, rows=slice(FIRST_EXPECTED.stop, None)),
+    )
     body = [line for part in parts for line in part(scene, budget)]
     return head + "".join(body) + _omissions(budget.omitted)
 
@@ -191,25 +196,24 @@ def _elsewhere(scene: Scene, budget: Budget) -> Iterator[str]:
         yield line
 
 
-def _markers(scene: Scene, budget: Budget) -> Iterator[str]:
+def _markers(scene: Scene, budget: Budget, rows: slice) -> Iterator[str]:
     """Printed markers: where each hangs, and what is doubtful about it."""
     names = {region.id: _name(region) for region in scene.regions}
-    for marker in scene.markers[:MOST_MARKERS]:
+    for marker in scene.markers[rows]:
         pose = pose_from_quaternion(np.array(marker.position_m), np.array(marker.quaternion_xyzw))
-        rows = rows_before(pose, scene.positions_m)
-        gaps_m = np.linalg.norm(scene.positions_m[rows] - pose[:3, 3], axis=1)
-        holder = names.get(int(scene.place_regions[rows[gaps_m.argmin()]]), "") if len(rows) else ""
+        places = rows_before(pose, scene.positions_m)
+        gaps_m = np.linalg.norm(scene.positions_m[places] - pose[:3, 3], axis=1)
+        holder = names.get(int(scene.place_regions[places[gaps_m.argmin()]]), "") if len(places) else ""
         where = f"{_point(marker.position_m)}{f' in {holder}' if holder else ''}"
         doubt = f", in doubt: {_short(marker.doubt, LONGEST_TASK)}" if marker.doubt else ""
         line = f"Printed marker {marker.id} ({_short(marker.dictionary)}) at {where}{doubt}\n"
         if budget.take(line, "markers"):
             yield line
-    budget.leave(len(scene.markers[MOST_MARKERS:]), "markers")
 
 
-def _expected(scene: Scene, budget: Budget) -> Iterator[str]:
+def _expected(scene: Scene, budget: Budget, rows: slice) -> Iterator[str]:
     """What nobody has seen: labels that are probably still to be found, and the surest place to look for each."""
-    for entry in scene.foresight.missing[:MOST_EXPECTED]:
+    for entry in scene.foresight.missing[rows]:
         behind = max(scene.foresight.openings, key=lambda opening: _chance(opening, entry.label), default=None)
         if behind is None or entry.probability < LEAST_EXPECTED:
             continue
@@ -245,7 +249,8 @@ def _omissions(omitted: dict[str, int]) -> str:
     """At most FOR_OMISSIONS tokens."""
     if not omitted:
         return ""
-    return f"Left out: {', '.join(f'{count} {kind}' for kind, count in omitted.items())}.\n"
+    left_out = ", ".join(f"{count} {kind}" for kind, count in omitted.items())
+    return f"Left out: {left_out}; a larger budget tells more.\n"
 
 
 def _name(region: Region) -> str:

@@ -1,6 +1,7 @@
 """What a click means: the printed marker, place or region that a ray of sight meets first (pure)."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from prior_sg.schemas.scene import Scene
 
 CLOSE_RAD = 0.012  # a click that misses a dot by less means it
 CLOSE_TO_MARKER_RAD = 0.02  # likewise a marker, beside which its name stands
+ON_GROUND_M = 0.5  # below a storey's floor, from which something is under it
 
 
 @dataclass(frozen=True)
@@ -41,6 +43,13 @@ class PickedMarker:
         return Spot(what="marker", id=self.key.id, dictionary=self.key.dictionary)
 
 
+class Met(NamedTuple):
+    """What a ray meets, and how far along it."""
+
+    along_m: float
+    what: Picked | PickedMarker
+
+
 def pick(
     scene: Scene,
     ground: dict[int, Footprint],
@@ -50,35 +59,42 @@ def pick(
     dots: bool,
     markers: bool = False,
 ) -> Picked | PickedMarker | None:
-    """What a ray from `origin_m` (3,) along `direction` (3,) meets; `dots` and `markers` say whether places and printed
-    markers can be seen."""
+    """What a ray from `origin_m` (3,) along `direction` (3,) meets first; `dots` and `markers` say whether places and
+    printed markers can be seen. What lies on the ground counts as before it."""
     direction = direction / np.linalg.norm(direction)
+    met: list[Met] = []
     if markers and scene.markers:
         half_m = np.array([one.size_m for one in scene.markers]) / 2
-        row = _nearest(spots_of(scene.markers) - origin_m, direction, CLOSE_TO_MARKER_RAD, half_m)
-        if row is not None:
-            return PickedMarker(scene.markers[row].key)
-    if not len(scene.place_ids):
-        return None
-    if dots and (row := _nearest(scene.positions_m - origin_m, direction, CLOSE_RAD)) is not None:
-        return _picked(scene, row, itself=True)
-    row = _below(scene, ground, origin_m, direction)
-    return None if row is None else _picked(scene, row, itself=False)
+        row, along_m = _nearest(spots_of(scene.markers) - origin_m, direction, CLOSE_TO_MARKER_RAD, half_m)
+        met += [] if row is None else [Met(along_m, PickedMarker(scene.markers[row].key))]
+    if dots and len(scene.place_ids):
+        row, along_m = _nearest(scene.positions_m - origin_m, direction, CLOSE_RAD)
+        met += [] if row is None else [Met(along_m, _picked(scene, row, itself=True))]
+    row, along_m = _below(scene, ground, origin_m, direction)
+    if row is not None:
+        within_m = ON_GROUND_M / abs(float(direction[2]))
+        met.append(Met(along_m + within_m, _picked(scene, row, itself=False)))
+    return min(met, key=lambda one: one.along_m).what if met else None
 
 
 def _nearest(
     offsets_m: np.ndarray, direction: np.ndarray, close_rad: float, half_m: np.ndarray | float = 0.0
-) -> int | None:
+) -> tuple[int | None, float]:
     """Of spots (spot, 3) seen from the eye, the nearest that a ray along `direction` (3,) misses by less than an angle,
-    or by less than half their size (spot,)."""
+    or by less than half their size (spot,); and how far along it is."""
     along_m = offsets_m @ direction
     aside_m = np.linalg.norm(offsets_m - along_m[:, None] * direction, axis=1)
     near = np.flatnonzero((along_m > 0) & (aside_m < np.maximum(close_rad * along_m, half_m)))
-    return int(near[along_m[near].argmin()]) if len(near) else None
+    if not len(near):
+        return None, np.inf
+    row = int(near[along_m[near].argmin()])
+    return row, float(along_m[row])
 
 
-def _below(scene: Scene, ground: dict[int, Footprint], origin_m: np.ndarray, direction: np.ndarray) -> int | None:
-    """The place that owns the nearest ground the ray meets."""
+def _below(
+    scene: Scene, ground: dict[int, Footprint], origin_m: np.ndarray, direction: np.ndarray
+) -> tuple[int | None, float]:
+    """The place that owns the nearest ground the ray meets, and how far along that is."""
     floors = sorted({float(one.vertices[0, 2]) for one in ground.values()}, reverse=bool(direction[2] < 0))
     for floor_m in floors if direction[2] else []:
         reach = (floor_m - origin_m[2]) / direction[2]
@@ -89,8 +105,8 @@ def _below(scene: Scene, ground: dict[int, Footprint], origin_m: np.ndarray, dir
         rows = np.flatnonzero(np.isin(scene.place_regions, storey))
         heights = scene.radii_m[rows] - np.linalg.norm(scene.positions_m[rows, :2] - at[:2], axis=1)
         if heights.max() > -PAD_M:
-            return int(rows[heights.argmax()])
-    return None
+            return int(rows[heights.argmax()]), float(reach)
+    return None, np.inf
 
 
 def _picked(scene: Scene, row: int, *, itself: bool) -> Picked:

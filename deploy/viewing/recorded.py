@@ -16,7 +16,7 @@ from prior_sg.deploy.errors import UserError
 from prior_sg.deploy.inspecting import replay
 from prior_sg.deploy.viewing.cloud import Cloud, small_image
 from prior_sg.deploy.viewing.sources import Camera, Likeness, Say
-from prior_sg.schemas.codec import DecodeError, Message, decode
+from prior_sg.schemas.codec import DecodeError, Message, copied, decode
 from prior_sg.schemas.frames import Keyframe, PoseUpdate
 from prior_sg.schemas.priors import Prior
 from prior_sg.schemas.regions import PosteriorReply, PosteriorRequest
@@ -142,8 +142,8 @@ def robot_of(message: Message) -> str:
 def camera_of(frame: Keyframe) -> Camera:
     """What the page shows of a keyframe. Raises ImageFault."""
     image = small_image(frame, IMAGE_PX)
-    depth = msgspec.structs.replace(frame, color=b"", depth=bytes(frame.depth))
-    return Camera(frame.frame_id, frame.stamp_ns, frame.intrinsics, frame.world_from_camera, image, depth)
+    depth = copied(msgspec.structs.replace(frame, color=b""))
+    return Camera(frame.frame_id, frame.stamp_ns, frame.intrinsics, depth.world_from_camera, image, depth)
 
 
 def open_recorded(place: str, robot: str) -> Recorded:

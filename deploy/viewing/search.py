@@ -13,7 +13,7 @@ from prior_sg.services.scene_store.core.queries.answering import answer
 from prior_sg.services.scene_store.core.queries.index import Index
 from prior_sg.services.scene_store.core.queries.markers import nothing_numbered, numbered
 
-MOST_ANSWERS = 5
+MOST_ANSWERS, MOST_LIT = 5, 1000  # shown with a number; lit, places that are not among them
 MARKER_NAME = re.compile(r"marker\s*#?\s*(\d{1,9})", re.IGNORECASE)
 NOTHING_KNOWN = Likeness({}, {})
 LIKELY = 0.5  # a score from which an answer is rather right than wrong
@@ -46,7 +46,7 @@ class Found:
 
 def ranked(index: Index, text: str, likeness: Likeness) -> Ranking:
     """What answers a text by what its labels mean; where nothing is known of that, by their words."""
-    asked = AnswersTo(text=text, regions=likeness.regions, objects=likeness.objects, limit=3 * MOST_ANSWERS)
+    asked = AnswersTo(text=text, regions=likeness.regions, objects=likeness.objects, limit=MOST_LIT)
     found = answer(index, asked)
     if not isinstance(found, Ranking):
         raise TypeError(f"AnswersTo is answered by {type(found).__name__}")
@@ -65,7 +65,8 @@ def found_in(ranking: Ranking, scene: Scene, text: str) -> Found:
         objects=frozenset(thing.id for thing in bright if thing.what == "object"),
     )
     said = ranking.note or ("" if best >= LIKELY else "nothing answers this for sure; these come nearest")
-    return Found([Hit(thing.what, thing.id, thing.label, thing.score) for thing in things[:MOST_ANSWERS]], lit, said)
+    listed = things[: max(MOST_ANSWERS, len(bright))]
+    return _first([Hit(thing.what, thing.id, thing.label, thing.score) for thing in listed], lit, said)
 
 
 def begun(scene: Scene, text: str) -> Found:
@@ -76,12 +77,12 @@ def begun(scene: Scene, text: str) -> Found:
         *((one.probability * one.known, Hit("object", one.id, one.label, None)) for one in scene.objects),
     ]
     fitting = [(sure, hit) for sure, hit in named if _begins(hit.label, start)]
-    best = [hit for _, hit in sorted(fitting, key=lambda one: -one[0])[:MOST_ANSWERS]]
+    best = [hit for _, hit in sorted(fitting, key=lambda one: -one[0])]
     lit = Lit(
-        regions=frozenset(hit.id for hit in best if hit.what == "region"),
-        objects=frozenset(hit.id for hit in best if hit.what == "object"),
+        regions=frozenset(hit.id for hit in best[:MOST_ANSWERS] if hit.what == "region"),
+        objects=frozenset(hit.id for hit in best[:MOST_ANSWERS] if hit.what == "object"),
     )
-    return Found(best, lit, "" if best else f"nothing here answers {text.strip()!r}")
+    return _first(best, lit, "" if best else f"nothing here answers {text.strip()!r}")
 
 
 def markers_called(scene: Scene, text: str) -> Found | None:
@@ -95,7 +96,14 @@ def markers_called(scene: Scene, text: str) -> Found | None:
         Hit("marker", one.id, f"marker {one.id}" if len(there) == 1 else str(one.key), None, one.dictionary)
         for one in there
     ]
-    return Found(hits[:MOST_ANSWERS], Lit(), doubts if there else nothing_numbered(scene, int(number[1])))
+    return _first(hits, Lit(), doubts if there else nothing_numbered(scene, int(number[1])))
+
+
+def _first(hits: list[Hit], lit: Lit, said: str) -> Found:
+    """The first of all that answer as well as the best, and how many others there are."""
+    more = len(hits) - MOST_ANSWERS
+    left_out = f"{more} more: write more of what you look for, or ask `prior-sg query`" if more > 0 else ""
+    return Found(hits[:MOST_ANSWERS], lit, "; ".join(filter(None, (said, left_out))))
 
 
 def find(index: Index, text: str, likeness: Likeness = NOTHING_KNOWN) -> Found:

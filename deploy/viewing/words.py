@@ -22,7 +22,7 @@ from prior_sg.schemas.regions import NO_REGION, PosteriorReply, Region
 from prior_sg.schemas.scene import Scene
 from prior_sg.schemas.status import ServiceStatus
 
-CANDIDATES, MOST_ROWS = 3, 40
+CANDIDATES, MOST_ROWS, MOST_LOSSES = 3, 40, 2
 NEAR_M = 0.3  # a way that ends so close to what was asked for ends there
 FAINT, SMALL = "opacity:.62", "opacity:.62;font-size:11.5px"
 NUMBER = "flex:none;text-align:right;font-variant-numeric:tabular-nums"
@@ -56,8 +56,8 @@ def headline(scene: Scene, title: str) -> str:
     )
 
 
-def _counted(count: int, name: str) -> str:
-    return f"{count} {name}" + ("" if count == 1 else "s")
+def _counted(count: int, name: str, several: str = "") -> str:
+    return f"{count} {name if count == 1 else several or name + 's'}"
 
 
 _BOX = "padding:2px 12px 6px;font-size:13px;line-height:1.4"
@@ -72,7 +72,9 @@ def legend(scene: Scene, colors: Mapping[str, Color]) -> str:
     ordered = sorted(scene.regions, key=lambda region: -region.area_m2)
     rows = "".join(_legend_row(scene, region, colors[region.label]) for region in ordered[:MOST_ROWS])
     more = len(ordered) - MOST_ROWS
-    return f'<div style="{_BOX}">{rows}{f"and {more} smaller ones" if more > 0 else ""}</div>'
+    return (
+        f'<div style="{_BOX}">{rows}{f"and {more} smaller ones, on the map and under Find" if more > 0 else ""}</div>'
+    )
 
 
 def _legend_row(scene: Scene, region: Region, color: Color) -> str:
@@ -118,7 +120,8 @@ def region_story(scene: Scene, region: Region) -> str:
         lines.append("made of " + ", ".join(text_of(said(member)) for member in region.members))
     if region.predicted:
         lines.insert(0, "a prediction from its surroundings: barely seen itself")
-    bars = _bars(candidates(scene, region), AGREES)
+    likely = candidates(scene, region)
+    bars = _bars(likely, AGREES) + _others(len(scene.labels) - len(likely), f"region {region.id}")
     return f'{_title(region.label, f"region {region.id}")}<div style="{_BOX}">{"<br>".join(lines)}{bars}</div>'
 
 
@@ -144,7 +147,13 @@ def place_story(scene: Scene, place: int) -> str:
     label = next((region.label for region in scene.regions if region.id == scene.place_regions[row]), "")
     said = f"unknown {_percent(float(scene.unknown[row]))}, {2 * float(scene.radii_m[row]):.1f} m of free space around"
     title = _title(label or "not labelled yet", f"place {place}")
-    return f'{title}<div style="{_BOX}">{said}{_bars(ranked, AGREES)}</div>'
+    others = _others(len(scene.labels) - len(ranked), f"place {place}")
+    return f'{title}<div style="{_BOX}">{said}{_bars(ranked, AGREES)}{others}</div>'
+
+
+def _others(count: int, thing: str) -> str:
+    """That there are so many labels more, and where to see them."""
+    return f'<div style="{SMALL}">{_counted(count, "other label")}: prior-sg query {thing}</div>' if count > 0 else ""
 
 
 def explanation(reply: PosteriorReply) -> str:
@@ -216,8 +225,10 @@ def _state_of(process: ServiceStatus) -> tuple[bool, str]:
         busy,
         f"{process.resident_mb:.0f} MB",
         *faults,
-        *(f"{loss.count} {loss.what}" for loss in process.losses[:2]),
+        *(f"{loss.count} {loss.what}" for loss in process.losses[:MOST_LOSSES]),
     ]
+    if (more := len(process.losses) - MOST_LOSSES) > 0:
+        told.append(f"and {_counted(more, 'other loss', 'other losses')}: prior-sg health")
     return not faults, text_of(", ".join(told))
 
 

@@ -39,6 +39,7 @@ GAUGES = (  # name, what it is, and what of a status it says
     ("backlog_inputs", "Inputs that wait", lambda one: one.backlog),
     ("backlog_oldest_seconds", "How long the input that waits longest has been waiting", lambda one: one.oldest_wait_s),
     ("step_running_seconds", "How long the process has been at the input it is at", lambda one: one.step_s),
+    ("step_compiling_seconds", "For how long of that it compiled inner loops", lambda one: one.step_compiling_s),
     ("unanswered_questions", "Questions of the process that nobody has answered yet", lambda one: len(one.waiting_for)),
 )
 COUNTS = (

@@ -11,7 +11,7 @@ from opentelemetry.sdk.trace import Event, ReadableSpan
 from opentelemetry.sdk.trace.export import BatchSpanProcessor
 from opentelemetry.trace import Link, SpanContext, SpanKind, Status, StatusCode, TraceFlags
 
-from prior_sg.deploy.errors import UserError
+from prior_sg.deploy.errors import UsageError, UserError
 from prior_sg.deploy.watching.spans import Span, Traces
 from prior_sg.schemas.status import Passage, ServiceStatus
 from prior_sg.services.runtime.bus import TRACEPARENT
@@ -48,7 +48,7 @@ def endpoint_in_force(given: str) -> str:
     if given.startswith(("http://", "https://")):
         return given
     if given:
-        raise UserError(f"{given!r} is no collector of traces: give its address, such as http://localhost:4318")
+        raise UsageError(f"{given!r} is no collector of traces: give its address, such as http://localhost:4318")
     if not any(map(os.environ.get, VARIABLES)):
         raise UserError(f"no collector of traces is named: give --trace http://HOST:4318, or set {VARIABLES[1]}")
     return ""

@@ -17,7 +17,7 @@ from prior_sg.schemas.priors import Prior
 from prior_sg.schemas.regions import NO_REGION
 from prior_sg.schemas.scene import Scene
 from prior_sg.services.segmenter.core.aim import border_costs
-from prior_sg.services.segmenter.core.layers.layer_map import LayerMap
+from prior_sg.services.segmenter.core.layers.layer_map import LayerMap, Numbered
 from prior_sg.services.segmenter.core.layers.stacking import BUILDING, LevelInForce
 from prior_sg.services.segmenter.core.layers.storeys import Storeys, storeys_of
 from prior_sg.services.segmenter.core.map.received import ReceivedGraph
@@ -74,7 +74,7 @@ class Levels:
         if self.seen is not None and self.prior is prior and self.seen.labels == scene.labels:
             changed = _changed(self.seen, scene)
         if changed is None or changed:
-            self.map.node_of = {level: dict(held) for level, held in self.node_of.items()}
+            self.map.node_of = {level: Numbered.of(held) for level, held in self.node_of.items()}
             regions, beliefs = scene.place_regions[ground.rows], scene.posteriors[ground.rows].astype(np.float32)
             self.map.renew(
                 {region.id: region for region in scene.regions},
@@ -86,7 +86,7 @@ class Levels:
                 changed=changed,
             )
             for level, held in self.map.node_of.items():
-                self.node_of[level] = self.node_of.get(level, {}) | held
+                self.node_of[level] = self.node_of.get(level, {}) | held.table
         self.seen, self.prior = scene, prior
         zones = self.map.zones
         regions = [msgspec.structs.replace(one, parent=zones.get(one.id, one.parent)) for one in scene.regions]

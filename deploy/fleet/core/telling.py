@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 import msgspec
 import numpy as np
 
+from prior_sg.deploy.fleet.core.foreseeing import news
 from prior_sg.deploy.fleet.core.marks import GONE
 from prior_sg.deploy.fleet.core.merging import Merged
 from prior_sg.deploy.told import ToldGraph, ToldObjects
@@ -126,6 +127,7 @@ class Teller:
             {region.id: region for region in scene.regions},
             [],
             nodes={(node.level, node.id): node for node in scene.nodes},
+            foresight=news(self.regions.foresight, scene.foresight),
             everything=everything,
             tolerance=posterior_change,
         )

@@ -5,14 +5,16 @@ fitted again to what has been seen since, and what has changed of the merged sce
 """
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import msgspec
 import numpy as np
 
+from prior_sg.deploy.fleet.core.doubting import fault_of_delta
 from prior_sg.deploy.fleet.core.finding.config import MatchConfig
 from prior_sg.deploy.fleet.core.finding.frames import apart, level
 from prior_sg.deploy.fleet.core.finding.matching import again, map_of, match
+from prior_sg.deploy.fleet.core.foreseeing import foreseen
 from prior_sg.deploy.fleet.core.ids import Name
 from prior_sg.deploy.fleet.core.levels import names_levels
 from prior_sg.deploy.fleet.core.members import Delta, Followed, Member, Relation
@@ -22,6 +24,7 @@ from prior_sg.deploy.fleet.core.telling import Teller
 from prior_sg.schemas.codec import Message, copied
 from prior_sg.schemas.levels import LevelName
 from prior_sg.schemas.markers import MarkerKey
+from prior_sg.schemas.members import MOST_MERGED
 from prior_sg.schemas.names import fault_of_robot
 from prior_sg.schemas.objects import ObjectDelta
 from prior_sg.schemas.places import PlaceDelta
@@ -30,11 +33,13 @@ from prior_sg.schemas.regions import RegionDelta
 from prior_sg.schemas.scene import Scene, SceneRequest
 from prior_sg.schemas.status import Tick
 from prior_sg.services.losses import Losses
+from prior_sg.services.refusals import InputRefused
 from prior_sg.services.scene_store.core import graph as scenes
 from prior_sg.services.scene_store.core import telling
 
 GROWN = 1.1  # times as many places as when it was looked at last: a map is looked at again
 REST_TICKS = 5  # from one fitting of a relation to the next, of a map that changes and hardly grows
+MOST_FORMER = 16  # maps of a robot's former sessions that are merged, besides those stored and what holds the frame
 ASK_TICKS = 30  # from one question for a prior that nobody knew to the next
 
 
@@ -50,6 +55,8 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
     match: MatchConfig = MatchConfig()
 
     def __post_init__(self) -> None:
+        if len(self.robots) > MOST_MERGED:
+            raise ValueError(f"{len(self.robots)} robots are named: at most {MOST_MERGED} are merged")
         for robot in (*self.robots, *self.transforms):
             if fault := fault_of_robot(robot):
                 raise ValueError(fault)
@@ -72,7 +79,7 @@ class State:
     events: list[str] = field(default_factory=list)  # to be told with the next delta
     noted: set[tuple[Name, int]] = field(default_factory=set)  # objects of former sessions whose change was told
     ticks: int = 0
-    wanted: str = ""  # digest of the prior whose levels the merged map follows; empty = of none
+    wanted: str = ""  # digest of the prior whose levels the merged map has, and by which it foresees; empty = none
     prior: tuple[str, Prior] | None = None  # the last that was wanted and came, with its digest
     asked_tick: int = 0  # when one was asked for
     kept_ids: int = 0  # numbers that are kept on disk
@@ -80,7 +87,7 @@ class State:
 
     @property
     def in_force(self) -> Prior | None:
-        """The prior whose levels the merged map follows, once it is there."""
+        """The prior that the merged map follows, once it is there."""
         return self.prior[1] if self.prior is not None and self.prior[0] == self.wanted else None
 
     def members(self) -> list[Member]:
@@ -92,7 +99,7 @@ def update(state: State, message: Message, cfg: Config) -> Iterator[Message]:
     """Take one input; yields deltas, and what is missing as the robot and the kind of delta."""
     match_for = {PlaceDelta, RegionDelta, ObjectDelta}
     if type(message) in match_for and message.robot in state.followed:  # type: ignore[attr-defined]
-        yield from _follow(state, message)  # type: ignore[arg-type]
+        yield from _follow(state, message, cfg)  # type: ignore[arg-type]
     elif isinstance(message, PriorList):
         for prior in message.priors:
             if prior.digest() == state.wanted:
@@ -137,14 +144,29 @@ class NumbersKept(Message, frozen=True, kw_only=True):
     robot: str
 
 
-def _follow(state: State, delta: Delta) -> Iterator[Message]:
+def _follow(state: State, delta: Delta, cfg: Config) -> Iterator[Message]:
+    if fault := fault_of_delta(delta):
+        raise InputRefused(fault)
     followed = state.followed[delta.robot]
     ended = followed.take(delta)
     if ended is not None:
         state.former.append(ended)
         state.events.append(f"{delta.robot} has begun a new session")
+        _forget(state, delta.robot, len(cfg.stored))
     if followed.lacking(delta):
         yield Lacking(robot=delta.robot, kind=type(delta).__name__)
+
+
+def _forget(state: State, robot: str, stored: int) -> None:
+    """Leave out the smallest of a robot's former maps where there are too many: each is merged again at every change.
+    The first `stored` of all were given by whoever started the bridge."""
+    left = [one for one in state.former[stored:] if one.name.robot == robot]
+    left = [one for one in left if one.relation is None or not one.relation.given]
+    if len(left) > MOST_FORMER:
+        least = min(left, key=lambda one: len(one.graph.places))
+        state.former = [one for one in state.former if one is not least]
+        places = f"{len(least.graph.places)} places"
+        state.events.append(f"session {least.name.session} of {robot} is forgotten, the smallest of many: {places}")
 
 
 def _tick(state: State, cfg: Config) -> Iterator[Message]:
@@ -161,7 +183,7 @@ def _tick(state: State, cfg: Config) -> Iterator[Message]:
     if not related:
         return
     found, changes = merged_of(state.robot, related, state.memory)
-    state.merged = levelled(found, state.memory, state.in_force)
+    state.merged = _seen_beyond(state, levelled(found, state.memory, state.in_force), related)
     for name, change in changes:
         if (name, change.number) not in state.noted:
             state.noted.add((name, change.number))
@@ -178,10 +200,20 @@ def _tick(state: State, cfg: Config) -> Iterator[Message]:
     yield from state.teller.tell(state.merged, "; ".join(events), *tolerances)
 
 
+def _seen_beyond(state: State, found: Merged, related: list[Member]) -> Merged:
+    """The same with what lies beyond its openings, of the priors that present robots follow."""
+    digests = [one.graph.alignment.prior_digest for one in related if not one.former]
+    scene = found.scene
+    beyond = foreseen(scene, state.in_force, filter(None, digests))
+    return replace(found, scene=msgspec.structs.replace(scene, foresight=beyond))
+
+
 def _aim(state: State, members: list[Member]) -> Iterator[PriorRequest]:
-    """Follow the prior of the first map that has levels by name; ask for it once, and later where nobody knew it."""
-    named = (one.graph for one in members if one.relation is not None and names_levels([*one.graph.nodes.values()]))
-    wanted = next((graph.alignment.prior_digest for graph in named), "")
+    """Follow the prior of the first map that has levels by name, else of the first that has one, maps of present robots
+    before former ones: by theirs is foreseen. Ask for it once, and later where nobody knew it."""
+    related = [one for one in members if one.relation is not None and one.graph.alignment.prior_digest]
+    related.sort(key=lambda one: (one.former, not names_levels([*one.graph.nodes.values()])))
+    wanted = next((one.graph.alignment.prior_digest for one in related), "")
     fresh, state.wanted = wanted != state.wanted, wanted
     if wanted and state.in_force is None and (fresh or state.ticks >= state.asked_tick + ASK_TICKS):
         state.asked_tick = state.ticks

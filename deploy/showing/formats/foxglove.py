@@ -13,7 +13,7 @@ import numpy as np
 
 from prior_sg.deploy.showing.material import Material, Moment
 from prior_sg.schemas.codec import DecodeError, decode
-from prior_sg.schemas.frames import Intrinsics, Keyframe, PoseUpdate
+from prior_sg.schemas.frames import Keyframe, PoseUpdate
 from prior_sg.schemas.topics import KEYFRAME, POSE_UPDATE
 from prior_sg.services.deltas import PoseCorrections
 from prior_sg.services.images import ImageFault, depth_of
@@ -28,10 +28,8 @@ ANY_CENTRE = float("inf")  # share of the image by which a principal point may l
 class _Image(NamedTuple):
     """What one keyframe shows."""
 
-    file: bytes
-    lens: Intrinsics
+    frame: Keyframe  # whose images are read when it is its turn
     world_from_camera: np.ndarray  # (4, 4)
-    frame: Keyframe  # whose depth is decoded when it is its turn
 
 
 Told = tuple[int, int, Moment | _Image]  # when, its order among the like, what
@@ -59,7 +57,7 @@ def write_foxglove(material: Material, path: Path) -> None:
                 case Moment():
                     stream.show(what.scene, stamp_ns)
                 case _Image():
-                    stream.camera(what.file, what.lens, what.world_from_camera, stamp_ns)
+                    stream.camera(bytes(what.frame.color), what.frame.intrinsics, what.world_from_camera, stamp_ns)
                     with contextlib.suppress(ImageFault):  # the map did not take it either
                         stream.depth(depth_of(what.frame, ANY_CENTRE), stamp_ns)
     save_layout(path.with_name(LAYOUT.format(path.stem)))
@@ -85,4 +83,4 @@ def _images(material: Material) -> Iterator[Told]:
             frame = decode(Keyframe, logged.payload)
             if frame.robot == robot and frame.color:  # a lidar without a camera has no picture
                 pose = poses.pose(frame.frame_id, frame.world_from_camera)
-                yield max(frame.stamp_ns, 0), 0, _Image(bytes(frame.color), frame.intrinsics, pose, frame)
+                yield max(frame.stamp_ns, 0), 0, _Image(frame, pose)

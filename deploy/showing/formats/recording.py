@@ -27,7 +27,7 @@ def write_rrd(material: Material, path: Path) -> None:
 
     scene = material.scene
     recording = rerun.RecordingStream("prior-sg", recording_id=f"{scene.robot}-{scene.stamp_ns}", send_properties=False)
-    recording.save(path)
+    stream = rerun.binary_stream(recording)  # written by us: Rerun's own writer ends the process on a full disk
     recording.log("world", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     recording.log("world", rerun.AnyValues(robot=scene.robot, task=scene.task, origin_m=[*scene.origin_m]), static=True)
     if material.cloud is not None:
@@ -41,8 +41,9 @@ def write_rrd(material: Material, path: Path) -> None:
             if logged.get(name) != (content := pickle.dumps(parts)):
                 recording.log(f"world/{name}", getattr(rerun, shape)(**parts))
                 logged[name] = content
-    recording.flush()
+    content = stream.read() or b""
     recording.disconnect()
+    path.write_bytes(content)
 
 
 def _layers(scene: Scene, colors: Colors) -> Iterator[Layer]:

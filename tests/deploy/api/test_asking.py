@@ -2,6 +2,8 @@
 
 import json
 import math
+import re
+import shlex
 
 import msgspec
 import numpy as np
@@ -11,11 +13,14 @@ import prior_sg
 from prior_sg.deploy.api.client import Client
 from prior_sg.deploy.api.scene import Scene
 from prior_sg.deploy.api.vectors import RecentVectors
+from prior_sg.deploy.benches.queries import synthetic_scene
 from prior_sg.deploy.cli.main import main
 from prior_sg.deploy.cli.query import _require_some
 from prior_sg.deploy.errors import UserError
 from prior_sg.schemas.codec import decode, encode
 from prior_sg.schemas.features import TextEmbeddings
+from prior_sg.schemas.foresight import Foresight, MissingLabel
+from prior_sg.schemas.levels import LevelNode
 from prior_sg.schemas.members import MapMember
 from prior_sg.schemas.priors import PriorList
 from prior_sg.schemas.queries import SceneQuery, Spot
@@ -258,7 +263,7 @@ def test_the_command_tells_where_markers_are(capsys, tmp_path):
     assert "2 spots" in ask("marker")[1] and "kitchen (region 3)" in ask("marker")[1]
     status, out = ask("marker", "8")
     assert status == 1 and "there is no marker 8; the scene has marker 7 (apriltag_36h11)" in out
-    assert "name one number" in ask("marker", "seven")[1]
+    assert "say `marker NUMBER`" in ask("marker", "seven")[1]
     assert "through kitchen 3" in ask("route", "place:10", "marker:7")[1]
     scene = prior_sg.Scene.read(path)
     (found,) = scene.markers(7)
@@ -287,11 +292,79 @@ def test_the_command_tells_what_was_not_seen(capsys, tmp_path):
     )
     status, out, _ = asked(capsys, path, "unseen", "hall")
     assert status == 0 and "predicted" in out and "adjacency 0.75" in out
+    assert "`in 6 m` for every 10 m" in " ".join(out.split()), "what was told before openings told what they lead to"
     status, out, _ = asked(capsys, path, "missing")
     assert status == 0 and "hall" in out and "0.50" in out
     status, _, err = asked(capsys, path, "unseen", "garage")
     assert status and "knows no region 'garage'" in err
     assert Scene(scene).missing()[0].label == "hall"
+
+
+def test_the_table_of_the_unseen_shows_what_it_is_in_the_order_of(capsys, tmp_path):
+    foreseen = foresight(message(), 2, "hall")
+    (opening,) = foreseen.openings
+    told = [msgspec.structs.replace(entry, toward=0.75) for entry in opening.labels]
+    foreseen = msgspec.structs.replace(foreseen, openings=[msgspec.structs.replace(opening, labels=told)])
+    Scene(message(foresight=foreseen)).save(tmp_path / "scene.json")
+    _, out, _ = asked(capsys, tmp_path / "scene.json", "unseen", "hall", "--start", "place:3")
+    out = " ".join(out.split())
+    assert "7.50" in out and "0.75" in out and "the chance that the nearest unseen hall is come to through" in out
+    assert "`leads there` for every 10 m of the way and of a look behind (1.0 m)" in out
+
+
+def crowded():
+    """A scene of which every list is longer than one."""
+    scene = synthetic_scene(600, 50)
+    label, other = scene.labels[:2]
+    opening = foresight(scene, 40, label).openings[0]
+    openings = [opening, *foresight(scene, 300, label).openings]
+    missing = [MissingLabel(label=name, probability=0.5) for name in (label, other)]
+    nodes = [LevelNode(level="zone", id=n, label="ward", probability=1.0, member_ids=[n], area_m2=9.0) for n in (1, 2)]
+    foreseen = Foresight(openings=openings, missing=missing, steps=3, look_m=1.0, elsewhere_m=9.0)
+    return msgspec.structs.replace(scene, markers=marked_home().markers, nodes=nodes, foresight=foreseen)
+
+
+@pytest.mark.parametrize(
+    ("words", "total"),
+    [
+        ("room kind", None),
+        ("near 1 1 1", 50),
+        ("near 1 1 1 --what place", 600),
+        ("near 1 1 1 --what region", 4),
+        ("within 1 1 1 99", 54),
+        ("in-box 0 0 0 99 99 9", 54),
+        ("label 'room kind 1' --what place", None),
+        ("objects", 50),
+        ("level zone", 2),
+        ("region 2", 20),
+        ("marker", 2),
+        ("unseen 'room kind 0' --start place:3", 2),
+        ("missing", 2),
+    ],
+)
+def test_what_a_list_leaves_out_is_counted_and_the_way_to_it_told(capsys, tmp_path, words, total):
+    path = tmp_path / "scene.json"
+    Scene(crowded()).save(path)
+
+    def ask(*more):
+        assert main(["query", *shlex.split(words), "--scene", str(path), *more]) == 0
+        return " ".join(capsys.readouterr().out.split())
+
+    (left,) = re.findall(r"and (\d+) more[ a-z]*: --limit (\d+) lists all", ask("--limit", "1"))
+    assert int(left[0]) + 1 == int(left[1]) == (total or int(left[1]))
+    assert json.loads(ask("--limit", "1", "--json"))["notes"][-1].startswith(f"and {left[0]} more")
+    assert "lists all" not in ask("--limit", left[1])
+
+
+def test_whoever_wants_all_is_told_that_there_is_more():
+    (one, _) = marked_home().markers
+    many = Scene(message(markers=[msgspec.structs.replace(one, id=number) for number in range(150)]))
+    with pytest.warns(UserWarning, match="100 of 150 are listed; limit=150 lists all") as said:
+        found = many.markers()
+    assert len(found) == 100 and found.total == 150 and said[0].filename == __file__
+    assert many.markers(limit=3).total == 150 and many.markers(limit=150)[-1].marker.id == 149
+    assert many.near((0.0, 0.0, 0.0), what="place").total == 3
+    assert many.near((0.0, 0.0, 0.0), what="place", radius_m=1.1).total == 1
 
 
 @pytest.mark.parametrize("words", [("near", "nan", "0", "0"), ("near", "1e12", "0", "0"), ("region", "9" * 30)])
@@ -328,22 +401,40 @@ def test_why_nothing_answers_is_said(capsys, tmp_path):
 @pytest.mark.parametrize(
     ("words", "reason"),
     [
-        (["near", "the", "window"], "put a sentence in quotes"),
+        (["near", "the", "window"], "a sentence goes in quotes"),
         (["region", "kitchen"], "such as `prior-sg query region 7`"),
         (["object", "oven"], "such as `prior-sg query object 7`"),
         (["marker", "seven"], "such as `prior-sg query marker 7`"),
-        (["marker", "7²"], "name one number"),
-        (["region"], "name one number"),
-        (["near"], "say `near X Y Z`"),
-        (["level"], "name a level: zone"),
-        (["route"], "two ends"),
-        (["changed", "yesterday"], "ask the running store"),
+        (["marker", "7²"], "say `marker NUMBER`, such as `prior-sg query marker 7`"),
+        (["region"], "say `region NUMBER`, such as `prior-sg query region 7`"),
+        (["object"], "say `object NUMBER`"),
+        (["place", "a", "b"], "say `place NUMBER`"),
+        (["near"], "say `near X Y Z`, such as `prior-sg query near 1.0 2.0 0.5`"),
+        (["within", "1", "2"], "say `within X Y Z RADIUS`, such as"),
+        (["in-box"], "say `in-box X Y Z X Y Z`, such as"),
+        (["label"], "say `label LABEL`, such as `prior-sg query label kitchen`; a sentence goes in quotes"),
+        (["label", " "], "say `label LABEL`"),
+        (["unseen"], "say `unseen LABEL`, such as `prior-sg query unseen bathroom`"),
+        (["objects", "chair", "in"], "say `objects LABEL in REGION`, such as"),
+        (["level"], "say `level zone|floor|"),
+        (["level", "attic"], "such as `prior-sg query level zone ward`"),
+        (["route"], "say `route FROM TO`"),
+        ([""], 'say `"SENTENCE"`, such as `prior-sg query "somewhere to sit"`'),
+        (["changed"], "say `changed NUMBER`"),
+        (["changed", "yesterday"], "say `changed NUMBER`, such as `prior-sg query changed 120`"),
         (["label", "kitchn"], "nearest labels are: kitchen"),
         (["changed", "3"], "ask the running store"),
-        (["route", "kitchen"], "two ends"),
+        (["route", "kitchen"], "say `route FROM TO`, such as `prior-sg query route kitchen 'dining room'`"),
         (["chairs", "--limit", "0"], "at least 1"),
+        (["chairs", "--limit", "9999999"], "at most 100000"),
+        (["route", "kitchen", "hall", "--clearance", "nan"], "--clearance is in metres"),
+        (["route", "kitchen", "hall", "--clearance=-1"], "--clearance is in metres"),
+        (["unseen", "hall", "--start", ""], "an end of a route is"),
     ],
 )
 def test_what_cannot_be_asked_is_one_sentence(capsys, saved, words, reason):
+    if reason.startswith("say "):  # at once, with no system that runs and no scene
+        assert main(["query", *words, "--connect", "tcp/127.0.0.1:1"]) == 2
+        assert reason in " ".join(capsys.readouterr().err.split())
     status, _, err = asked(capsys, saved, *words)
-    assert status == 1 and reason in " ".join(err.split())
+    assert status == (1 if "nearest labels" in reason else 2) and reason in " ".join(err.split())

@@ -1,7 +1,9 @@
 """A program's end of a running system, on the local bus with the services played here."""
 
+import contextlib
 import threading
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -17,6 +19,7 @@ from tests.help.store import StandIn, delta
 from tests.help.world import prior
 
 ROBOT = "ada"
+replace = msgspec.structs.replace
 
 
 def follow(scene, task, digest):
@@ -70,13 +73,82 @@ def test_a_client_keeps_few_priors():
         assert len(client._priors) == MOST_PRIORS
 
 
-def test_a_merged_map_takes_no_task_and_no_poses_and_says_who_does():
+def followed(scene, task, digest):
+    return replace(scene, task=task, prior_digest=digest)
+
+
+class Merging(StandIn):
+    """A merged map of robots' stand-ins, which follows them once all have a task."""
+
+    def __init__(self, robots, **options):
+        of = [one.robot for one in robots]
+        super().__init__(message(merged_of=of, task="; ".join(of)), hub=robots[0].hub, **options)
+        self.robots, self.over = robots, threading.Event()
+        threading.Thread(target=self.follow, daemon=True).start()
+
+    def follow(self):
+        while not self.over.wait(0.05):
+            first, *others = (one.scenes[-1] for one in self.robots)
+            if first.task != self.scenes[-1].task and all(one.task == first.task for one in others):
+                self.store(replace(self.scenes[-1], task=first.task, prior_digest=first.prior_digest))
+
+
+@contextlib.contextmanager
+def merging(**options):
+    """Two robots, of which options are the second's, and their merged map."""
+    first = StandIn(message(robot="r1"), followed, behind_s=0.1, hub=Hub())
+    first.bus.bus.announce(alive_key("scene_store", "s-1"))
+    second = StandIn(message(robot="r2"), followed, behind_s=0.3, hub=first.hub, **options)
+    merged = Merging([first, second])
+    try:
+        with Client(robot=ROBOT, bus=first.open_bus()) as client:
+            yield first, second, merged, client
+    finally:
+        merged.over.set()
+
+
+def test_a_task_for_a_merged_map_is_given_to_each_of_its_robots():
+    with merging() as (first, second, merged, client):
+        told = []
+        switch = client.switch("sweep", regions=["kitchen", "hall"], on_prior=told.append)
+    assert told == [switch.prior], "once, though two robots got it"
+    assert [[(task.task, task.environment) for task in one.tasks] for one in (first, second, merged)] == [
+        [("sweep", "home")],
+        [("sweep", "home")],
+        [],
+    ]
+    assert switch.scene.message.robot == ROBOT and switch.scene.task == "sweep"
+    assert switch.scene.message.prior_digest == switch.prior.digest() == second.scenes[-1].prior_digest
+
+
+def test_who_of_a_merged_map_does_not_take_a_task_is_told(monkeypatch):
+    with merging(mute=["regions"]) as (first, second, merged, client):
+        said = "r2 does not follow the task: no regions for the new task within 1 s; see `prior-sg health`; r1 took it"
+        with pytest.raises(prior_sg.TaskError, match=said):
+            client.switch("sweep", timeout_s=1.0)
+        assert first.scenes[-1].task == "sweep" and second.scenes[-1].task != "sweep"
+    monkeypatch.setattr("prior_sg.deploy.api.client.MERGE_WAIT_S", 0.3)
+    with merging() as (_, _, merged, client):
+        merged.over.set()
+        with pytest.raises(prior_sg.TaskError, match="r1, r2 follow the task, and their merged map ada does not"):
+            client.switch("sweep")
+
+
+def test_a_task_for_maps_that_are_merged_of_each_other_is_refused():
+    first = StandIn(message(robot="r1", merged_of=["ada"]), hub=Hub())
+    StandIn(message(robot="ada", merged_of=["r1"]), hub=first.hub)
+    before = threading.active_count()
+    refused = pytest.raises(prior_sg.TaskError, match="ada and r1 are merged of each other")
+    with Client(robot="ada", bus=first.open_bus()) as client, refused:
+        client.switch("sweep", timeout_s=1.0)
+    assert threading.active_count() <= before + 1
+
+
+def test_a_merged_map_takes_no_poses_and_says_who_does():
     system, client = joined(scene=message(merged_of=["r1", "r2"]))
     system.bus.bus.announce(alive_key("scene_store", "s-1"))
     of = "ada is the merged map of r1, r2"
     with client:
-        with pytest.raises(prior_sg.TaskError, match=f"{of} and follows what they do: give the task to a robot"):
-            client.switch("sweep")
         with pytest.raises(prior_sg.PosesError, match=f"{of} and follows what they do: give the poses to a robot"):
             client.correct_poses({0: np.eye(4)})
         with pytest.raises(prior_sg.NotInSceneError, match=f"{of}: why a place carries its label is known"):

@@ -1,5 +1,9 @@
 """The bridge beside the store: several robots' deltas become those of one map, which the store keeps as any robot's."""
 
+import asyncio
+import json
+from pathlib import Path
+
 import msgspec
 import numpy as np
 import pytest
@@ -11,13 +15,14 @@ from prior_sg.deploy.evaluation.priors import library_prior
 from prior_sg.deploy.fleet.bridge import KEEP_NUMBERS, SERVICE
 from prior_sg.deploy.fleet.core.finding.frames import level
 from prior_sg.deploy.fleet.core.ids import Name
-from prior_sg.deploy.fleet.core.update import ASK_TICKS, Config, NumbersKept
+from prior_sg.deploy.fleet.core.update import ASK_TICKS, MOST_FORMER, Config, KeepNumbers, NumbersKept
 from prior_sg.deploy.fleet.keeping import keep
+from prior_sg.deploy.showing.export import scene_json
 from prior_sg.schemas.levels import LevelNode
 from prior_sg.schemas.members import MapMember
 from prior_sg.schemas.places import PlaceDelta, SnapshotRequest
 from prior_sg.schemas.priors import PriorList
-from prior_sg.schemas.queries import ById, ByLabel, NodesOf, SceneQuery
+from prior_sg.schemas.queries import ById, ByLabel, NodesOf, SceneQuery, Spot, WhereToLook
 from prior_sg.schemas.regions import RegionDelta
 from prior_sg.schemas.scene import SceneRequest
 from prior_sg.schemas.status import Tick
@@ -30,6 +35,7 @@ from prior_sg.schemas.topics import (
     SCENE_QUERY,
     topic_of,
 )
+from prior_sg.services.refusals import InputRefused
 from prior_sg.services.registry import BY_NAME
 from prior_sg.services.runtime.runner import Pipeline, Runner
 from prior_sg.services.runtime.service import Identity, ServiceError
@@ -98,7 +104,7 @@ def test_whose_map_it_will_be_is_told_before_anything_is_in_it_and_nothing_store
     ],
 )
 def test_what_cannot_be_merged_is_said_before_a_router_is_looked_for(words, says, capsys):
-    assert main(["fleet", *words]) == 1
+    assert main(["fleet", *words]) == 2
     assert says in " ".join(capsys.readouterr().err.split())
 
 
@@ -279,6 +285,19 @@ def test_numbers_live_on_in_a_file(tmp_path):
         Fleet(msgspec.structs.replace(CFG, memory=str(tmp_path / "broken")))
 
 
+def test_numbers_that_cannot_be_kept_are_told_once_and_kept_when_they_can(tmp_path, caplog):
+    (tmp_path / "folder").write_text("in the way")
+    cfg = msgspec.structs.replace(CFG, memory=str(tmp_path / "folder" / "home.msgpack"))
+    keeps = KEEP_NUMBERS.open(cfg, Identity("home", "fleet", 5))
+    for content in (b"one", b"two"):
+        assert asyncio.run(keeps(KeepNumbers(robot="home", content=content))) == NumbersKept(robot="home")
+    assert [entry.levelname for entry in caplog.records] == ["WARNING"]
+    assert "home.msgpack cannot be written (File exists)" in caplog.text
+    (tmp_path / "folder").unlink()
+    asyncio.run(keeps(KeepNumbers(robot="home", content=b"three")))
+    assert Path(cfg.memory).read_bytes() == b"three" and len(caplog.records) == 1
+
+
 def test_the_frame_lives_on_in_that_file_for_maps_that_go_on(tmp_path):
     path = str(tmp_path / "home.msgpack")
     cfg = msgspec.structs.replace(CFG, memory=path)
@@ -309,6 +328,26 @@ def started(cfg, *told):
     if fleet.kept:
         keep(cfg.memory, fleet.kept[-1])
     return fleet
+
+
+@pytest.mark.parametrize("stored", [False, True])
+def test_of_many_former_sessions_the_smallest_are_forgotten_but_what_was_stored_or_holds_the_frame(stored, tmp_path):
+    path = tmp_path / "scene.json"
+    path.write_text(json.dumps(scene_json(houses.scene(rooms=houses.ROOMS[:1]))))
+    fleet = Fleet(Config(robots=("r1",), stored=(f"r1={path}",) if stored else ()))
+    fleet.tell(houses.scene("r1", MOVED, rooms=houses.ROOMS[:1]))  # holds the frame, unless the stored one does
+    fleet.tick()
+    state, events = fleet.bridge.state, []
+    for epoch in range(2, MOST_FORMER + 5):
+        away = level(0.0, np.array((100.0 * epoch, 0.0, 0.0)))
+        fleet.tell(houses.scene("r1", away, rooms=houses.ROOMS[: 1 if epoch == 4 else 2]), epoch)
+        events += state.events
+        fleet.tick()
+    forgotten = [said.partition(" of r1")[0] for said in events if "is forgotten, the smallest of many" in said]
+    numbers = [1, 4, 2] if stored else [3, 1]  # of equal ones, the oldest
+    assert forgotten == [f"session {number}" for number in numbers]
+    last = MOST_FORMER + 3 + stored
+    assert [one.name.session for one in state.former] == [one for one in range(last) if one not in numbers]
 
 
 def test_a_session_keeps_its_number_when_the_bridge_starts_again(tmp_path):
@@ -410,6 +449,67 @@ def test_levels_of_the_merged_map_are_told_and_asked_for(tmp_path):
     assert fleet.tick() == []
 
 
+def opened(scene, *spots_m):
+    """A map whose places nearest to these spots (x, y, dx, dy) of the world open that way, wide enough for a door."""
+    spots, ways = np.array(spots_m, float)[:, :2], np.array(spots_m, float)[:, 2:]
+    gaps_m = np.linalg.norm(scene.positions_m[None, :, :2] - spots[:, None], axis=2)
+    directions = np.column_stack((ways, np.zeros(len(ways)))).astype(np.float32)
+    return msgspec.structs.replace(
+        scene,
+        frontier_ids=scene.place_ids[gaps_m.argmin(axis=1)],
+        frontier_directions=directions,
+        frontier_areas_m2=np.full(len(ways), 2.0, np.float32),
+    )
+
+
+def test_what_lies_beyond_the_openings_of_a_merged_map_is_foreseen(tmp_path):
+    """One robot knows all but the bathroom, the other all but the kitchen: an opening into the kitchen is none, one to
+    the east is foreseen with the regions of both, and all of it follows the one prior."""
+    prior = library_prior("residential home", "tidy up", houses.LABELS)
+    first_m, second_m = houses.scene(rooms=houses.ROOMS[:4]), houses.scene("r2", rooms=houses.ROOMS[1:])
+    east, into_kitchen = (7.6, 2.0, 1.0, 0.0), (3.4, 2.0, -1.0, 0.0)
+    robots = [
+        msgspec.structs.replace(opened(one, *spots), prior_digest=prior.digest())
+        for one, spots in ((first_m, [east]), (second_m, [into_kitchen]))
+    ]
+    fleet = Fleet(in_one_frame(tmp_path))
+    fleet.bridge.answers[PRIORS] = lambda request: PriorList(priors=[prior])
+    for scene in robots:
+        fleet.tell(scene)
+    for _ in range(3):
+        fleet.tick()
+    scene = fleet.scene()
+    (opening,) = scene.foresight.openings
+    assert opening.beyond_m[0] > 8.0 and opening.beyond_m[1] == pytest.approx(2.0, abs=0.5)
+    holder = next(region for region in scene.regions if region.id == opening.region)
+    assert holder.label == "living room"
+    found = {entry.label: entry.found for entry in scene.foresight.missing}
+    assert found["bathroom"] == 1, "which the other robot has seen"
+    question = WhereToLook(label="bathroom", start=Spot(here=True))
+    (outlook,) = fleet.store.answer(SCENE_QUERY, SceneQuery(robot="home", questions=[question])).answers
+    assert outlook.prospects and not outlook.reason
+    assert fleet.bridge.answer(REGION_SNAPSHOT, SnapshotRequest(robot="home")).foresight == scene.foresight
+    assert fleet.tick() == []
+    fleet.tell(msgspec.structs.replace(robots[1], prior_digest="another"), epoch=2)
+    fleet.tick()
+    assert fleet.scene().foresight.openings == [], "robots that follow several tasks foresee nothing together"
+
+
+def test_a_stored_map_of_another_prior_takes_no_foresight_from_present_robots(tmp_path):
+    """The stored one names zones, which present maps do not; theirs is the prior that counts."""
+    prior = library_prior("residential home", "tidy up", houses.LABELS)
+    zone = LevelNode(level="zone", id=0, label="living quarters", probability=0.9, member_ids=[0])
+    former = msgspec.structs.replace(houses.scene(rooms=houses.ROOMS[:4]), prior_digest="older", nodes=[zone])
+    (tmp_path / "scene.json").write_text(json.dumps(scene_json(former)))
+    fleet = Fleet(Config(robots=("r1",), stored=(f"r1={tmp_path / 'scene.json'}",)))
+    fleet.bridge.answers[PRIORS] = lambda request: PriorList(priors=[prior])
+    now = opened(houses.scene(rooms=houses.ROOMS[:4]), (7.6, 2.0, 1.0, 0.0))
+    fleet.tell(msgspec.structs.replace(now, prior_digest=prior.digest()), epoch=2)
+    for _ in range(3):
+        fleet.tick()
+    assert len(fleet.scene().foresight.openings) == 1
+
+
 def test_a_prior_that_nobody_knew_is_asked_for_again(tmp_path):
     robots, prior = tall_house()
     asked = []
@@ -453,6 +553,7 @@ def test_ids_of_levels_live_on_in_the_file(tmp_path):
     [
         ({"robots": ("r1", "r1")}, "twice"),
         ({"robots": ("fleet",)}, "reserved"),
+        ({"robots": tuple(f"r{number}" for number in range(257))}, "at most 256"),
         ({"robots": ("r1",), "transforms": {"r2": (0.0, 0.0, 0.0, 0.0)}}, "name it, too"),
     ],
 )
@@ -492,3 +593,60 @@ def test_a_stored_scene_is_gone_on_in(tmp_path):
 def test_scenes_that_are_not_there_are_refused(stored, why):
     with pytest.raises(ServiceError, match=why):
         Fleet(Config(robots=("r1",), stored=(stored,)))
+
+
+def absurd(delta):
+    """Deltas as this one that no robot can mean, with what is said of each."""
+    far = delta.positions_m.copy() if isinstance(delta, PlaceDelta) else None
+    if far is None:
+        gone = [msgspec.structs.replace(item, position_m=(1e200, 0.0, 0.0)) for item in delta.objects]
+        return [(msgspec.structs.replace(delta, objects=gone), r"1e\+200 m away")]
+    far[3] = 3e38
+    wide, hollow = np.full_like(delta.radii_m, 1e30), np.full_like(delta.radii_m, -1)
+    one_hollow = np.where(np.arange(len(delta.radii_m)) == 1, np.float32(-1), delta.radii_m)
+    return [
+        (msgspec.structs.replace(delta, positions_m=far), r"3e\+38 m away"),
+        (msgspec.structs.replace(delta, radii_m=wide), r"1e\+30 m of free space"),
+        (msgspec.structs.replace(delta, radii_m=hollow), "-1 m of free space"),
+        (msgspec.structs.replace(delta, radii_m=one_hollow), "-1 m of free space"),
+        (msgspec.structs.replace(delta, camera_m=(0.0, -1e9, 0.0)), r"1e\+09 m away"),
+    ]
+
+
+def test_a_robot_that_tells_what_cannot_be_does_not_end_the_map_of_the_others():
+    fleet = Fleet(Config(robots=("r1", "r2", "r3"), transforms=dict.fromkeys(("r1", "r3"), (0.0, 0.0, 0.0, 0.0))))
+    fleet.tell(first())
+    fleet.tick()
+    before = fleet.scene()
+    places, regions, objects = houses.deltas(houses.scene("r3"))
+    for wrong, said in [*absurd(places), *absurd(objects)]:
+        with pytest.raises(InputRefused, match=f"r3 tells of .*{said}"):
+            fleet.pipeline.publish(topic_of(type(wrong)), wrong)
+        fleet.tick()
+        assert np.array_equal(fleet.scene().place_ids, before.place_ids)
+    for delta in (places, regions, objects):
+        fleet.pipeline.publish(topic_of(type(delta)), delta)
+    fleet.tick()
+    assert len(fleet.scene().place_ids) > len(before.place_ids)
+
+
+def test_a_map_with_places_kilometres_apart_and_wide_ones_is_merged_in_bounded_memory():
+    fleet = Fleet(Config(robots=("r1", "r2"), transforms={"r1": (0.0, 0.0, 0.0, 0.0)}))
+    fleet.tell(first())
+    fleet.tick()
+    held = second()
+    positions_m, radii_m = held.positions_m.copy(), held.radii_m.copy()
+    positions_m[0], radii_m[1:9] = (9e5, -9e5, 1.0), 99.0
+    fleet.tell(msgspec.structs.replace(held, positions_m=positions_m, radii_m=radii_m))
+    fleet.tick()
+    alone = Fleet(Config(robots=("r2",)))
+    alone.tell(msgspec.structs.replace(held, positions_m=positions_m, radii_m=radii_m))
+    alone.tick()
+    assert max(region.area_m2 for region in alone.scene().regions) > 2e4
+
+
+@pytest.mark.parametrize(("robot", "why"), [("", "is empty"), ("a/b", "choose one without")])
+def test_a_stored_scene_needs_the_name_of_a_robot(tmp_path, robot, why):
+    (tmp_path / "scene.json").write_text(json.dumps(scene_json(houses.scene())))
+    with pytest.raises(ServiceError, match=rf"scene\.json cannot be merged: .*{why}"):
+        Fleet(Config(robots=("r1",), stored=(f"{robot}={tmp_path / 'scene.json'}",)))

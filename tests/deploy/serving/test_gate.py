@@ -140,6 +140,44 @@ def test_who_takes_nothing_is_given_up(monkeypatch):
             assert ended == ["http.disconnect"]
 
 
+LARGE = bytes(range(256)) * 2**16
+
+
+async def large(scope, receive, send):
+    if scope["type"] == "http":
+        length = (b"content-length", str(len(LARGE)).encode())
+        await send({"type": "http.response.start", "status": 200, "headers": [length]})
+        await send({"type": "http.response.body", "body": LARGE})
+
+
+def test_a_large_answer_waits_in_pieces_for_who_takes_it_slowly(monkeypatch):
+    sizes = []
+
+    async def piece(message):
+        sizes.append(len(message.get("body", b"")))
+
+    asyncio.run(large({"type": "http"}, None, gate.in_pieces(piece)))
+    assert max(sizes) == gate.PIECE_B and sum(sizes) == len(LARGE)
+    with served(Gate(large, Entrance())) as address:
+        host, port = address.removeprefix("http://").split(":")
+        with socket.create_connection((host, int(port)), timeout=10) as connection:
+            connection.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n")
+            time.sleep(0.3)
+            answer = b"".join(iter(lambda: connection.recv(2**20), b""))
+    assert answer.partition(b"\r\n\r\n")[2] == LARGE
+
+
+def test_the_end_of_a_server_waits_for_nobody_who_takes_nothing(monkeypatch, caplog):
+    monkeypatch.setattr(server, "GRACE_S", 0.2)
+    with served(Gate(large, Entrance())) as address:
+        host, port = address.removeprefix("http://").split(":")
+        connection = socket.create_connection((host, int(port)), timeout=10)
+        connection.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n")
+        time.sleep(0.3)
+    connection.close()
+    assert not [record for record in caplog.records if record.levelname == "ERROR"]
+
+
 TOKENS = [
     ((BEARER,), 200),
     ((("authorization", f"bearer {TOKEN}"),), 200),

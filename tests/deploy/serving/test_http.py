@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import json
 import socket
+import time
 
 import httpx
 import msgspec
@@ -100,6 +101,27 @@ def test_a_scene_is_sent_again_only_when_it_has_changed(form):
         assert b"nursery" in newer.content
 
 
+def test_who_asks_for_the_whole_at_once_shares_what_is_written():
+    written = []
+
+    def write(scene):
+        time.sleep(0.05)
+        written.append(scene.robot)
+        return b"x"
+
+    async def asked(system):
+        tag = await system.tag("bench")
+        many = [asyncio.create_task(system.written("bench", f"{tag} {i}", "slow", write)) for i in range(60)]
+        return await asyncio.gather(*many), await system.written("bench", "later", "slow", write)
+
+    with opened() as (store, _, _):
+        system = System(store.open_bus, store.robot)
+        bodies, _ = asyncio.run(asked(system))
+        system.close()
+    assert bodies == [b"x"] * 60
+    assert len(written) == 3  # of the first, of all who came meanwhile, of one who came later
+
+
 def test_questions_by_address(get):
     assert get("/v1/robots") == ["bench"]
     assert "p-1" in get("/health")["silent"]
@@ -119,9 +141,33 @@ def test_questions_by_address(get):
     assert "word by word" in get(f"{V1}/search?q=room")["answer"]["note"]
     assert get(f"{V1}/task")["answer"]["task"] == "bench"
     assert "not kept" in get(f"{V1}/changes?since=9")["answer"]["reason"]
-    assert get(f"{V1}/missing")["answer"] == {"type": "missing", "labels": [], "openings": 0, "reason": ""}
+    assert get(f"{V1}/missing")["answer"] == {
+        "type": "missing",
+        "labels": [],
+        "openings": 0,
+        "reason": "",
+        "total": 0,
+    }
     assert "no opening" in get(f"{V1}/unseen?label=room kind 3")["answer"]["reason"]
     assert "knows no region 'hall'" in get(f"{V1}/unseen?label=hall&from=1,1,1")["answer"]["reason"]
+
+
+@pytest.mark.parametrize(
+    ("address", "said"),
+    [
+        ("regions?limit=1", "1 of 4 are listed; limit=4 lists all"),
+        ("objects?limit=29", "29 of 30 are listed; limit=30 lists all"),
+        ("near?x=1&y=1&z=1", "1 of 30 are listed; k=30 lists all"),
+        ("within?x=1&y=1&z=1&radius_m=99&limit=2", "2 of 34 are listed; limit=34 lists all"),
+        ("search?q=room&what=region&k=1", "1 of 4 are listed; k=4 lists all"),
+        ("regions/2", "10 of 20 are listed; limit=20 lists all"),
+        ("regions/2?limit=20", ""),
+        ("regions", ""),
+        ("task", ""),
+    ],
+)
+def test_what_an_answer_leaves_out_is_told(get, address, said):
+    assert get(f"{V1}/{address}")["note"] == said
 
 
 def test_markers_by_number():
@@ -131,6 +177,7 @@ def test_markers_by_number():
         assert "no printed marker" in client.get(f"{V1}/markers").json()["answer"]["reason"]
         store.store(marked)
         assert [one["marker"]["id"] for one in client.get(f"{V1}/markers").json()["answer"]["markers"]] == [7, 9]
+        assert client.get(f"{V1}/markers?limit=1").json()["note"] == "1 of 2 are listed; limit=2 lists all"
         (found,) = client.get(f"{V1}/markers/7").json()["answer"]["markers"]
         assert found["marker"]["position_m"] == [4.45, 1.0, 1.5] and found["region"]["label"]
         missing = client.get(f"{V1}/markers/8")
@@ -188,6 +235,7 @@ def test_any_questions_over_one_revision():
             json.dumps({"questions": [{"type": "by_label", "label": "a", "limit": 10_001}]}).encode(),
             json.dumps({"questions": [{"type": "by_label", "label": "a", "limit": 5_001}] * 2}).encode(),
             json.dumps({"questions": [{"type": "changed_since", "revision": 0}] * 9}).encode(),
+            json.dumps({"questions": [{"type": "where_to_look", "label": "a"}] * 9}).encode(),
             json.dumps({"questions": [{"type": "by_label", "label": "a" * 2001}]}).encode(),
             b'{"questions": [{"type": "answers_to", "text": "a", "regions": {"room kind 1": 1e308}}]}',
             b'{"questions": [{"type": "in_radius", "point_m": [1e308, 1, 1], "radius_m": 1, "what": "place"}]}',

@@ -7,6 +7,7 @@ import json
 import os
 import sys
 
+import httpx
 import msgspec
 import numpy as np
 import pytest
@@ -101,6 +102,25 @@ def test_printed_markers_are_told():
     everything, one = asyncio.run(answers())
     assert [found["marker"]["id"] for found in everything] == [7, 9] and [found["marker"]["id"] for found in one] == [7]
     assert "doubt" in everything[1]["marker"] and "doubt" not in everything[0]["marker"]
+
+
+def test_what_an_answer_leaves_out_is_told():
+    scene = msgspec.structs.replace(SCENE, markers=marked_home().markers)
+    asked = [
+        ("markers", {"limit": 1}, "1 of 2 are listed; limit=2 lists all"),
+        ("near", {"x": 1, "y": 1, "z": 1}, "5 of 30 are listed; k=30 lists all"),
+        ("near", {"x": 1, "y": 1, "z": 1, "what": "place"}, "5 of 400 are listed; k goes to 100: ask more narrowly"),
+        ("find", {"text": "room", "what": "region", "k": 1}, "1 of 4 are listed; k=4 lists all"),
+        ("region_candidates", {"region": 2}, "10 of 20 are listed; limit=20 lists all"),
+    ]
+
+    async def notes():
+        with opened() as (store, system):
+            store.store(scene)
+            async with Client(planner(system)) as client:
+                return [json.loads((await called(client, tool, **given))[0]).get("note") for tool, given, _ in asked]
+
+    assert asyncio.run(notes()) == [said for *_, said in asked]
 
 
 def test_what_has_not_been_seen_is_foretold():
@@ -250,6 +270,16 @@ def test_over_http_with_a_token():
         assert not refused and json.loads(text)["answers"][0]["things"][0]["what"] == "object"
         with pytest.raises(BaseException):  # noqa: B017 whatever the client makes of 401
             asyncio.run(asked(address, "a-wrong-secret-of-others"))
+
+
+def test_sessions_over_http_are_bounded(monkeypatch):
+    monkeypatch.setattr(module, "MOST_SESSIONS", 1)
+    about = {"protocolVersion": "2025-03-26", "capabilities": {}, "clientInfo": {"name": "x", "version": "1"}}
+    begin = {"jsonrpc": "2.0", "id": 1, "method": "initialize", "params": about}
+    accept = {"Accept": "application/json, text/event-stream"}
+    with opened() as (_, system), served(planner_app(system, Entrance())) as address:
+        status = [httpx.post(f"{address}/mcp", json=begin, headers=accept).status_code for _ in range(2)]
+    assert status == [200, 503]
 
 
 def test_over_standard_input_and_output(endpoint):

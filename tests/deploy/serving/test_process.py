@@ -46,7 +46,7 @@ def test_what_cannot_be_served_is_told(command, endpoint, tmp_path, capsys):
         ]
         (tmp_path / "token").write_text("a-long-secret-of-ours")
         for options, said in cases:
-            assert main([*command, "--connect", endpoint, *options]) == 1
+            assert main([*command, "--connect", endpoint, *options]) == (2 if said == "--token-file" else 1)
             assert said in capsys.readouterr().err
     with pytest.raises(SystemExit):
         main([*command, "--port", "65536"])
@@ -54,5 +54,5 @@ def test_what_cannot_be_served_is_told(command, endpoint, tmp_path, capsys):
 
 
 def test_a_token_needs_http(tmp_path, capsys):
-    assert main(["mcp", "--token-file", str(tmp_path)]) == 1
+    assert main(["mcp", "--token-file", str(tmp_path)]) == 2
     assert "add --http" in capsys.readouterr().err

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import resource
 import xml.etree.ElementTree as ET
 
 import msgspec
@@ -162,6 +163,19 @@ def test_rerun_reads_the_timelines(tmp_path):
     for part in reader.store().stream().to_chunks():
         rows[str(part.entity_path)] = rows.get(str(part.entity_path), 0) + part.num_rows
     assert (rows["/world/edges"], rows["/world/regions/names"]) == (1, 2)  # what stays is not written again
+
+
+@pytest.mark.parametrize("name", sorted(FORMATS))
+def test_a_disk_that_takes_no_more_is_told_by_every_format(name, tmp_path):
+    whole = written(name, tmp_path)
+    (tmp_path / "less").mkdir()
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100, hard))
+    try:
+        with pytest.raises(ExportError, match=r"cannot write .*; choose another place with --out"):
+            save(Material(told()), tmp_path / "less" / whole.name, name)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
 @pytest.mark.parametrize("make", [flat, with_details, told])

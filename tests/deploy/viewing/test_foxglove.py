@@ -23,6 +23,7 @@ from prior_sg.deploy.viewing.foxglove.server import AGAIN_S, Broadcast, jpeg_of,
 from prior_sg.deploy.viewing.foxglove.stream import LAYERS
 from prior_sg.deploy.viewing.held import Held
 from prior_sg.deploy.viewing.recorded import camera_of
+from prior_sg.schemas.codec import copied, encode
 from prior_sg.services.images import depth_of
 from prior_sg.services.runtime.bus import BusError
 from tests.deploy.viewing.test_recorded import log as recorded_log
@@ -91,6 +92,14 @@ def test_the_image_is_the_cameras_file_where_it_was_taken(exported):
     x, y, z, w = (getattr(pose.rotation, axis) for axis in "xyzw")
     forward = (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y))
     assert forward == pytest.approx(frame.world_from_camera[:3, 2])
+
+
+def test_what_is_kept_to_show_depth_does_not_hold_the_colour_image():
+    received = copied(keyframe())
+    kept = camera_of(received)
+    assert kept.depth.depth == received.depth and (kept.world_from_camera == received.world_from_camera).all()
+    assert kept.depth.depth.obj == encode(msgspec.structs.replace(received, color=b""))
+    assert not np.shares_memory(kept.world_from_camera, received.world_from_camera)
 
 
 def test_depth_is_in_millimetres_beside_the_image(exported):

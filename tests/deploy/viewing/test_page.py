@@ -233,7 +233,7 @@ def test_names_from_outside_are_shown_and_not_run(shown: tuple[Held, Page]) -> N
 
 
 def test_other_machines_are_refused_in_a_sentence(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["view", "somewhere", "--host", "0.0.0.0"]) == 1
+    assert main(["view", "somewhere", "--host", "0.0.0.0"]) == 2
     said = capsys.readouterr().err
     assert "ssh -L" in said and said.count("\n") <= 3
 

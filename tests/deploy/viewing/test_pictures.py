@@ -2,6 +2,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from prior_sg.deploy.api.client import Health
 from prior_sg.deploy.showing.colors import PALETTE, LabelColors
 from prior_sg.deploy.viewing import drawing
 from prior_sg.deploy.viewing.cloud import Cloud, points_of
@@ -12,11 +13,13 @@ from prior_sg.deploy.viewing.search import find
 from prior_sg.deploy.viewing.shapes import Mesh, difference
 from prior_sg.deploy.viewing.sources import Likeness
 from prior_sg.deploy.viewing.ways import Trip, way
-from prior_sg.deploy.viewing.words import headline, legend
+from prior_sg.deploy.viewing.words import headline, health_table, legend, place_story, region_story
 from prior_sg.schemas.queries import Spot
+from prior_sg.schemas.status import Loss, ServiceStatus
 from prior_sg.services.scene_store.core.queries.index import Index
+from tests.help.examples import EXAMPLES
 from tests.help.foreseen import foresight
-from tests.help.homes import home, keyframe, marked_home, region
+from tests.help.homes import home, keyframe, marked_home, region, two_floors
 
 
 def area_m2(ground: Footprint) -> float:
@@ -160,6 +163,29 @@ def test_what_a_text_means_comes_before_its_words_and_doubts_are_said() -> None:
     assert "no worker" in find(Index(scene), "stove", Likeness({}, {}, "no worker embeds it")).said
 
 
+def test_what_the_page_leaves_out_is_counted() -> None:
+    many = [msgspec.structs.replace(home().objects[0], id=number) for number in range(30)]
+    index = Index(home(objects=many))
+    for text, more in (("stove", 27), ("sto", 25)):  # a word, with the regions that hold some; the beginning of one
+        found = find(index, text)
+        assert len(found.hits) == 5 and f"{more} more: write more of what you look for" in found.said
+    assert len(find(index, "stove").lit.objects) == 30
+    assert "write more" not in find(Index(home()), "stove").said
+    labels = [f"room {number}" for number in range(9)]
+    scene = home(labels=labels, posteriors=np.full((len(home().place_ids), 9), 0.1, np.float16))
+    told = region_story(scene, msgspec.structs.replace(scene.regions[0], label=labels[0]))
+    assert "6 other labels: prior-sg query region 3" in told
+    assert "4 other labels: prior-sg query place 10" in place_story(scene, 10)
+    assert "other label" not in region_story(home(), home().regions[0])
+
+
+def test_further_losses_of_a_process_are_counted() -> None:
+    status = next(one for one in EXAMPLES if isinstance(one, ServiceStatus))
+    losses = [Loss(what=f"what {number}", reason="r", count=1, example="e") for number in range(4)]
+    told = health_table(Health([msgspec.structs.replace(status, losses=losses)], {}))
+    assert "1 what 1" in told and "what 2" not in told and "and 2 other losses: prior-sg health" in told
+
+
 @pytest.mark.parametrize(
     ("above", "place", "region_", "itself"),
     [((2.0, 1.0), 12, 3, True), ((2.5, 1.4), 12, 3, False), ((6.2, 1.4), 18, 7, False), ((20.0, 20.0), None, 0, False)],
@@ -215,7 +241,7 @@ def test_the_name_of_a_marker_finds_it_and_what_is_doubtful_is_said() -> None:
 def test_a_merged_map_without_a_task_says_whose_it_is_and_what_to_do() -> None:
     bare = home(task="", regions=[], robot="home", merged_of=["robot1", "robot2"])
     told = headline(bare, "live")
-    assert "merged map of robot1, robot2: give a task to a robot" in told and "no task yet" not in told
+    assert "merged map of robot1, robot2: give it a task" in told and "no task yet" not in told
     assert "a task of robot1 or robot2" in legend(bare, {})
     assert "home, merged map of robot1, robot2" in headline(home(robot="home", merged_of=["robot1", "robot2"]), "live")
     assert "no task: residential home as it is" in headline(home(task=""), "live")
@@ -279,3 +305,35 @@ def test_of_one_number_in_two_dictionaries_each_is_named_clicked_and_gone_to_by_
     ends = [way(Index(scene), Trip(hit.spot, Spot(what="place", id=10))).goal_m for hit in hits]
     assert ends == [other.position_m, one.position_m]
     assert [PickedMarker(marker.key).spot for marker in scene.markers] == [hit.spot for hit in hits]
+
+
+def test_a_click_means_what_it_meets_first() -> None:
+    """Of a marker, a place's dot and the ground in one line of sight, the nearest: the others are behind it."""
+    place = home().positions_m[2]  # place 12, at (2, 1)
+    marker = marked_home().markers[0]
+
+    def clicked(marker_m, eye, **seen):
+        scene = home(markers=[msgspec.structs.replace(marker, position_m=tuple(map(float, marker_m)))])
+        eye = np.array(eye, float)
+        return pick(scene, footprints(scene), eye, place - eye, **({"dots": True, "markers": True} | seen))
+
+    eye = place + np.array((-3.0, 0.0, 2.0))
+    beyond, before = place + np.array((0.3, 0.0, -0.2)), place + np.array((-0.3, 0.0, 0.2))
+    assert clicked(beyond, eye).spot == Spot(what="place", id=12)
+    assert clicked(before, eye).spot.what == "marker"
+    assert clicked(beyond, eye, dots=False).spot.what == "marker"
+    assert clicked(place + np.array((6.0, 0.0, -4.0)), eye, dots=False).spot == Spot(what="region", id=3), (
+        "under the floor"
+    )
+    assert clicked(place * (1, 1, 0), place + np.array((0, 0, 5)), dots=False).spot.what == "marker", (
+        "it lies on the floor"
+    )
+
+
+def test_a_dot_of_the_storey_below_is_not_clicked_through_the_floor() -> None:
+    scene = two_floors()
+    eye, place = np.array((2.0, 1.0, 9.0)), scene.positions_m[2]
+    below = msgspec.structs.replace(scene, positions_m=scene.positions_m.copy())
+    below.positions_m[2] = place + np.array((0.5, 0.4, 0.0))
+    picked = pick(below, footprints(scene), eye, below.positions_m[2] - eye, dots=True)
+    assert picked is not None and not picked.itself and picked.region != 3

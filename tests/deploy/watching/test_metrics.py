@@ -72,6 +72,7 @@ def test_every_figure_of_a_status_is_told():
     assert values["prior_sg_step_duration_seconds_bucket", "0.001", *of] == 2
     assert values["prior_sg_step_duration_seconds_count", *of] == 3
     assert values["prior_sg_step_duration_seconds_sum", *of] == 12
+    assert values["prior_sg_step_running_seconds", *of] == 9 and values["prior_sg_step_compiling_seconds", *of] == 8
     assert values["prior_sg_losses_total", "segmenter-1", "dark", "ada", "segmenter", "frames refused"] == 3
     assert values["prior_sg_store_file_bytes", *of] == 10
     assert values["prior_sg_process_answers", "x-1", "x"] == 0

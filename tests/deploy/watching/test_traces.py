@@ -117,7 +117,7 @@ def test_traces_need_a_collector_and_metrics(endpoint, capsys, monkeypatch, tmp_
     monkeypatch.delenv("OTEL_EXPORTER_OTLP_ENDPOINT", raising=False)
     assert main(["metrics", "--connect", endpoint, "--port", "0", "--trace"]) == 1
     assert "no collector of traces is named" in capsys.readouterr().err
-    assert main(["metrics", "--connect", endpoint, "--port", "0", "--trace", "localhost:4318"]) == 1
+    assert main(["metrics", "--connect", endpoint, "--port", "0", "--trace", "localhost:4318"]) == 2
     assert "is no collector of traces" in capsys.readouterr().err
-    assert main(["up", "--out", str(tmp_path), "--trace", "http://localhost:1"]) == 1
+    assert main(["up", "--out", str(tmp_path), "--trace", "http://localhost:1"]) == 2
     assert "add --metrics" in capsys.readouterr().err

@@ -15,6 +15,8 @@ THROUGH_M = 0.25  # a wall that deep in the other's free space is none there
 NEAR_OBJECT_M = 0.7  # between one object in two maps
 CLEAR_M = 0.3  # an object that deep in the other's free space is not there
 CELL_M = 0.25  # in which the overlap's floor is counted
+MOST_CELLS = 40  # along the radius of the widest place: of wider ones cells are larger
+MOST_POINTS = 4_000_000  # that are looked at together
 LEAST_SHARE = 1e-3
 WALL_WORTH, THROUGH_WORTH = 0.1, 0.12  # of a point of a wall that both have, and that only one has
 ROOM_M2 = 20.0  # labels of more floor than that count as of that much: neighbours say the same
@@ -84,14 +86,18 @@ def _floor_m2(centers_m: np.ndarray, radii_m: np.ndarray, other: Shape) -> float
     """Area of the discs under these places, where the other map is free, too."""
     if not len(centers_m):
         return 0.0
-    reach = int(np.ceil(radii_m.max() / CELL_M))
-    steps = np.stack(np.meshgrid(*[np.arange(-reach, reach + 1) * CELL_M] * 2), axis=-1).reshape(-1, 2)
-    points = centers_m[:, None, :2] + steps
-    inside = (steps**2).sum(axis=1)[None] <= radii_m[:, None] ** 2
-    heights = np.broadcast_to(centers_m[:, None, 2], inside.shape)[inside]
-    spots = np.column_stack((points[inside], heights))
-    _, first = np.unique(np.floor(spots[:, :2] / CELL_M).astype(np.int64), axis=0, return_index=True)
-    return float((other.depth_m(spots[first]) > 0).sum() * CELL_M**2)
+    cell_m = max(CELL_M, float(radii_m.max()) / MOST_CELLS)
+    reach = int(np.ceil(radii_m.max() / cell_m))
+    steps = np.stack(np.meshgrid(*[np.arange(-reach, reach + 1) * cell_m] * 2), axis=-1).reshape(-1, 2)
+    spots = np.zeros((0, 3))
+    for rows in np.array_split(np.arange(len(centers_m)), -(-len(centers_m) * len(steps) // MOST_POINTS)):
+        points = centers_m[rows, None, :2] + steps
+        inside = (steps**2).sum(axis=1)[None] <= radii_m[rows, None] ** 2
+        heights = np.broadcast_to(centers_m[rows, None, 2], inside.shape)[inside]
+        spots = np.concatenate((spots, np.column_stack((points[inside], heights))))
+        _, first = np.unique(np.floor(spots[:, :2] / cell_m).astype(np.int64), axis=0, return_index=True)
+        spots = spots[first]
+    return float((other.depth_m(spots) > 0).sum() * cell_m**2) if len(spots) else 0.0
 
 
 def _labels(points_m: np.ndarray, rows: np.ndarray, a: Scene, b: Scene, shape_b: Shape) -> float:
