@@ -4,7 +4,7 @@ import argparse
 import os
 from collections.abc import Sequence
 
-from prior_sg.deploy.errors import UserError
+from prior_sg.deploy.errors import UsageError
 from prior_sg.schemas.names import fault_of_robot, normal
 from prior_sg.schemas.priors import fault_of_task
 
@@ -15,22 +15,22 @@ def names_in(text: str) -> list[str]:
 
 
 def check_robot(name: str) -> None:
-    """Raise UserError unless a robot can be called so."""
+    """Raise UsageError unless a robot can be called so."""
     if fault := fault_of_robot(name):
-        raise UserError(fault)
+        raise UsageError(fault)
 
 
 def check_task(environment: str, task: str, regions: Sequence[str]) -> None:
-    """Raise UserError for what no gateway would take."""
+    """Raise UsageError for what no gateway would take."""
     if fault := fault_of_task(environment, task, list(regions)):
-        raise UserError(fault)
+        raise UsageError(fault)
 
 
 def check_encoding(arguments: Sequence[str]) -> None:
-    """Raise UserError for an argument whose bytes are not text."""
+    """Raise UsageError for an argument whose bytes are not text."""
     for argument in arguments:
         if any("\ud800" <= c <= "\udfff" for c in argument):
-            raise UserError(_no_text(argument))
+            raise UsageError(_no_text(argument))
 
 
 def _no_text(argument: str) -> str:
@@ -42,7 +42,7 @@ def _no_text(argument: str) -> str:
 
 
 def check_arguments(arguments: argparse.Namespace) -> None:
-    """Check, and bring to one spelling, what the options of any command name. Raises UserError."""
+    """Check, and bring to one spelling, what the options of any command name. Raises UsageError."""
     given = vars(arguments)
     if given.get("robot") is not None:  # None = of all robots
         check_robot(arguments.robot)

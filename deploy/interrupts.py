@@ -1,26 +1,43 @@
-"""Ctrl-C is remembered, for what is being imported when it comes may swallow the exception that it raises."""
+"""Ctrl-C is remembered, for what runs when it comes may swallow the exception that it raises: imports, finalizers."""
 
+import _thread
 import signal
+import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 EXIT_INTERRUPTED = 130  # as shells say of a process that SIGINT has ended
+AGAIN_S = 0.05  # after which a finalizer that swallowed it has ended
 _came = threading.Event()
 
 
 @contextmanager
 def remembered() -> Iterator[None]:
-    """Within, Ctrl-C raises KeyboardInterrupt as ever, and `came` tells of it from then on."""
+    """Within, Ctrl-C raises KeyboardInterrupt as ever, and `came` tells of it from then on. It comes again where Python
+    could not raise it: in a finalizer, a callback of a weak reference or of C.
+    """
     _came.clear()
     if threading.current_thread() is not threading.main_thread():  # only the main thread may handle signals
         yield
         return
     previous = signal.signal(signal.SIGINT, interrupt)
+    previous_hook, sys.unraisablehook = sys.unraisablehook, _comes_again
     try:
         yield
     finally:
+        sys.unraisablehook = previous_hook
         signal.signal(signal.SIGINT, previous)
+
+
+def _comes_again(unraisable: "sys.UnraisableHookArgs") -> None:
+    if not issubclass(unraisable.exc_type, KeyboardInterrupt):
+        sys.__unraisablehook__(unraisable)
+        return
+    # Not at once: it would be raised, and lost, within this very hook.
+    later = threading.Timer(AGAIN_S, _thread.interrupt_main)
+    later.daemon = True
+    later.start()
 
 
 def interrupt(number: int, frame: object) -> None:

@@ -4,14 +4,12 @@ Names, tasks, paths and notes come from users, models, files and other robots. N
 can move the cursor, colour or turn what others read. Styles are given beside the text (`line`), never inside it.
 """
 
-import io
-import os
-import sys
 from typing import Any
 
 from rich.console import Console
 from rich.progress import Task, TextColumn
 from rich.status import Status
+from rich.table import Table
 from rich.text import Text
 
 from prior_sg.schemas.names import shown
@@ -58,45 +56,12 @@ def line(*parts: Part) -> Text:
     return Text.assemble(*(_plain(part) if isinstance(part, str) else (shown(part[0]), part[1]) for part in parts))
 
 
-def complain(text: str) -> None:
-    """One sentence on standard error."""
-    print(shown(f"prior-sg: {text}"), file=sys.stderr)
-
-
-def forgive() -> None:
-    """What the terminal's encoding lacks is printed as `?`."""
-    for stream in (sys.stdout, sys.stderr):
-        if hasattr(stream, "reconfigure"):
-            stream.reconfigure(errors="replace")
-
-
-def keep_apart() -> None:
-    """What libraries write past Python, as Zenoh does its errors, goes to standard error from now on, so that nothing
-    but results is on standard output. Where `sys.stdout` is something else than the process's, nothing changes."""
-    stream, errors = sys.stdout, sys.__stderr__
-    if not isinstance(stream, io.TextIOWrapper) or stream is not sys.__stdout__ or errors is None:
-        return
-    stream.flush()
-    file = os.fdopen(os.dup(stream.fileno()), "wb", 0 if isinstance(stream.buffer, io.RawIOBase) else -1)
-    os.dup2(errors.fileno(), stream.fileno())
-    sys.stdout = io.TextIOWrapper(
-        file, stream.encoding, stream.errors, line_buffering=stream.line_buffering, write_through=stream.write_through
-    )
-
-
-def settle() -> None:
-    """What was printed is on standard output. Raises OSError where it cannot be there."""
-    if sys.stdout is not None:
-        sys.stdout.flush()
-
-
-def give_up() -> None:
-    """What cannot be on standard output any more, for its reader or the disk's room has gone, is nobody's: Python would
-    complain of it at its end."""
-    try:
-        settle()
-    except OSError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+def table(*headings: str, **options: Any) -> Table:
+    """A table in which nothing is cut off: a word wider than its column goes on below. `options` are rich's."""
+    made = Table(*headings, **options)
+    for column in made.columns:
+        column.overflow = "fold"
+    return made
 
 
 def _plain(text: Any) -> Any:

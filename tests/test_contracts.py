@@ -77,5 +77,6 @@ def test_shared_modules_beside_the_services_are_in_the_pure_room():
         "registry",
         "roles",
         "compiled",
+        "compiling",
         "folders",
     }

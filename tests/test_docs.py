@@ -5,7 +5,10 @@ A function is named as `file.py::function` or `file.py::Class.method`, the file 
 
 import argparse
 import ast
+import importlib
 import re
+import shlex
+import tomllib
 import typing
 from functools import cache
 
@@ -178,3 +181,82 @@ def test_what_does_not_exist_is_found(tmp_path):
     wrong = [name for name in named if not has_setting(BY_NAME["segmenter"].config, name.split(".")[1:])]
     assert wrong == ["segmenter.balance.gone", "segmenter.gone"]
     assert [target for target in LINK.findall(text) if leads_nowhere(page, target)] == ["gone.md", "page.md#bottom"]
+
+
+CAPITALS = re.compile(r"(?<![\w.])[A-Z][A-Z_]+(?![\w.])|[…\[\]]|\.\.\.")  # placeholders, and parts left out
+
+
+def shell_lines(text):
+    """Lines of fences that a shell would take, as words; continued ones joined, comments and redirections left out."""
+    for kind, fence in re.findall(r"```(\w*)\n(.*?)```", text, re.DOTALL):
+        if kind in ("sh", "bash", "console"):
+            yield from (line for line in fence.replace("\\\n", " ").splitlines() if line.strip())
+
+
+def misused(text):
+    """Calls in fences that no placeholder leaves open and that the command would refuse."""
+    for line in shell_lines(text):
+        for call in re.findall(r"(?:^|[;&|] *|bin/)prior-sg ([^#|>]+)", line):
+            if CAPITALS.search(call) or ("'" in line and call.count("'") % 2):
+                continue
+            words = shlex.split(call.split(" && ")[0].split("; ")[0].rstrip("& "))
+            try:
+                build_parser().parse_args(words)
+            except SystemExit as ended:
+                if ended.code:
+                    yield call.strip()
+
+
+def nowhere(text):
+    """Targets of make, modules, extras and files that fences name and that do not exist."""
+    code = "\n".join(shell_lines(text))
+    targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+    for line in code.splitlines():
+        for words in re.findall(r"(?:^|[;&] *)make ((?:[a-z-]+ ?)+)", line.partition("#")[0]):
+            yield from (f"make {word}" for word in words.split() if word not in targets)
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    for names in re.findall(r"(?:prior-sg|'\.|\"\.|\s\.)\[([a-z0-9,-]+)\]", text):
+        yield from (f"[{name}]" for name in names.split(",") if name not in project["optional-dependencies"])
+    for module in re.findall(r"python3? -m ((?:prior_sg|tests)[\w.]*)", text):
+        path = module.replace("prior_sg.", "src/prior_sg/", 1).replace(".", "/")
+        if not ((ROOT / f"{path}.py").is_file() or (ROOT / path / "__main__.py").is_file()):
+            yield f"python -m {module}"
+    for path in re.findall(r"(?<![\w/.-])((?:deploy|tests|docs|examples|services|schemas)/[\w./@-]*\w)", code):
+        if not (ROOT / path).exists():
+            yield path
+
+
+def pythons(text):
+    return re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
+def test_calls_in_fences_would_be_taken(document, capsys):
+    assert list(misused(document.read_text(encoding="utf-8"))) == []
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
+def test_what_fences_name_is_there(document):
+    assert list(nowhere(document.read_text(encoding="utf-8"))) == []
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
+def test_python_in_fences_imports_what_exists(document):
+    for code in pythons(document.read_text(encoding="utf-8")):
+        for node in ast.walk(ast.parse(code)):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("prior_sg"):
+                module = importlib.import_module(node.module)
+                assert [name.name for name in node.names if not hasattr(module, name.name)] == []
+            if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "prior_sg":
+                assert node.attr in dir(importlib.import_module("prior_sg"))
+
+
+def test_what_fences_say_wrongly_is_found(capsys):
+    text = (
+        "```sh\nprior-sg query near 1 2 3 --what house\nprior-sg fleet robot1\nprior-sg trace twelve | less\n"
+        "prior-sg run PATH --task x\nprior-sg health  # all\nmake demo tests\npip install -e '.[api,apy]'\n"
+        "python -m tests.fuzzy --inputs 2\npytest tests/services/segmenter tests/services/segmentor\n```\n"
+    )
+    refused = [call.split()[0] for call in misused(text)]
+    assert refused == ["query", "fleet", "trace"]
+    assert list(nowhere(text)) == ["make tests", "[apy]", "python -m tests.fuzzy", "tests/services/segmentor"]

@@ -322,8 +322,6 @@ def test_replay_and_export_on_the_command_line(disturbed, capsys, tmp_path):
     [
         (["run", "/nowhere", "--environment", "home", "--task", "t"], "/nowhere does not exist"),
         (["replay", "/nowhere.mcap", "segmenter"], "nowhere.mcap"),
-        (["replay", "x.mcap", "nobody"], "there is no service 'nobody'"),
-        (["up", "nobody"], "there is no service 'nobody'"),
         (["health", "--connect", "tcp/127.0.0.1:1"], "no router answers on tcp/127.0.0.1:1"),
         (["export", "/nowhere.sqlite", "--out", "x.json"], "nowhere.sqlite does not exist"),
     ],
@@ -332,6 +330,13 @@ def test_errors_are_one_sentence(arguments, sentence, capsys):
     assert main(arguments) == 1
     error = capsys.readouterr().err.strip()
     assert sentence in error and len(error.splitlines()) == 1
+
+
+@pytest.mark.parametrize("arguments", [["replay", "x.mcap", "nobody"], ["up", "nobody"]])
+def test_a_service_that_is_none_is_a_command_put_wrongly(arguments, capsys):
+    assert main(arguments) == 2
+    error = capsys.readouterr().err.strip()
+    assert "there is no service 'nobody'; known: ingest" in error and len(error.splitlines()) == 1
 
 
 def test_an_unknown_environment_ends_the_run_with_the_reason(tmp_path):

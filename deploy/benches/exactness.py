@@ -121,10 +121,10 @@ def measured(walk: Walk, cfg: Config) -> dict[str, float]:
         for key, side, tree in (("too_wide", 1, raw), ("too_wide_agreed", 1, agreed), ("too_narrow", -1, agreed))
     }
     order = np.random.default_rng(7).permutation(len(walk.keyframes))
-    fearless = msgspec.structs.replace(cfg, max_speed_m_s=0.0)  # in another order every pose jumps
+    fearless = msgspec.structs.replace(cfg, max_speed_m_s=0.0)  # in another order, or with some left out, poses jump
     reordered = places_of([walk.keyframes[row] for row in order], fearless)
-    one = maps[0] if walk.other else places_of(walk.keyframes[::2], cfg)
-    other = places_of(walk.other or walk.keyframes[1::2], cfg)
+    one = maps[0] if walk.other else places_of(walk.keyframes[::2], fearless)
+    other = places_of(walk.other or walk.keyframes[1::2], fearless)
     return {
         "keyframes": float(len(walk.keyframes)),
         "places": float(np.mean([len(each.radii_m) for each in maps])),

@@ -2,7 +2,9 @@
 
 The command itself runs as a user starts it, in a process of its own, and is watched from outside: processes by what the
 kernel says of them, messages by a client of its router. Resident memory counts the pages of a library in each process
-that maps them; the proportional share divides them among those, so that only its sum is what the machine gives.
+that maps them; the proportional share divides them among those, so that its sum is what the machine gives. How many
+pages of a file one use of it maps depends on how the file came into the machine's memory: a kernel that keeps it in
+pieces of 1 MB, as pip wrote it, maps whole pieces. A process's own memory, which no file holds, does not depend on it.
 """
 
 import contextlib
@@ -55,10 +57,11 @@ MILESTONES: dict[str, Topic] = {
 
 
 class Memory(NamedTuple):
-    """Of one process: resident, and with pages of several processes divided among them."""
+    """Of one process: resident, with pages of several processes divided among them, and what no file holds."""
 
-    resident_mb: float
+    mb: float
     share_mb: float
+    own_mb: float
 
 
 Look = dict[str, Memory]  # by service, and `command`
@@ -87,7 +90,8 @@ class Seen:
 def memory_bench(source: Path) -> tuple[dict, dict]:
     """Megabytes of each process and of all: at start, when the source has ended, and at most.
 
-    At start = when all services but ingest stand and have been given nothing; of ingest, before its first keyframe.
+    At start = when all services stand and have been given nothing. Of ingest also once it has opened its source: as it
+    was last before its first keyframe.
     """
     start = standing()
     looks: list[tuple[float, Look]] = []
@@ -97,34 +101,36 @@ def memory_bench(source: Path) -> tuple[dict, dict]:
             if time.time() - began_s > TIMEOUT_S:
                 raise RuntimeError(f"the run did not end within {TIMEOUT_S:.0f} s")
             time.sleep(LOOK_S)
-        idle = [found for at_s, found in looks if "ingest" in found and at_s < seen.first_s["keyframe"]]
-        if idle:
-            start["ingest"] = idle[-1]["ingest"]
-        return summed(start, [found for _, found in looks]) | _times(seen, began_s), {"source": source.name}
+        opened = [found["ingest"] for at_s, found in looks if "ingest" in found and at_s < seen.first_s["keyframe"]]
+        figures = summed(start, [found for _, found in looks]) | _figures("ingest", "opened", opened[-1:])
+        return figures | _times(seen, began_s), {"source": source.name}
 
 
 def summed(start: Look, looks: list[Look]) -> dict[str, float]:
-    """Figures of a run: `{service}_{start|end|most}_mb` and, with shared pages divided, `…_share_mb`; the same of all
-    together. The end is the last look at which all were there.
+    """Figures of a run: `{service}_{start|end|most}_mb`, with shared pages divided `…_share_mb`, and `…_own_mb` without
+    those of files; the same of all together. The end is the last look at which all were there; each kind of memory is
+    at most what it was at any.
     """
     whole = [found for found in looks if set(found) >= {*NAMES, COMMAND}]
     if not whole:
         raise RuntimeError("the services never stood together")
     figures: dict[str, float] = {}
     for name in (*NAMES, COMMAND):
-        of = [found[name] for found in whole]
-        for when, found in {"start": start.get(name), "end": of[-1], "most": max(of)}.items():
-            if found is not None:
-                figures |= {f"{name}_{when}_mb": found.resident_mb, f"{name}_{when}_share_mb": found.share_mb}
-    for kind in Memory._fields:
-        unit = "mb" if kind == "resident_mb" else "share_mb"
-        sums = [sum(getattr(one, kind) for one in found.values()) for found in whole]
-        figures |= {f"{TOTAL}_end_{unit}": sums[-1], f"{TOTAL}_most_{unit}": max(sums)}
-    return figures
+        if name in start:
+            figures |= _figures(name, "start", [start[name]])
+        figures |= _figures(name, "end", [whole[-1][name]]) | _figures(name, "most", [found[name] for found in whole])
+    sums = [Memory(*map(sum, zip(*found.values(), strict=True))) for found in whole]
+    return figures | _figures(TOTAL, "end", sums[-1:]) | _figures(TOTAL, "most", sums)
+
+
+def _figures(name: str, when: str, looks: list[Memory]) -> dict[str, float]:
+    """Each kind of memory at most; none without a look."""
+    found = zip(*looks, strict=True)
+    return {f"{name}_{when}_{kind}": max(of) for kind, of in zip(Memory._fields, found, strict=False)}
 
 
 def standing() -> Look:
-    """Every service but ingest under a supervisor, after some idle time."""
+    """Every service under a supervisor, after some idle time; ingest without a source."""
     with contextlib.ExitStack() as ending:
         folder = Path(ending.enter_context(tempfile.TemporaryDirectory()))
         endpoint, stop_router = open_free_router("tcp/127.0.0.1:0")
@@ -134,12 +140,10 @@ def standing() -> Look:
         )
         ending.callback(supervisor.stop)
         client = ending.enter_context(BusClient(ZenohBus(endpoint)))
-        wanted = set(NAMES) - {"ingest"}
         for name in NAMES:
-            if name in wanted:
-                supervisor.start(name)
+            supervisor.start(name)
         end_s = time.monotonic() + TIMEOUT_S
-        while set(client.alive().values()) < wanted:
+        while set(client.alive().values()) < set(NAMES):
             supervisor.check()
             if time.monotonic() > end_s:
                 raise RuntimeError(f"not all services stood within {TIMEOUT_S:.0f} s")
@@ -220,13 +224,19 @@ def look(command: psutil.Process) -> Look:
     """The command and the services below it, as they are now; workers together."""
     found: Look = {}
     for process in (command, *command.children(recursive=True)):
-        with contextlib.suppress(psutil.Error):
+        with contextlib.suppress(psutil.Error, OSError):
             name = COMMAND if process == command else _service(process.cmdline())
             if name:
-                figures = process.memory_full_info()
-                before = found.get(name, Memory(0.0, 0.0))
-                found[name] = Memory(before.resident_mb + figures.rss / 1e6, before.share_mb + figures.pss / 1e6)
+                before = found.get(name, Memory(0.0, 0.0, 0.0))
+                found[name] = Memory(*map(sum, zip(before, memory_of(process.pid), strict=True)))
     return found
+
+
+def memory_of(pid: int) -> Memory:
+    """Memory of a process as Linux tells it. Raises OSError where the process is gone."""
+    lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()[1:]
+    kilobytes = {name: int(amount.split()[0]) for name, _, amount in (line.partition(":") for line in lines)}
+    return Memory(*(kilobytes[name] * 1024 / 1e6 for name in ("Rss", "Pss", "Anonymous")))
 
 
 def _service(arguments: list[str]) -> str:

@@ -92,7 +92,7 @@ def measured(
     usual = {"preset": "outdoor"} if world is not None and world.outdoors else {}
     source = world_source(name) if name else open_source(path)
     if world is not None and range_m:
-        frames = _seen_as_far(dataclasses.replace(world, range_m=range_m))
+        frames = seen_as_far(dataclasses.replace(world, range_m=range_m))
     else:
         frames = keyframes_of(source)
     mapped = _mapped(frames, usual | settings)
@@ -124,7 +124,7 @@ def measured(
     }
 
 
-def _seen_as_far(world: World) -> Iterator[Keyframe]:
+def seen_as_far(world: World) -> Iterator[Keyframe]:
     """What a camera of the world's range would measure without noise, along the world's walk."""
     camera, scale_m = world.intrinsics, world.range_m / np.iinfo(np.uint16).max
     shape = (camera.height_px, camera.width_px)

@@ -23,6 +23,7 @@ from prior_sg.services.runtime.service import Identity
 
 PLACE_STAGES: dict[str, Callable[..., Any]] = {  # the function of the place graph whose time makes a stage
     "decode": images.depth_of,
+    "blocks": tsdf.blocks_of,
     "fuse": tsdf.integrate,
     "distances": distance.refresh,
     "places": places.extract,

@@ -1,7 +1,7 @@
 """How far two scenes of one stream are the same, by what readers hold on to: places, labels, names of regions, objects.
 
-Two undisturbed runs differ as well: workers answer in another order, and graph cuts stop at another place when time is
-short. What they differ by is the measure for any other pair.
+Two undisturbed runs differ as well, in ids: workers answer in another order, so regions come and go at other times.
+What they differ by is the measure for any other pair.
 """
 
 from typing import NamedTuple

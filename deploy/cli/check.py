@@ -4,17 +4,17 @@ import argparse
 from typing import TYPE_CHECKING
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress
-from rich.table import Table
 
 from prior_sg.deploy.cli.shared import Commands, add_settings, console
-from prior_sg.deploy.cli.source_options import add_source_options, read_options
+from prior_sg.deploy.cli.source_options import add_source_options, mapping_options, read_options
 from prior_sg.deploy.errors import UserError
 from prior_sg.deploy.json_text import json_text
-from prior_sg.deploy.terminal import Description, Terminal, line
+from prior_sg.deploy.terminal import Description, Terminal, line, table
 
 if TYPE_CHECKING:
     from prior_sg.deploy.inspecting.check import Report
     from prior_sg.services.ingest.core.config import Config
+    from prior_sg.services.place_graph.core.config import Config as PlaceGraphConfig
 
 SAID_AT_START = ("reading", "ground truth")
 STYLE = {"ok": "green", "note": "yellow", "problem": "bold red"}
@@ -43,7 +43,7 @@ def add_commands(commands: Commands) -> None:
 
 def cmd_check(arguments: argparse.Namespace) -> int:
     """Check a source and show what was found; 1 when there are problems."""
-    report = _checked(arguments.source, read_options(arguments))
+    report = _checked(arguments.source, read_options(arguments), mapping_options(arguments))
     if arguments.json:
         print(json_text(as_builtins(report), None))
     else:
@@ -51,7 +51,7 @@ def cmd_check(arguments: argparse.Namespace) -> int:
     return 1 if report.verdict == "problem" else 0
 
 
-def before_start(path: str, cfg: "Config", console: Terminal) -> "Report":
+def before_start(path: str, cfg: "Config", console: Terminal, mapping: "PlaceGraphConfig | None" = None) -> "Report":
     """A brief check: one line about the source and one for each problem. Raises HopelessSource and SourceError."""
     from prior_sg.deploy.inspecting.check import check, unseen
     from prior_sg.services.ingest.sources import open_source
@@ -62,7 +62,7 @@ def before_start(path: str, cfg: "Config", console: Terminal) -> "Report":
             f"{path} is not looked at before the start, for {cfg.pose_source} is a FIFO, which one reader empties"
         )
         return unseen(path)
-    report = check(open_source(path, options=cfg), cfg, brief=True)
+    report = check(open_source(path, options=cfg), cfg, mapping=mapping, brief=True)
     console.print(report.summary)
     for finding in report.findings:
         if finding.verdict == "problem" or (finding.verdict == "note" and finding.topic in SAID_AT_START):
@@ -74,11 +74,11 @@ def before_start(path: str, cfg: "Config", console: Terminal) -> "Report":
 
 def show(report: "Report", console: Terminal) -> None:
     """A table of all findings, and a closing line."""
-    table = Table("", "what", "found", "mend", title=report.source)
+    rows = table("", "what", "found", "mend", title=report.source)
     for finding in report.findings:
         verdict = line((finding.verdict, STYLE[finding.verdict]))
-        table.add_row(verdict, finding.topic, finding.text, finding.mend)
-    console.print(table)
+        rows.add_row(verdict, finding.topic, finding.text, finding.mend)
+    console.print(rows)
     count = len(report.problems)
     console.print(f"{count or 'no'} problem{'s' * (count != 1)}, {report.seconds:.1f} s")
 
@@ -96,7 +96,7 @@ def as_builtins(report: "Report") -> dict:
     }
 
 
-def _checked(path: str, cfg: "Config") -> "Report":
+def _checked(path: str, cfg: "Config", mapping: "PlaceGraphConfig") -> "Report":
     from prior_sg.deploy.inspecting.check import check, unreadable
     from prior_sg.services.ingest.sources import SourceError, open_source
 
@@ -107,7 +107,7 @@ def _checked(path: str, cfg: "Config") -> "Report":
             progress.update(bar, completed=done, total=total or None)
 
         try:
-            return check(open_source(path, options=cfg), cfg, progress=show_progress)
+            return check(open_source(path, options=cfg), cfg, mapping=mapping, progress=show_progress)
         except SourceError as error:
             return unreadable(path, str(error))
 

@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 
 from prior_sg.deploy.cli.shared import Commands, add_bus, console, until_interrupted
-from prior_sg.deploy.errors import UserError
+from prior_sg.deploy.errors import UsageError
 
 API_PORT, MCP_PORT = 8000, 8001
 LAST_PORT = 65535
@@ -67,7 +67,7 @@ def cmd_mcp(arguments: argparse.Namespace) -> int:
 
     if not arguments.http:
         if arguments.token_file is not None:
-            raise UserError("a token is asked for over HTTP only: add --http, or leave --token-file")
+            raise UsageError("a token is asked for over HTTP only: add --http, or leave --token-file")
         serve_planner_here(arguments.connect, arguments.robot)
         return 0
     entry = entrance(arguments.host, arguments.token_file)

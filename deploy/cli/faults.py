@@ -27,7 +27,7 @@ def sentence_of(error: Exception) -> str | None:
 def _of_system(error: OSError) -> str | None:
     where = f" {error.filename}" if error.filename else ""
     if error.errno in FULL:
-        return f"there is no space left for{where or ' the results'}; free some, or choose another folder with --out"
+        return f"there is no space left for{where or ' the results'}; free some, or write elsewhere"
     if error.errno in REFUSED:
         return f"cannot use{where or ' a file'} ({error.strerror}); choose another folder, or have its rights changed"
     if error.errno in (errno.EMFILE, errno.ENFILE):

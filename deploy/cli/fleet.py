@@ -9,7 +9,7 @@ import uuid
 from pathlib import Path
 
 from prior_sg.deploy.cli.shared import Commands, add_bus, console, tell_logs, until_interrupted, wait
-from prior_sg.deploy.errors import UserError
+from prior_sg.deploy.errors import UsageError
 
 Lying = tuple[float, float, float, float]  # x, y, z in metres, heading in radians
 MEMORY = "out/fleet/{}.msgpack"
@@ -58,16 +58,16 @@ def add_commands(commands: Commands) -> None:
 
 
 def transforms_of(texts: list[str], robots: list[str], same_frame: bool) -> dict[str, Lying]:
-    """Transforms as the command gives them, headings in radians. Raises UserError."""
+    """Transforms as the command gives them, headings in radians. Raises UsageError."""
     found = dict.fromkeys(robots, (0.0, 0.0, 0.0, 0.0)) if same_frame else {}
     for text in texts:
         robot, _, told = text.partition("=")
         try:
             x, y, z, yaw = (float(number) for number in told.split(","))
         except ValueError as error:
-            raise UserError(f"{text!r} is no transform: write ROBOT=X,Y,Z,YAW, in metres and degrees") from error
+            raise UsageError(f"{text!r} is no transform: write ROBOT=X,Y,Z,YAW, in metres and degrees") from error
         if not all(math.isfinite(number) for number in (x, y, z, yaw)):
-            raise UserError(f"{text!r} is no transform: its numbers must be finite")
+            raise UsageError(f"{text!r} is no transform: its numbers must be finite")
         found[robot] = (x, y, z, math.radians(yaw))
     return found
 
@@ -82,9 +82,9 @@ def cmd_fleet(arguments: argparse.Namespace) -> int:
     from prior_sg.services.runtime.service import Identity
 
     if fault := fault_of_robot(arguments.name):
-        raise UserError(fault)
+        raise UsageError(fault)
     if arguments.name in arguments.robots:
-        raise UserError(NAME_OF_A_ROBOT.format(arguments.name))
+        raise UsageError(NAME_OF_A_ROBOT.format(arguments.name))
     try:
         cfg = Config(
             robots=tuple(arguments.robots),
@@ -94,7 +94,7 @@ def cmd_fleet(arguments: argparse.Namespace) -> int:
             match=MatchConfig(markers=not arguments.without_markers),
         )
     except ValueError as error:
-        raise UserError(str(error)) from error
+        raise UsageError(str(error)) from error
     tell_logs()
     console.print(f"{', '.join(cfg.robots)} as {arguments.name}; Ctrl-C stops")
     identity = Identity(arguments.name, f"{SERVICE.name}-{uuid.uuid4().hex[:8]}", time.time_ns())

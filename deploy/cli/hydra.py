@@ -6,7 +6,7 @@ import time
 import uuid
 
 from prior_sg.deploy.cli.shared import Commands, add_bus, console, tell_logs, until_interrupted
-from prior_sg.deploy.errors import UserError
+from prior_sg.deploy.errors import UsageError
 
 
 def add_commands(commands: Commands) -> None:
@@ -52,7 +52,7 @@ def cmd_hydra(arguments: argparse.Namespace) -> int:
             correct_poses=not arguments.keep_poses,
         )
     except ValueError as error:
-        raise UserError(str(error)) from error
+        raise UsageError(str(error)) from error
     tell_logs()
     back = f"; names of rooms to {cfg.labels_to}" if cfg.labels_to else ""
     console.print(f"scene graphs of Hydra from {cfg.graph_from}{back}; Ctrl-C stops")

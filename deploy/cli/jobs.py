@@ -5,12 +5,13 @@ from pathlib import Path
 
 from prior_sg.deploy.cli.check import before_start
 from prior_sg.deploy.cli.shared import Commands, add_bus, add_log_mb, add_settings, console
-from prior_sg.deploy.cli.source_options import add_source_options, read_options, source_settings
+from prior_sg.deploy.cli.source_options import add_source_options, mapping_options, read_options, source_settings
 from prior_sg.deploy.edge import names_in
-from prior_sg.deploy.errors import UserError
+from prior_sg.deploy.errors import UsageError, UserError
 from prior_sg.deploy.interrupts import EXIT_INTERRUPTED
 from prior_sg.deploy.sample import COARSE, SAMPLE
 from prior_sg.deploy.settings import DEMO_ENVIRONMENT, DEMO_TASK
+from prior_sg.services.runtime import heap
 
 
 def add_commands(commands: Commands) -> None:
@@ -93,13 +94,13 @@ def settings_of(arguments: argparse.Namespace) -> list[str]:
 
 
 def encoder_settings(choice: str) -> list[str]:
-    """Settings of workers and segmenter for one choice of an encoder. Raises UserError."""
+    """Settings of workers and segmenter for one choice of an encoder. Raises UsageError."""
     from prior_sg.services.feature_pyramid.encoders.base import EncoderUnavailable, space_of
 
     try:
         return [f"feature_pyramid.space={choice}", f"segmenter.space={space_of(choice)}"] if choice else []
     except EncoderUnavailable as error:
-        raise UserError(str(error)) from error
+        raise UsageError(str(error)) from error
 
 
 def cmd_demo(arguments: argparse.Namespace) -> int:
@@ -124,14 +125,14 @@ def cmd_demo(arguments: argparse.Namespace) -> int:
 
 def cmd_run(arguments: argparse.Namespace) -> int:
     """The main job on a source of the user's."""
-    from prior_sg.deploy.cli import report
     from prior_sg.deploy.cli.mending import check_mapped
     from prior_sg.deploy.running.job import Job, run
     from prior_sg.services.ingest.core.options import is_live
 
     if not (is_live(arguments.source) or Path(arguments.source).exists()):
         raise UserError(f"{arguments.source} does not exist")
-    beside = before_start(arguments.source, read_options(arguments), console).beside
+    beside = before_start(arguments.source, read_options(arguments), console, mapping_options(arguments)).beside
+    heap.give_back()  # what the images that were looked at took
     job = Job(
         source=arguments.source,
         out=arguments.out,
@@ -151,6 +152,8 @@ def cmd_run(arguments: argparse.Namespace) -> int:
         ),
     )
     result = run(job, console)
+    from prior_sg.deploy.cli import report  # what scores and draws takes as much memory as all else of this process
+
     report.write(result, job.out, beside.regions, console, beside.objects)
     if result.interrupted:
         counts = result.counts

@@ -17,7 +17,7 @@ from prior_sg.deploy.cli.shared import (
     wait,
     writing,
 )
-from prior_sg.deploy.errors import UserError
+from prior_sg.deploy.errors import UsageError
 from prior_sg.services.folders import user_settings
 
 ROLES = ("robot", "edge", "fleet", "viewer", "operator")
@@ -67,7 +67,7 @@ def add_commands(commands: Commands) -> None:
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    raise UserError("name an action; `prior-sg keys --help` lists them")
+    raise UsageError("name an action; `prior-sg keys --help` lists them")
 
 
 def _init(arguments: argparse.Namespace) -> int:
@@ -124,20 +124,20 @@ def _told_others(arguments: argparse.Namespace) -> int:
 
 def _list(arguments: argparse.Namespace) -> int:
     import msgspec
-    from rich.table import Table
 
     from prior_sg.deploy.keys.authority import Authority
+    from prior_sg.deploy.terminal import table
 
     authority = Authority(arguments.folder)
     everybody = sorted(authority.participants.values(), key=lambda one: (one.role, one.name))
     if arguments.json:
         print(msgspec.json.encode(everybody).decode())
         return 0
-    table = Table("name", "role", "key", "until", "state")
+    rows = table("name", "role", "key", "until", "state")
     today = time.strftime("%Y-%m-%d", time.gmtime())
     for one in everybody:
-        table.add_row(one.name, one.role, str(one.issue), one.until, one.state(today))
-    console.print(table)
+        rows.add_row(one.name, one.role, str(one.issue), one.until, one.state(today))
+    console.print(rows)
     return 0
 
 

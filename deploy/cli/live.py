@@ -18,10 +18,10 @@ from prior_sg.deploy.cli.shared import (
     until_interrupted,
     wait,
 )
-from prior_sg.deploy.cli.source_options import add_source_options, read_options
+from prior_sg.deploy.cli.source_options import add_source_options, mapping_options, read_options
 from prior_sg.deploy.cli.watching import add_metrics, check_metrics, open_metrics
 from prior_sg.deploy.edge import names_in
-from prior_sg.deploy.errors import UserError
+from prior_sg.deploy.errors import UsageError, UserError
 from prior_sg.deploy.running import serve
 from prior_sg.deploy.running.notify import Watchdog
 from prior_sg.services.errors import PriorSgError
@@ -100,7 +100,7 @@ def cmd_up(arguments: argparse.Namespace) -> int:
     names = arguments.services or [service.name for service in SERVICES]
     for name in names:
         if name not in BY_NAME:
-            raise UserError(f"there is no service {name!r}; known: {', '.join(BY_NAME)}")
+            raise UsageError(f"there is no service {name!r}; known: {', '.join(BY_NAME)}")
     if arguments.api is not None:
         extras.require("api", "prior-sg up --api")
     check_metrics(arguments)
@@ -166,9 +166,9 @@ def _check_place(arguments: argparse.Namespace, names: list[str]) -> None:
         raise UserError(f"these keys are of {own.name}, which writes nothing of {arguments.robot}; use --robot")
     mappers = [name for name in names if KEYFRAME in BY_NAME[name].reads]
     if arguments.thin_link and mappers and "ingest" not in names:
-        raise UserError(f"{mappers[0]} needs every keyframe, and a thin link carries none: run it where ingest runs")
+        raise UsageError(f"{mappers[0]} needs every keyframe, and a thin link carries none: run it where ingest runs")
     if beyond is not None and arguments.no_router:
-        raise UserError("--listen and --join are of the router that `up` starts; leave out --no-router")
+        raise UsageError("--listen and --join are of the router that `up` starts; leave out --no-router")
 
 
 def _settings(arguments: argparse.Namespace) -> list[str]:
@@ -184,7 +184,7 @@ def _settings(arguments: argparse.Namespace) -> list[str]:
     ]
     if arguments.source:
         if not is_live(arguments.source):  # a robot may come later, through the router that is started here
-            before_start(arguments.source, read_options(arguments), console)
+            before_start(arguments.source, read_options(arguments), console, mapping_options(arguments))
         settings.append(f"ingest.source={arguments.source}")
     settings += settings_of(arguments)
     check_settings(arguments.config, settings)

@@ -68,7 +68,7 @@ def build_parser() -> argparse.ArgumentParser:
 def main(argv: list[str] | None = None) -> int:
     """Exit status of the command; faults of the user or the system are one sentence on standard error."""
     from prior_sg.deploy.interrupts import EXIT_INTERRUPTED, remembered
-    from prior_sg.deploy.terminal import give_up
+    from prior_sg.deploy.streams import give_up
 
     # As services of `up` have it: products are small, and threads spin for each other and change last bits of sums.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -86,7 +86,7 @@ def main(argv: list[str] | None = None) -> int:
 def _told(argv: list[str] | None) -> int:
     from prior_sg.deploy.cli.faults import sentence_of
     from prior_sg.deploy.interrupts import insist
-    from prior_sg.deploy.terminal import complain, give_up, settle
+    from prior_sg.deploy.streams import complain, give_up, settle
     from prior_sg.services.errors import PriorSgError
 
     try:
@@ -109,7 +109,7 @@ def _run(argv: list[str] | None) -> int:
     from prior_sg.deploy.interrupts import interrupt
     from prior_sg.deploy.limits import check_memory
     from prior_sg.deploy.settings import use_keys
-    from prior_sg.deploy.terminal import forgive, keep_apart
+    from prior_sg.deploy.streams import forgive, keep_apart
     from prior_sg.services.runtime import extras
 
     forgive()
@@ -120,6 +120,8 @@ def _run(argv: list[str] | None) -> int:
     use_keys(getattr(arguments, "keys", ""))
     check_memory(arguments.needs)
     extras.require(arguments.needs, f"prior-sg {arguments.command}")
+    if arguments.command != "serve":  # one service may need no images, and loads it with the first
+        extras.load(arguments.needs)
     if threading.current_thread() is threading.main_thread() and arguments.command != "serve":
         signal.signal(signal.SIGTERM, interrupt)  # ended by a supervisor: as tidy as Ctrl-C
     return arguments.run(arguments)

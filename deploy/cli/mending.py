@@ -13,7 +13,11 @@ ADVICE = (  # the first whose words are in the reason or its example; before all
         "poses jump",
         "--poses, --axes and --position-scale say how poses are written; ingest.max_speed_m_s=0 believes all",
     ),
-    ("pose jumps", "--poses, --quaternion and --axes say how poses are written"),
+    (
+        "pose jumps",
+        "--set place_graph.max_speed_m_s=SPEED believes a camera that moves so fast; --poses, --quaternion and --axes"
+        " say how poses are written",
+    ),
     ("no depth image", "--sync-tolerance SECONDS takes more together; --clock received counts arrival"),
     ("no pose lies within", "--sync-tolerance SECONDS takes poses farther away"),
     ("from the origin", "--origin auto moves the world's zero to the recording"),

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from prior_sg.deploy.cli.shared import Commands, add_settings, console
 from prior_sg.deploy.cli.source_options import add_source_options, read_options
-from prior_sg.deploy.errors import UserError
+from prior_sg.deploy.errors import UsageError
 from prior_sg.deploy.settings import DEFAULT_ROBOT
 
 SHOWN_REASONS = 5
@@ -33,7 +33,7 @@ def cmd_pack(arguments: argparse.Namespace) -> int:
     from prior_sg.deploy.sample.packed import pack_source
 
     if arguments.log.suffix != ".mcap":
-        raise UserError(f"{arguments.log} must end in .mcap, so that it is read as a log again")
+        raise UsageError(f"{arguments.log} must end in .mcap, so that it is read as a log again")
     with console.status("opening the source") as status:
         source, refused = pack_source(
             arguments.source,

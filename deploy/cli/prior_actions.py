@@ -2,22 +2,23 @@
 
 import argparse
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import msgspec
 import numpy as np
-from rich.table import Table
 
 from prior_sg.deploy.cli.prior_file import PriorError, Rows, adjacency, containment, existence, read, write
 from prior_sg.deploy.cli.shared import open_client
 from prior_sg.deploy.edge import names_in
+from prior_sg.deploy.errors import UsageError
 from prior_sg.deploy.running.inprocess import InProcess
 from prior_sg.deploy.settings import resolved_config
-from prior_sg.deploy.terminal import Terminal, line
+from prior_sg.deploy.terminal import Terminal, line, table
 from prior_sg.schemas.codec import DecodeError
 from prior_sg.schemas.priors import ObjectPrior, Prior, PriorRevision, Provenance, Task
 from prior_sg.schemas.topics import PRIOR, PRIOR_REVISION
+from prior_sg.services.errors import reason_of
 from prior_sg.services.prior_gateway.core.compose import Library, NoPrior
 from prior_sg.services.prior_gateway.core.config import Config
 from prior_sg.services.prior_gateway.outside.archive import PREFERRED, PriorShelf
@@ -39,7 +40,7 @@ def settings(arguments: argparse.Namespace) -> Config:
 def task_of(arguments: argparse.Namespace) -> Task:
     """The task that the options name."""
     if not arguments.environment:
-        raise PriorError("name an environment with --environment, or a file or digest")
+        raise UsageError("name an environment with --environment, or a file or digest")
     return Task(
         robot="cli",
         stamp_ns=time.time_ns(),
@@ -123,7 +124,7 @@ def show(arguments: argparse.Namespace, console: Terminal) -> int:
         try:
             draw(prior, arguments.out)
         except (ValueError, OSError) as error:
-            raise PriorError(f"cannot draw {arguments.out}: {error}") from error
+            raise PriorError(f"cannot draw {arguments.out}: {reason_of(error)}") from error
         console.print(f"drawn in {arguments.out}")
     return 0
 
@@ -154,32 +155,31 @@ def bring(arguments: argparse.Namespace, console: Terminal) -> int:
         raise PriorError(f"{arguments.file}: {said}; if you have read it and stand for it, import it with --vouch")
     if not cfg.archive:
         raise PriorError("there is no archive to import into; set prior_gateway.archive to a folder")
-    PriorShelf(cfg.archive).put(prior, PREFERRED, verdict=said)
+    if not PriorShelf(cfg.archive).put(prior, PREFERRED, verdict=said):
+        raise PriorError(f"nothing is imported: {cfg.archive} cannot be written; set prior_gateway.archive to a folder")
     console.print(f"prior {prior.digest()} ({said}) answers {prior.task!r} in {prior.environment!r} from now on")
     return 0
 
 
 def list_all(arguments: argparse.Namespace, console: Terminal) -> int:
     """The library, then what the archive holds."""
-    table = Table("environment", "task", "regions", show_lines=True)
+    rows = table("environment", "task", "regions", show_lines=True)
     for listing in environments():
         for task, regions in listing.tasks.items():
-            table.add_row(listing.name, task, ", ".join(regions))
-    console.print(table)
+            rows.add_row(listing.name, task, ", ".join(regions))
+    console.print(rows)
     cfg = settings(arguments)
     kept = list(PriorShelf(cfg.archive).all())
     if kept:
-        table = Table(title=f"kept in {cfg.archive}")
-        table.add_column("digest", no_wrap=True)
-        for column in ("environment", "task", "from", "regions", "signature"):
-            table.add_column(column)
+        rows = table("digest", "environment", "task", "from", "regions", "signature", title=f"kept in {cfg.archive}")
+        rows.columns[0].no_wrap = True  # it is copied
         for name, entry in kept:
             prior = entry.prior
             source = prior.provenance.source + (" (in force)" if name == PREFERRED else "")
-            table.add_row(
+            rows.add_row(
                 prior.digest()[:12], prior.environment, prior.task, source, str(len(prior.regions)), entry.verdict
             )
-        console.print(table)
+        console.print(rows)
     return 0
 
 
@@ -261,8 +261,10 @@ def describe(prior: Prior, cfg: Config, console: Terminal) -> None:
 
     merit = merits(prior)
     for i, region in enumerate(prior.regions):
-        best = [j for j in np.argsort(-merit[i], kind="stable")[:5] if merit[i, j] > 0]
-        near = [j for j in np.argsort(-prior.adjacency[i], kind="stable") if j != i][:4]
+        best = [j for j in np.argsort(-merit[i], kind="stable") if merit[i, j] > 0]
+        near = [j for j in np.argsort(-prior.adjacency[i], kind="stable") if j != i]
+        held = [f"{prior.objects[j].name} {prior.containment[i, j]:.0%}" for j in best]
+        touched = [f"{prior.regions[j].name} {prior.adjacency[i, j]:.0%}" for j in near]
         share = _with_spread(region.existence, prior.spread.existence[i] if prior.spread else None)
         slope = f"{np.degrees(region.inclination_mean_rad):.0f}±{np.degrees(region.inclination_std_rad):.0f}° steep"
         zone = f", {prior.zones[i]}" if prior.zones[i] else ""
@@ -272,9 +274,13 @@ def describe(prior: Prior, cfg: Config, console: Terminal) -> None:
                 f"  {share} of the places{zone}, {slope}, r_Q {region.query_radius_m:.2f} m",
             )
         )
-        console.print("    holds " + ", ".join(f"{prior.objects[j].name} {prior.containment[i, j]:.0%}" for j in best))
-        console.print("    touches " + ", ".join(f"{prior.regions[j].name} {prior.adjacency[i, j]:.0%}" for j in near))
-        console.print("    looks like " + "; ".join(region.phrases[:3]))
+        for said, names, most, between in (
+            ("holds", held, 5, ", "),
+            ("touches", touched, 4, ", "),
+            ("looks like", region.phrases, 3, "; "),
+        ):
+            if names:
+                console.print(f"    {said} {some_of(names, most, between)}")
     if sized := [_size(item) for item in prior.objects if item.size_m is not None]:
         console.print(line(("sizes", "bold"), "  ", ", ".join(sized)))
     made = prior.provenance
@@ -286,6 +292,12 @@ def describe(prior: Prior, cfg: Config, console: Terminal) -> None:
         console.print(f"revises {made.parent_digest}{first if made.root_digest else ''}")
     if made.contributors:
         console.print(f"by what was seen by {', '.join(made.contributors)}")
+
+
+def some_of(names: Sequence[str], most: int, between: str = ", ") -> str:
+    """The first of them, and how many are left out."""
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return f"{between.join(names[:most])}{more}"
 
 
 def _with_spread(value: float, spread: float | None) -> str:

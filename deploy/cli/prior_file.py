@@ -8,7 +8,9 @@ import msgspec
 import numpy as np
 
 from prior_sg.deploy.errors import UserError
+from prior_sg.schemas.levels import Entry, LevelPrior, NamedLevel
 from prior_sg.schemas.priors import Counts, ObjectPrior, Prior, Provenance, RegionPrior, Spread
+from prior_sg.services.errors import reason_of
 
 FORMAT = "prior-sg prior 1"
 Rows = Mapping[str, Mapping[str, float]]
@@ -16,6 +18,16 @@ Rows = Mapping[str, Mapping[str, float]]
 
 class PriorError(UserError):
     """What was asked of a prior cannot be done; the message says what to do instead."""
+
+
+class LevelFile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One level above the regions; `parents` by child, which is a region or an entry of the level below."""
+
+    name: NamedLevel
+    task: str = ""
+    entries: list[Entry]
+    parents: dict[str, dict[str, float]]
+    adjacency: dict[str, dict[str, float]]
 
 
 class PriorFile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -33,6 +45,7 @@ class PriorFile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     spread: dict[str, Any] | None = None
     tested: list[float] | None = None
     tested_looks: float | None = None
+    levels: list[LevelFile] = []  # from below; files from before these were written have none
 
 
 def write(prior: Prior, path: Path) -> None:
@@ -53,6 +66,7 @@ def write(prior: Prior, path: Path) -> None:
         spread=spread,
         tested=None if prior.tested is None else prior.tested.regions.tolist(),
         tested_looks=None if prior.tested is None else prior.tested.looks,
+        levels=_level_files(prior),
     )
     try:
         path.write_bytes(msgspec.json.format(msgspec.json.encode(file), indent=1) + b"\n")
@@ -83,9 +97,10 @@ def read(path: Path) -> Prior:
             tested=None
             if file.tested is None
             else Counts(regions=np.array(file.tested, np.float32), looks=file.tested_looks),
+            levels=_levels(file.levels, regions),
         )
     except (OSError, msgspec.MsgspecError, ValueError, TypeError, OverflowError, RecursionError) as error:
-        raise PriorError(f"{path} is no usable prior: {error}") from error
+        raise PriorError(f"{path} is no usable prior: {reason_of(error)}") from error
 
 
 def existence(prior: Prior) -> Rows:
@@ -111,6 +126,36 @@ def _rows(names: list[str], columns: list[str], matrix: np.ndarray) -> dict[str,
     }
 
 
+def _level_files(prior: Prior) -> list[LevelFile]:
+    files, children = [], _regions(prior)
+    for level in prior.levels:
+        parents = _rows(children, level.names, level.parents)
+        touching = _rows(level.names, level.names, level.adjacency)
+        files.append(
+            LevelFile(name=level.name, task=level.task, entries=level.entries, parents=parents, adjacency=touching)
+        )
+        children = level.names
+    return files
+
+
+def _levels(files: list[LevelFile], children: list[str]) -> list[LevelPrior]:
+    """Of files from below, the first above these regions."""
+    levels = []
+    for file in files:
+        names = [entry.name for entry in file.entries]
+        levels.append(
+            LevelPrior(
+                name=file.name,
+                task=file.task,
+                entries=file.entries,
+                parents=_matrix(file.parents, children, names),
+                adjacency=_matrix(file.adjacency, names, names),
+            )
+        )
+        children = names
+    return levels
+
+
 def _regions(prior: Prior) -> list[str]:
     return [region.name for region in prior.regions]
 
@@ -118,6 +163,9 @@ def _regions(prior: Prior) -> list[str]:
 def _matrix(rows: Rows, names: list[str], columns: list[str]) -> np.ndarray:
     if missing := [f"{row}, {column}" for row in names for column in columns if column not in rows.get(row, {})]:
         raise ValueError(f"a matrix lacks {missing[0]}")
+    unknown = [row for row in rows if row not in names] + [c for row in names for c in rows[row] if c not in columns]
+    if unknown:
+        raise ValueError(f"a matrix has {unknown[0]!r}, which the prior does not name")
     return np.array([[rows[row][column] for column in columns] for row in names], np.float32).reshape(
         len(names), len(columns)
     )

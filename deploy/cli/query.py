@@ -2,34 +2,29 @@
 
 import argparse
 import contextlib
+import math
 import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
-from rich.table import Table
-
+from prior_sg.deploy.cli import query_tables as tables
 from prior_sg.deploy.cli.shared import Commands, add_bus, console
-from prior_sg.deploy.errors import UserError
+from prior_sg.deploy.errors import UsageError, UserError
 from prior_sg.schemas.levels import LEVELS
-from prior_sg.schemas.members import said
 
 if TYPE_CHECKING:
     from prior_sg.deploy.api.asking import Asking
     from prior_sg.deploy.api.client import Client
     from prior_sg.schemas.answers import (
-        Details,
         Difference,
         MarkerInRegion,
-        Neighbour,
         NodeWithRegions,
         Outlook,
-        RegionBeliefs,
         Route,
         Thing,
     )
     from prior_sg.schemas.foresight import MissingLabel
-    from prior_sg.schemas.members import MapMember
 
 FORMS = """\
 what to ask:
@@ -53,7 +48,8 @@ examples:
   prior-sg query near 1.0 2.0 0.5 --what region
   prior-sg query route here "dining room" --clearance 0.3"""
 WHATS = ("place", "region", "object")
-DECIMALS = 2
+T = TypeVar("T")
+Ask = Callable[["Asking"], T]  # a question that is put as it is understood
 
 
 def add_commands(commands: Commands) -> None:
@@ -88,29 +84,61 @@ def cmd_query(arguments: argparse.Namespace) -> int:
     import msgspec
 
     from prior_sg.deploy.api.errors import NotInSceneError
+    from prior_sg.deploy.api.listed import CutWarning
+    from prior_sg.schemas.queries import MOST_ASKED
 
-    if arguments.limit < 1:
-        raise UserError("--limit must be at least 1")
+    if not 1 <= arguments.limit <= MOST_ASKED:
+        raise UsageError(f"--limit must be at least 1, and at most {MOST_ASKED}")
+    if not 0 <= arguments.clearance < math.inf:
+        raise UsageError(
+            "--clearance is in metres, from 0 on, such as `prior-sg query route here hall --clearance 0.3`"
+        )
     if arguments.object:
         arguments.what, arguments.label = "object", arguments.object
     word, *rest = arguments.words
-    run, show = ASKED.get(word, FOUND) if rest else (ASKED | ALONE).get(word, FOUND)
+    question, show = ASKED.get(word, FOUND) if rest else (ASKED | ALONE).get(word, FOUND)
+    ask = question(arguments, rest if question is not _find else arguments.words)
     try:
         with warnings.catch_warnings(record=True) as said, _opened(arguments) as scene:
             warnings.simplefilter("always", UserWarning)
+            warnings.simplefilter("ignore", CutWarning)  # said in words of the command
             if arguments.scene is None:
                 _require_some(scene)
-            found = run(scene, arguments, rest if run is not _find else arguments.words)
-    except (NotInSceneError, ValueError) as error:  # the latter of what no question may hold
+            found = ask(scene)
+    except NotInSceneError as error:
         raise UserError(str(error)) from error
-    notes = [str(warning.message) for warning in said]
+    except ValueError as error:  # of what no question may hold
+        raise UsageError(str(error)) from error
+    notes, left_out = [str(warning.message) for warning in said], _left_out(found)
     if arguments.json:
-        print(msgspec.json.encode({"answer": found, "notes": notes}).decode())
+        print(msgspec.json.encode({"answer": found, "notes": notes + left_out}).decode())
         return 0
     for note in notes:
         console.print(f"note: {note}")
     show(found)
+    for note in left_out:
+        console.print(note)
     return 0
+
+
+def _left_out(found: Any) -> list[str]:
+    """How much is not listed, and how to get it; nothing where all is."""
+    from prior_sg.deploy.api.listed import Listed
+    from prior_sg.schemas.answers import Outlook, listed_of
+    from prior_sg.schemas.queries import MOST_ASKED
+
+    rows: Sequence[Any]
+    match found:
+        case Listed():
+            rows, total, more = found, found.total, "more"
+        case {"beliefs": beliefs}:
+            rows, total, more = *listed_of(beliefs), "more labels"
+        case Outlook():
+            rows, total, more = *listed_of(found), "more openings"
+        case _:
+            return []
+    how = f"--limit {total} lists all" if total <= MOST_ASKED else f"--limit {MOST_ASKED} lists most"
+    return [f"and {total - len(rows)} {more}: {how}"] if total > len(rows) else []
 
 
 def _opened(arguments: argparse.Namespace) -> Any:
@@ -135,233 +163,124 @@ def _require_some(client: "Client") -> None:
         )
 
 
-def _find(scene: "Asking", arguments: argparse.Namespace, words: Sequence[str]) -> "list[Thing]":
-    return scene.find(" ".join(words), arguments.what, arguments.limit)
+def _find(arguments: argparse.Namespace, words: Sequence[str]) -> "Ask[list[Thing]]":
+    text = _name(words, '"SENTENCE"', '"somewhere to sit"')
+    return lambda scene: scene.find(text, arguments.what, arguments.limit)
 
 
-def _near(scene: "Asking", arguments: argparse.Namespace, words: Sequence[str]) -> "list[Thing]":
-    point = _numbers(words, 3, "near X Y Z")
-    return scene.near(point, arguments.limit, arguments.what or "object", arguments.label)
+def _near(arguments: argparse.Namespace, words: Sequence[str]) -> "Ask[list[Thing]]":
+    point = _numbers(words, 3, "near X Y Z", "near 1.0 2.0 0.5")
+    return lambda scene: scene.near(point, arguments.limit, arguments.what or "object", arguments.label)
 
 
-def _within(scene: "Asking", arguments: argparse.Namespace, words: Sequence[str]) -> "list[Thing]":
-    *point, radius_m = _numbers(words, 4, "within X Y Z RADIUS")
-    return scene.within(point, radius_m, arguments.what, arguments.label, arguments.limit)
+def _within(arguments: argparse.Namespace, words: Sequence[str]) -> "Ask[list[Thing]]":
+    *point, radius_m = _numbers(words, 4, "within X Y Z RADIUS", "within 1.0 2.0 0.5 3.0")
+    return lambda scene: scene.within(point, radius_m, arguments.what, arguments.label, arguments.limit)
 
 
-def _in_box(scene: "Asking", arguments: argparse.Namespace, words: Sequence[str]) -> "list[Thing]":
-    corners = _numbers(words, 6, "in-box X Y Z X Y Z")
-    return scene.in_box(corners[:3], corners[3:], arguments.what, arguments.label, arguments.limit)
+def _in_box(arguments: argparse.Namespace, words: Sequence[str]) -> "Ask[list[Thing]]":
+    corners = _numbers(words, 6, "in-box X Y Z X Y Z", "in-box 0 0 0 4.0 3.0 2.5")
+    return lambda scene: scene.in_box(corners[:3], corners[3:], arguments.what, arguments.label, arguments.limit)
 
 
-def _label(scene: "Asking", arguments: argparse.Namespace, words: Sequence[str]) -> "list[Thing]":
-    return scene.labelled(" ".join(words), arguments.what, arguments.limit)
+def _label(arguments: argparse.Namespace, words: Sequence[str]) -> "Ask[list[Thing]]":
+    label = _name(words, "label LABEL", "label kitchen")
+    return lambda scene: scene.labelled(label, arguments.what, arguments.limit)
 
 
-def _objects(scene: "Asking", arguments: argparse.Namespace, words: Sequence[str]) -> "list[Thing]":
+def _objects(arguments: argparse.Namespace, words: Sequence[str]) -> "Ask[list[Thing]]":
     at = words.index("in") if "in" in words else len(words)
-    return scene.objects_in(" ".join(words[at + 1 :]), " ".join(words[:at]) or arguments.label, arguments.limit)
+    region = _name(words[at + 1 :], "objects LABEL in REGION", "objects chair in kitchen") if at < len(words) else ""
+    return lambda scene: scene.objects_in(region, " ".join(words[:at]) or arguments.label, arguments.limit)
 
 
-def _one(scene: "Asking", arguments: argparse.Namespace, words: Sequence[str]) -> "dict[str, Any]":
+def _one(arguments: argparse.Namespace, words: Sequence[str]) -> "Ask[dict[str, Any]]":
     what: Any = arguments.words[0]
     number = _id(words, f"{what} 7")
-    found: dict[str, Any] = {"details": scene.describe(what, number), "neighbours": scene.neighbours(what, number)}
-    return found | ({"beliefs": scene.candidates(number, arguments.limit)} if what == "region" else {})
+
+    def ask(scene: "Asking") -> "dict[str, Any]":
+        found: dict[str, Any] = {"details": scene.describe(what, number), "neighbours": scene.neighbours(what, number)}
+        return found | ({"beliefs": scene.candidates(number, arguments.limit)} if what == "region" else {})
+
+    return ask
 
 
-def _levels(scene: "Asking", arguments: argparse.Namespace, words: Sequence[str]) -> "list[NodeWithRegions]":
+def _levels(arguments: argparse.Namespace, words: Sequence[str]) -> "Ask[list[NodeWithRegions]]":
     level, *label = words or ("",)
     if level not in LEVELS:
-        raise UserError(f"name a level: {', '.join(LEVELS)}; such as `prior-sg query level zone ward`")
-    return scene.levels(level, " ".join(label) or arguments.label, limit=arguments.limit)
+        raise _misput(f"level {'|'.join(LEVELS)}", "level zone ward")
+    return lambda scene: scene.levels(level, " ".join(label) or arguments.label, limit=arguments.limit)
 
 
-def _markers(scene: "Asking", arguments: argparse.Namespace, words: Sequence[str]) -> "list[MarkerInRegion]":
-    return scene.markers(_id(words, "marker 7") if words else None, limit=arguments.limit)
+def _markers(arguments: argparse.Namespace, words: Sequence[str]) -> "Ask[list[MarkerInRegion]]":
+    number = _id(words, "marker 7") if words else None
+    return lambda scene: scene.markers(number, limit=arguments.limit)
 
 
-def _route(scene: "Asking", arguments: argparse.Namespace, words: Sequence[str]) -> "Route":
+def _route(arguments: argparse.Namespace, words: Sequence[str]) -> "Ask[Route]":
     if len(words) != 2:
-        raise UserError("a route needs two ends: prior-sg query route kitchen bedroom (quote names of several words)")
-    return scene.route(words[0], words[1], arguments.clearance)
+        raise _misput("route FROM TO", "route kitchen 'dining room'")
+    return lambda scene: scene.route(words[0], words[1], arguments.clearance)
 
 
-def _unseen(scene: "Asking", arguments: argparse.Namespace, words: Sequence[str]) -> "Outlook":
-    return scene.where_to_look(" ".join(words), arguments.start, arguments.clearance, arguments.limit)
+def _unseen(arguments: argparse.Namespace, words: Sequence[str]) -> "Ask[Outlook]":
+    label = _name(words, "unseen LABEL", "unseen bathroom")
+    return lambda scene: scene.where_to_look(label, arguments.start, arguments.clearance, arguments.limit)
 
 
-def _missing(scene: "Asking", arguments: argparse.Namespace, words: Sequence[str]) -> "list[MissingLabel]":
-    return scene.missing(arguments.limit)
+def _missing(arguments: argparse.Namespace, words: Sequence[str]) -> "Ask[list[MissingLabel]]":
+    return lambda scene: scene.missing(arguments.limit)
 
 
-def _changed(scene: "Asking", arguments: argparse.Namespace, words: Sequence[str]) -> "Difference":
-    from prior_sg.deploy.api.client import Client
+def _changed(arguments: argparse.Namespace, words: Sequence[str]) -> "Ask[Difference]":
+    revision = _id(words, "changed 120")
+    if arguments.scene is not None:
+        raise UsageError("a saved scene is of one revision; ask the running store, without --scene")
+    return lambda scene: cast("Client", scene).changed_since(revision)
 
-    if not isinstance(scene, Client):
-        raise UserError("a saved scene is of one revision; ask the running store, without --scene")
-    return scene.changed_since(_id(words, "changed 120"))
+
+def _misput(form: str, example: str) -> UsageError:
+    """That a question is not put as it is understood."""
+    return UsageError(f"say `{form}`, such as `prior-sg query {example}`; a sentence goes in quotes")
 
 
-def _numbers(words: Sequence[str], count: int, form: str) -> list[float]:
+def _name(words: Sequence[str], form: str, example: str) -> str:
+    if not (name := " ".join(words).strip()):
+        raise _misput(form, example)
+    return name
+
+
+def _numbers(words: Sequence[str], count: int, form: str, example: str) -> list[float]:
     try:
         numbers = [float(word) for word in words]
     except ValueError:
         numbers = []
     if len(numbers) != count:
-        raise UserError(f"say `{form}` in metres of the world, or put a sentence in quotes; see prior-sg query --help")
+        raise _misput(form, example)
     return numbers
 
 
 def _id(words: Sequence[str], example: str) -> int:
     if len(words) != 1 or not words[0].removeprefix("-").isdecimal():
-        raise UserError(f"name one number, such as `prior-sg query {example}`, or put a sentence in quotes")
+        raise _misput(f"{example.split(maxsplit=1)[0]} NUMBER", example)
     return int(words[0])
 
 
-def _show_things(things: "Sequence[Thing]") -> None:
-    """One row each, with the columns that this question fills."""
-    if not things:
-        console.print("nothing")
-        return
-    extra = [name for name in ("score", "distance_m") if getattr(things[0], name) is not None]
-    table = Table(
-        *(name.removesuffix("_m") for name in extra), "what", "id", "label", "probability", "region", "position m"
-    )
-    for one in things:
-        label = f"{one.label or '(no label)'}{' (predicted)' if one.predicted else ''}"
-        region = "-" if one.region < 0 or one.what == "region" else str(one.region)
-        values = [f"{getattr(one, name):.{DECIMALS}f}" for name in extra]
-        table.add_row(*values, one.what, str(one.id), label, f"{one.probability:.2f}", region, _at(one.position_m))
-    console.print(table)
-
-
-def _show_levels(found: "Sequence[NodeWithRegions]") -> None:
-    table = Table("level", "id", "label", "probability", "area m²", "regions")
-    for one in found:
-        node, regions = one.node, ", ".join(f"{region.label} {region.id}" for region in one.regions)
-        table.add_row(node.level, str(node.id), node.label, f"{node.probability:.2f}", f"{node.area_m2:.1f}", regions)
-    console.print(table)
-
-
-def _show_one(found: "dict[str, Any]") -> None:
-    details: Details = found["details"]
-    neighbours: list[Neighbour] = found["neighbours"]
-    if details.thing is not None:
-        _show_things([details.thing])
-    if details.region is not None:
-        region = details.region
-        objects = f"objects {', '.join(map(str, region.object_ids))}" if region.object_ids else "no objects"
-        console.print(f"{region.place_count} places, {region.area_m2:.1f} m², {objects}{_made_of(region.members)}")
-        _show_beliefs(found["beliefs"])
-    if details.place is not None:
-        place = details.place
-        beliefs = ", ".join(f"{one.label} {one.probability:.2f}" for one in place.beliefs)
-        console.print(f"radius {place.radius_m:.2f} m, unknown {place.unknown:.2f}; {beliefs}")
-    if details.object is not None:
-        low, high = _at(details.object.min_m), _at(details.object.max_m)
-        console.print(
-            f"box from {low} to {high}, seen in {details.object.frames} keyframes{_made_of(details.object.members)}"
-        )
-    for one in neighbours:
-        doors = f", {sum(way.door for way in one.ways)} doors of {len(one.ways)} ways" if one.ways else ""
-        length = f", {one.length_m:.2f} m" if one.length_m else ""
-        clearance = f", clearance {one.clearance_m:.2f} m" if one.clearance_m else ""
-        console.print(f"beside {one.thing.what} {one.thing.id} {one.thing.label}{length}{clearance}{doors}")
-
-
-def _show_markers(found: "list[MarkerInRegion]") -> None:
-    for one in found:
-        marker, region = one.marker, one.region
-        where = "in no region" if region is None else f"in {region.label} (region {region.id})"
-        doubt = f"; in doubt: {marker.doubt}" if marker.doubt else ""
-        console.print(f"{marker.key} at {_at(marker.position_m)} {where}, from {marker.frames} keyframes{doubt}")
-
-
-def _made_of(members: "Sequence[MapMember]") -> str:
-    return f"; made of {', '.join(map(said, members))}" if members else ""
-
-
-def _show_beliefs(found: "RegionBeliefs") -> None:
-    table = Table("label", "probability")
-    for one in found.beliefs:
-        table.add_row(one.label, f"{one.probability:.2f}")
-    console.print(table)
-    console.print(f"unknown {found.unknown:.2f}; {found.predicted_share:.0%} of {found.places} places predicted")
-
-
-def _show_route(found: "Route") -> None:
-    if not found.found:
-        console.print(found.reason)
-        return
-    gaps = f"; {found.start_gap_m:.2f} m from the start, {found.goal_gap_m:.2f} m from the goal"
-    console.print(
-        f"{found.length_m:.2f} m over {len(found.place_ids)} places, clearance {found.clearance_m:.2f} m{gaps}"
-    )
-    console.print("through " + (" → ".join(f"{one.label} {one.id}" for one in found.regions) or "no region"))
-    table = Table("place", "position m")
-    for number, point_m in zip(found.place_ids, found.waypoints_m, strict=True):
-        table.add_row(str(number), _at(point_m))
-    console.print(table)
-
-
-def _show_outlook(found: "Outlook") -> None:
-    if found.found:
-        console.print(f"seen already: {', '.join(f'{one.label} {one.id}' for one in found.found)}")
-    console.print(f"another {found.label} behind any opening: {found.probability:.2f} (predicted)")
-    table = Table("expected m", "probability", "way m", "place", "width m", "out of", "beyond m")
-    for one in found.prospects:
-        opening = one.opening
-        figures = (f"{one.expected_m:.1f}", f"{one.probability:.3f}", f"{one.way_m:.1f}", str(opening.place_id))
-        table.add_row(*figures, f"{opening.width_m:.1f}", f"region {opening.region}", _at(opening.beyond_m))
-    console.print(table)
-    why = next(entry for entry in found.prospects[0].opening.labels if entry.label == found.label)
-    told = (
-        f"adjacency {why.adjacency:.2f}, existence {why.existence:.2f}, {why.found} found, {why.met} such borders met"
-    )
-    console.print(f"why the first: {told}")
-    if found.route is not None:
-        _show_route(found.route)
-
-
-def _show_missing(found: "list[MissingLabel]") -> None:
-    table = Table("label", "probability (predicted)", "found so far")
-    for one in found:
-        table.add_row(one.label, f"{one.probability:.2f}", str(one.found))
-    console.print(table if found else "nothing")
-
-
-def _show_difference(found: "Difference") -> None:
-    for title, things in (("appeared", found.appeared), ("gone", found.gone)):
-        if things:
-            console.print(title)
-            _show_things(things)
-    for one in found.renamed:
-        console.print(f"{one.thing.what} {one.thing.id}: {one.former_label or '(no label)'} → {one.thing.label}")
-    console.print(
-        f"places: {found.places_appeared} new, {found.places_gone} gone, {found.places_relabelled} with another label"
-    )
-
-
-def _at(point_m: Sequence[float]) -> str:
-    return " ".join(f"{value:.{DECIMALS}f}" for value in point_m)
-
-
-Asked = tuple[Callable[["Asking", argparse.Namespace, Sequence[str]], Any], Callable[[Any], None]]
+Asked = tuple[Callable[[argparse.Namespace, Sequence[str]], "Ask[Any]"], Callable[[Any], None]]
 ASKED: dict[str, Asked] = {  # by first word; whatever else is a sentence
-    "near": (_near, _show_things),
-    "within": (_within, _show_things),
-    "in-box": (_in_box, _show_things),
-    "label": (_label, _show_things),
-    "objects": (_objects, _show_things),
-    "level": (_levels, _show_levels),
-    "region": (_one, _show_one),
-    "place": (_one, _show_one),
-    "object": (_one, _show_one),
-    "marker": (_markers, _show_markers),
-    "route": (_route, _show_route),
-    "unseen": (_unseen, _show_outlook),
-    "changed": (_changed, _show_difference),
+    "near": (_near, tables.show_things),
+    "within": (_within, tables.show_things),
+    "in-box": (_in_box, tables.show_things),
+    "label": (_label, tables.show_things),
+    "objects": (_objects, tables.show_things),
+    "level": (_levels, tables.show_levels),
+    "region": (_one, tables.show_one),
+    "place": (_one, tables.show_one),
+    "object": (_one, tables.show_one),
+    "marker": (_markers, tables.show_markers),
+    "route": (_route, tables.show_route),
+    "unseen": (_unseen, tables.show_outlook),
+    "changed": (_changed, tables.show_difference),
 }
-FOUND: Asked = (_find, _show_things)
-ALONE: dict[str, Asked] = {"missing": (_missing, _show_missing)}  # words that ask by themselves, and begin sentences
+FOUND: Asked = (_find, tables.show_things)
+ALONE: dict[str, Asked] = {"missing": (_missing, tables.show_missing)}  # with more words it begins a sentence

@@ -10,6 +10,7 @@ from prior_sg.deploy.cli.ros_results import add_results
 from prior_sg.deploy.cli.shared import Commands, console
 from prior_sg.deploy.errors import UserError
 from prior_sg.deploy.json_text import json_text
+from prior_sg.deploy.terminal import table
 
 if TYPE_CHECKING:
     from prior_sg.services.ingest.core.ros.topics import Topic
@@ -73,12 +74,12 @@ def _heard(arguments: argparse.Namespace) -> "list[Topic]":
 
 
 def _table(topics: "list[Topic]") -> Table:
-    table = Table("topic", "type", "messages", "per second", "frame", "serves as")
+    rows = table("topic", "type", "messages", "per second", "frame", "serves as")
     for topic in topics:
         serves = " ".join(filter(None, (topic.taken_for or "-", f"({topic.encoding})" if topic.encoding else "")))
         rate = f"{topic.rate_hz:.1f}" if topic.rate_hz else "-"
-        table.add_row(topic.name, topic.type, str(topic.count), rate, topic.frame, serves)
-    return table
+        rows.add_row(topic.name, topic.type, str(topic.count), rate, topic.frame, serves)
+    return rows
 
 
 def _as_builtins(topic: "Topic") -> dict:

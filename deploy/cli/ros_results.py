@@ -5,7 +5,7 @@ from pathlib import Path
 
 from prior_sg.deploy.cli.shared import Commands, add_bus, console, until_interrupted, writing
 from prior_sg.deploy.cli.source_options import source_option
-from prior_sg.deploy.errors import UserError
+from prior_sg.deploy.errors import UsageError
 from prior_sg.deploy.ros.options import add_options, options_of
 from prior_sg.deploy.ros.rules import Look
 from prior_sg.services.runtime import extras
@@ -41,10 +41,10 @@ def add_ros(up: argparse.ArgumentParser) -> None:
 
 
 def check_ros(arguments: argparse.Namespace) -> None:
-    """That the bridge of `up` can be. Raises UserError, ExtraMissing."""
+    """That the bridge of `up` can be. Raises UsageError, ExtraMissing."""
     extras.require("ros", "prior-sg up --ros")
     if arguments.ros in ("", arguments.connect) and (arguments.listen or arguments.join):
-        raise UserError(
+        raise UsageError(
             "a router with --listen or --join passes on nothing of ROS: start another for ROS (`ros2 run rmw_zenoh_cpp "
             "rmw_zenohd`) and name it, as in --ros tcp/127.0.0.1:7448"
         )

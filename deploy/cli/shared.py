@@ -8,7 +8,7 @@ import re
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from prior_sg.deploy.errors import UserError
 from prior_sg.deploy.interrupts import insist
@@ -23,13 +23,23 @@ if TYPE_CHECKING:
     from prior_sg.services.runtime.keys import Beyond
 
 POLL_S = 0.2
+LONGEST_COMPLAINT = 1500  # characters of what is wrong with an argument; there are names of all commands
 console = Terminal()
 
 Run = Callable[[argparse.Namespace], int]  # does what a command was told; its exit status
 
 
 class Parser(argparse.ArgumentParser):
-    """What it says of an argument is fit for a terminal."""
+    """What it says of an argument is one sentence, fit for a terminal, that ends in an example."""
+
+    def __init__(self, *given: Any, example: str = "", **named: Any) -> None:
+        super().__init__(*given, **named)
+        self._example = example
+
+    def error(self, message: str) -> NoReturn:
+        """End with status 2."""
+        short = message if len(message) <= LONGEST_COMPLAINT else f"{message[:LONGEST_COMPLAINT]}…"
+        self.exit(2, f"{self.prog}: error: {short}; such as `{self._example}` (see {self.prog} --help)\n")
 
     def _print_message(self, message: str, file: "SupportsWrite[str] | None" = None) -> None:
         super()._print_message(shown(message), file)
@@ -53,7 +63,7 @@ class Commands:
 
 def with_example(text: str) -> dict:
     """Arguments of a parser whose help ends in an example."""
-    return {"epilog": f"example: {text}", "formatter_class": argparse.RawDescriptionHelpFormatter}
+    return {"example": text, "epilog": f"example: {text}", "formatter_class": argparse.RawDescriptionHelpFormatter}
 
 
 def add_bus(parser: argparse.ArgumentParser, robot: bool = True) -> None:
@@ -111,9 +121,12 @@ def add_log_mb(parser: argparse.ArgumentParser) -> None:
 
 
 def _not_negative(text: str) -> float:
-    number = float(text)
+    try:
+        number = float(text)
+    except ValueError:
+        number = -1.0
     if not 0 <= number < math.inf:
-        raise argparse.ArgumentTypeError("must be a number from 0 on")
+        raise argparse.ArgumentTypeError(f"{text!r} is no number from 0 on")
     return number
 
 

@@ -9,6 +9,7 @@ from prior_sg.deploy.settings import resolved_config
 
 if TYPE_CHECKING:
     from prior_sg.services.ingest.core.config import Config
+    from prior_sg.services.place_graph.core.config import Config as PlaceGraphConfig
 
 GROUP = "how the source is read, where its files do not say or say it wrongly"
 
@@ -150,6 +151,14 @@ def read_options(arguments: argparse.Namespace) -> "Config":
 
     config, settings = getattr(arguments, "config", "") or "", getattr(arguments, "set", None) or []
     return resolved_config(BY_NAME["ingest"], config, [*source_settings(arguments), *settings])
+
+
+def mapping_options(arguments: argparse.Namespace) -> "PlaceGraphConfig":
+    """What `--config` and `--set` say of the place graph. Raises ConfigError."""
+    from prior_sg.services.registry import BY_NAME
+
+    config, settings = getattr(arguments, "config", "") or "", getattr(arguments, "set", None) or []
+    return resolved_config(BY_NAME["place_graph"], config, settings)
 
 
 def _value(option: Option, text: str) -> str:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from rich.table import Table
 
 from prior_sg.deploy.cli.shared import Commands, add_bus, add_log_mb, console, hush_logs, open_client
-from prior_sg.deploy.errors import UserError
+from prior_sg.deploy.errors import UsageError, UserError
 from prior_sg.deploy.evaluation import command as evaluation
 from prior_sg.deploy.evaluation import tune_command as tuning
 from prior_sg.deploy.terminal import Part, line
@@ -20,6 +20,9 @@ from prior_sg.services.errors import PriorSgError
 if TYPE_CHECKING:
     from prior_sg.deploy.inspecting.health import Found
     from prior_sg.schemas.status import TopicCount
+
+
+MOST_DIFFERENCES = 20  # of one life, listed
 
 
 def add_commands(commands: Commands) -> None:
@@ -213,7 +216,7 @@ def cmd_replay(arguments: argparse.Namespace) -> int:
     from prior_sg.services.registry import BY_NAME
 
     if arguments.service not in BY_NAME:
-        raise UserError(f"there is no service {arguments.service!r}; known: {', '.join(BY_NAME)}")
+        raise UsageError(f"there is no service {arguments.service!r}; known: {', '.join(BY_NAME)}")
     log = replay.open_log(arguments.log, arguments.service)
     differences = 0
     for life in log.lives:
@@ -221,8 +224,11 @@ def cmd_replay(arguments: argparse.Namespace) -> int:
         console.print(
             f"{found.instance}: {found.inputs} inputs, {found.recorded} outputs recorded, {found.outputs} made"
         )
-        for text in found.differences[:20] if arguments.diff else []:
+        listed = found.differences[:MOST_DIFFERENCES] if arguments.diff else []
+        for text in listed:
             console.print(f"  {text}")
+        if listed and len(found.differences) > len(listed):
+            console.print(f"  and {len(found.differences) - len(listed)} more")
         differences += len(found.differences)
     if arguments.service == "scene_store":
         text = report.final_scene_difference(log, arguments.log)
@@ -321,16 +327,16 @@ def cmd_bench(arguments: argparse.Namespace) -> int:
     from prior_sg.deploy.evaluation.datasets import seeds_of
 
     if arguments.name not in (*bench.BENCHES, *bench.LONG, "all"):
-        raise UserError(
+        raise UsageError(
             f"there is no measurement {arguments.name!r}; known: {', '.join((*bench.BENCHES, *bench.LONG))}, all"
         )
     for option, takers in bench.TAKERS.items():
         if getattr(arguments, option) and arguments.name not in takers:
-            raise UserError(f"--{option} is of the measurements {', '.join(takers)}, not of {arguments.name}")
+            raise UsageError(f"--{option} is of the measurements {', '.join(takers)}, not of {arguments.name}")
     hush_logs()
     seeds = seeds_of(arguments.seeds)
     if arguments.seeds and not seeds:
-        raise UserError(f"--seeds {arguments.seeds} names no seeds: write 3, 0-9 or 1,4,7")
+        raise UsageError(f"--seeds {arguments.seeds} names no seeds: write 3, 0-9 or 1,4,7")
     for name in bench.BENCHES if arguments.name == "all" else [arguments.name]:
         with console.status(f"measuring {name}") as status:
             asked = bench.Asked(

@@ -4,7 +4,7 @@ import argparse
 from typing import TYPE_CHECKING
 
 from prior_sg.deploy.cli.shared import Commands, add_bus, console, until_interrupted, wait
-from prior_sg.deploy.errors import UserError
+from prior_sg.deploy.errors import UsageError
 from prior_sg.deploy.settings import ROUTER_WAIT_S
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ def cmd_view(arguments: argparse.Namespace) -> int:
     from prior_sg.deploy.viewing.page import Options, Page
 
     if arguments.host not in LOOPBACK:
-        raise UserError(
+        raise UsageError(
             f"the page has no login, so it is served to this machine alone, not on {arguments.host}; from elsewhere, "
             f"open a tunnel: ssh -L {arguments.port}:127.0.0.1:{arguments.port} USER@THIS-MACHINE"
         )

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from prior_sg.deploy.cli.doors import add_entrance, port_in, say_until
 from prior_sg.deploy.cli.shared import Commands, add_bus, console, open_client, until_interrupted
-from prior_sg.deploy.errors import UserError
+from prior_sg.deploy.errors import UsageError, UserError
 from prior_sg.services.runtime import extras
 
 if TYPE_CHECKING:
@@ -71,7 +71,7 @@ def check_metrics(arguments: argparse.Namespace) -> None:
     """That what `up` is told about metrics can be done. Raises UserError, ExtraMissing."""
     if arguments.metrics is None:
         if arguments.trace is not None:
-            raise UserError("traces are sent by the process that serves metrics: add --metrics")
+            raise UsageError("traces are sent by the process that serves metrics: add --metrics")
         return
     extras.require("ops", "prior-sg up --metrics")
     if arguments.trace is not None:

@@ -28,6 +28,7 @@ from prior_sg.schemas.topics import DETECTIONS, KEYFRAME, PLACE_DELTA, PLACE_SNA
 from prior_sg.services.feature_pyramid.core.crops import smallest_crop_px
 from prior_sg.services.feature_pyramid.detectors.load import is_prompted, load_detector
 from prior_sg.services.feature_pyramid.worker import Worker
+from prior_sg.services.place_graph.core.config import AT_ONCE
 from prior_sg.services.registry import BY_NAME
 from prior_sg.services.runtime.config import resolve
 from prior_sg.services.runtime.runner import Runner
@@ -192,8 +193,8 @@ class Perceiver:
         return self._walk(dataset, self.mapping(dataset))[-2:]
 
     def _walk(self, dataset: Dataset, cfg: Any) -> list[bytes]:
-        """The deltas of all keyframes, then the whole place graph, then the map."""
-        runner = self._runner("place_graph", cfg)
+        """The deltas of all keyframes, one for each, then the whole place graph, then the map."""
+        runner = self._runner("place_graph", msgspec.structs.replace(cfg, slice_blocks=AT_ONCE))
         published = (output for keyframe in self._keyframes(dataset, "places") for output in runner.feed(keyframe))
         deltas = [encode(message) for topic, message in published if topic is PLACE_DELTA]
         requests = ((PLACE_SNAPSHOT, SnapshotRequest(robot=ROBOT)), (VOXEL_MAP, MapRequest(robot=ROBOT)))

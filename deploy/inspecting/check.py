@@ -10,6 +10,8 @@ import msgspec
 import numpy as np
 
 from prior_sg.deploy.inspecting.beside import Beside, truth_beside
+from prior_sg.deploy.inspecting.following import Following
+from prior_sg.schemas.frames import Keyframe
 from prior_sg.services.ingest.core import selection
 from prior_sg.services.ingest.core.config import Config
 from prior_sg.services.ingest.core.frames import BadFrame, RawFrame
@@ -18,6 +20,7 @@ from prior_sg.services.ingest.core.inspection.conventions import FROM_CAMERA
 from prior_sg.services.ingest.core.inspection.findings import note, ok, problem
 from prior_sg.services.ingest.sources import Source
 from prior_sg.services.losses import kind_of
+from prior_sg.services.place_graph.core.config import Config as PlaceGraphConfig
 
 PAIRS, LIMIT_S = 40, 3.5
 BRIEF_PAIRS, BRIEF_FRAMES, BRIEF_LIMIT_S = 6, 60, 0.8
@@ -49,14 +52,24 @@ class Report:
         return next(verdict for verdict in ("problem", "note", "ok") if verdict in verdicts | {"ok"})
 
 
-def check(source: Source, cfg: Config, *, brief: bool = False, progress: Progress = lambda done, total: None) -> Report:
-    """Everything that a sample of the source tells; `brief` looks at its beginning only, in about a second."""
+def check(
+    source: Source,
+    cfg: Config,
+    *,
+    mapping: PlaceGraphConfig | None = None,
+    brief: bool = False,
+    progress: Progress = lambda done, total: None,
+) -> Report:
+    """Everything that a sample of the source tells; `brief` looks at its beginning only, in about a second.
+    `mapping` is how the place graph will map it, None = as it does by itself."""
     started_s = time.monotonic()
-    recording = look(source, cfg, brief=brief, progress=progress)
+    following = Following(mapping or PlaceGraphConfig())
+    recording = look(source, cfg, following, brief=brief, progress=progress)
     beside = truth_beside(source)
     findings = [
         *_read_as(source),
         *inspect(recording, reading_of(source), thorough=not brief),
+        *following.findings(),
         *beside.findings,
     ]
     return Report(
@@ -81,9 +94,15 @@ def unseen(path: str) -> Report:
 
 
 def look(
-    source: Source, cfg: Config, *, brief: bool = False, progress: Progress = lambda done, total: None
+    source: Source,
+    cfg: Config,
+    following: Following,
+    *,
+    brief: bool = False,
+    progress: Progress = lambda done, total: None,
 ) -> Recording:
-    """Read a source: every stamp and pose, and some images; what the time does not suffice for is left out."""
+    """Read a source: every stamp and pose, and some images; what the time does not suffice for is left out.
+    `following` sees the keyframes."""
     end_s = time.monotonic() + (BRIEF_LIMIT_S if brief else LIMIT_S)
     recording = Recording(source.total, source.depth_unit_m)
     state = selection.State(robot="sample")  # nobody reads what it would publish
@@ -97,7 +116,7 @@ def look(
             recording.unreadable[kind_of(frame.reason)] += 1
         else:
             _remember(recording, frame)
-            _select(recording, state, frame, cfg)
+            _select(recording, state, frame, cfg, following)
             if frame.depth if source.thinned else wants(frame.index, recording.world_from_camera[-1]):
                 _decode(recording, frame, with_color=not brief and len(recording.shots) % color_every == 0)
         progress(recording.read, frames)
@@ -149,7 +168,7 @@ def _remember(recording: Recording, frame: RawFrame) -> None:
     recording.world_from_camera.append(np.array(frame.world_from_camera))
 
 
-def _select(recording: Recording, state: selection.State, frame: RawFrame, cfg: Config) -> None:
+def _select(recording: Recording, state: selection.State, frame: RawFrame, cfg: Config, following: Following) -> None:
     """Let the selection see the frame, as it will in the run."""
     bare = msgspec.structs.replace(frame, color=b"", depth=b"", mask=b"")
     verdict = selection.judge(state, bare, cfg)
@@ -157,7 +176,9 @@ def _select(recording: Recording, state: selection.State, frame: RawFrame, cfg: 
         recording.refused[kind_of(held.refusal.text)] += 1
         deque(selection.refuse(state, held), 0)
     for accepted in verdict.accepted:
-        deque(selection.accept(state, accepted, cfg), 0)
+        for _, message in selection.accept(state, accepted, cfg):
+            if isinstance(message, Keyframe):
+                following.see(message)
     recording.keyframes = state.keyframes
 
 

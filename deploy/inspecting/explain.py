@@ -80,6 +80,8 @@ def label_table(reply: PosteriorReply) -> Table:
         costs = [column[row] for column in sources.values()]
         cells = (f"{reply.posterior[row]:.3f}", *(f"{cost:.2f}" for cost in costs), f"{sum(costs):.2f}")
         table.add_row(reply.labels[row], *cells)
+    if len(reply.labels) > ROWS:
+        table.caption = f"and {len(reply.labels) - ROWS} less probable labels"
     return table
 
 

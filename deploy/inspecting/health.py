@@ -137,9 +137,15 @@ def _unheard(one: OnTheRoll) -> str:
 
 def _hanging(found: Found) -> Iterator[Remark]:
     for one in found.processes:
-        if one.step_s > LONG_STEP_S:
+        if one.step_compiling_s > LONG_STEP_S:
             yield Remark(
-                f"{one.instance} (pid {one.pid}) has been at one input for {one.step_s:.0f} s, {one.backlog} wait: if "
+                f"{one.instance} has compiled inner loops for {one.step_compiling_s:.0f} s, as a first run does, and "
+                f"{one.backlog} inputs wait: it goes on by itself; `prior-sg warm` compiles them ahead of time",
+                False,
+            )
+        if (step_s := one.step_s - one.step_compiling_s) > LONG_STEP_S:
+            yield Remark(
+                f"{one.instance} (pid {one.pid}) has been at one input for {step_s:.0f} s, {one.backlog} wait: if "
                 f"that goes on, `kill -9 {one.pid}` there, and `prior-sg up` starts it again",
                 True,
                 "PriorSgStepHangs",

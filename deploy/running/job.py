@@ -22,6 +22,7 @@ from prior_sg.deploy.interrupts import came
 from prior_sg.deploy.limits import fault_of_files, files_allowed
 from prior_sg.deploy.running.inprocess import InProcess
 from prior_sg.deploy.running.recorder import Recorder, Settling
+from prior_sg.deploy.running.standstill import STALL_AFTER_S, Standstill
 from prior_sg.deploy.running.supervisor import Supervisor
 from prior_sg.deploy.settings import DEFAULT_CONNECT, DEFAULT_ROBOT, check_settings
 from prior_sg.deploy.terminal import Description, Terminal
@@ -48,7 +49,6 @@ QUIET_S = 1.5
 START_TIMEOUT_S = 180.0
 PRIOR_TIMEOUT_S = 900.0  # a model may need minutes
 POLL_S = 0.1
-STALL_AFTER_S = 120.0
 KEYFRAMES = "keyframes.sqlite"  # below the output folder: what ingest needs to go on where it was
 
 
@@ -331,20 +331,20 @@ class Run:
 
     def _follow(self, progress: Progress, bar: TaskID) -> bool:
         """Show progress until the source has ended and everything has settled; True when the user interrupts that."""
-        finished, moved_s, last = False, time.monotonic(), (0, 0)
+        finished = False
+        standstill = Standstill(lambda: self.client.statuses()[0], progress.console.print)
         while not (finished and self.settling.settled(QUIET_S)):
             for event in self.supervisor.check():
                 progress.console.print(event)
             if (state := self.counts.ingest) is not None:
                 finished = state.finished
                 progress.update(bar, total=state.frames_total or None, completed=state.frames_read)
-                if (state.frames_read, state.encoded) != last:
-                    last, moved_s = (state.frames_read, state.encoded), time.monotonic()
+                standstill.see((state.frames_read, state.encoded))
             progress.update(bar, description=_description(self.counts, finished))
             if self.interrupted.is_set():
                 progress.console.print("interrupted: writing what there is; Ctrl-C again ends at once")
                 return True
-            if time.monotonic() - max(moved_s, self.settling.changed_s) > STALL_AFTER_S:
+            if standstill.reached(self.settling.changed_s):
                 said = f"nothing has moved for {STALL_AFTER_S:.0f} s; see the logs in {self.supervisor.log_folder}"
                 if not finished:
                     raise RunError(said)

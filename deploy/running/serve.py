@@ -17,7 +17,7 @@ from prior_sg.deploy.errors import UserError
 from prior_sg.deploy.running import crashes
 from prior_sg.deploy.running.here import noted
 from prior_sg.deploy.settings import DEFAULT_ROBOT, add_keys, connect_in_force, resolved_config, use_keys
-from prior_sg.deploy.terminal import complain
+from prior_sg.deploy.streams import complain
 from prior_sg.services.roles import KEEPERS, LEASED, NAMES, WRITERS, declared
 from prior_sg.services.runtime import extras
 from prior_sg.services.runtime.bus import BusError

@@ -275,7 +275,9 @@ ANSWERS = [
         task_before="t",
         reason="r",
     ),
-    answers.RegionBeliefs(thing=THING, beliefs=[BELIEF], unknown=0.25, predicted_share=0.5, places=3, reason="r"),
+    answers.RegionBeliefs(
+        thing=THING, beliefs=[BELIEF], unknown=0.25, predicted_share=0.5, places=3, reason="r", total=2
+    ),
     answers.Words(
         environment="home",
         task="tidy up",
@@ -286,11 +288,20 @@ ANSWERS = [
         objects={"stove": 2},
         merged_of=["r1", "r2"],
     ),
-    answers.Ranking(things=[THING], note="n", reason="r"),
+    answers.Ranking(things=[THING], note="n", reason="r", total=2),
     answers.Nodes(nodes=[answers.NodeWithRegions(node=LEVEL_NODE, regions=[THING])], total=2, reason="r"),
     answers.Outlook(
         label="hall",
-        prospects=[answers.Prospect(opening=FORESIGHT.openings[0], probability=0.75, expected_m=12.5, way_m=3.5)],
+        prospects=[
+            answers.Prospect(
+                opening=FORESIGHT.openings[0],
+                probability=0.75,
+                expected_m=12.5,
+                way_m=3.5,
+                toward=0.5,
+                per_metre=0.125,
+            )
+        ],
         probability=0.875,
         route=answers.Route(
             found=True,
@@ -307,8 +318,10 @@ ANSWERS = [
         ),
         found=[THING],
         reason="r",
+        total=2,
+        look_m=1.5,
     ),
-    answers.Missing(labels=FORESIGHT.missing, openings=2, reason="r"),
+    answers.Missing(labels=FORESIGHT.missing, openings=2, reason="r", total=2),
     answers.Markers(markers=[answers.MarkerInRegion(marker=MARKER, region=THING)], total=2, reason="r"),
 ]
 
@@ -596,6 +609,7 @@ EXAMPLES: list[Message] = [
         ],
         losses=[status.Loss(what="w", reason="r", count=1, example="e")],
         step_s=7.5,
+        step_compiling_s=6.5,
         clock_ns=8,
         release="1",
         cpu_s=9.5,

@@ -200,6 +200,9 @@ def deltas(held, epoch=1):
         clearances_m=held.clearances_m,
         removed_edges=none.reshape(0, 2),
         camera_m=tuple(held.trajectory[0].tolist()),
+        frontier_ids=held.frontier_ids,
+        frontier_directions=held.frontier_directions,
+        frontier_areas_m2=held.frontier_areas_m2,
     )
     yield RegionDelta(
         robot=held.robot,

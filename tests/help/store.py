@@ -39,17 +39,19 @@ from tests.help.world import prior
 class StandIn:
     """`relabel` makes of a scene and a task the scene that follows it, which the store has `behind_s` after the regions
     are told; `forgotten` revisions are not kept; `mute` says which of "prior", "regions", "names", "poses" stay out.
+    On a `hub` that is given, it answers of its own robot alone.
     """
 
-    def __init__(self, scene, relabel=lambda scene, task, digest: scene, *, mute=(), behind_s=0.0):
-        self.hub, self.robot, self.relabel = Hub(), scene.robot, relabel
+    def __init__(self, scene, relabel=lambda scene, task, digest: scene, *, mute=(), behind_s=0.0, hub=None):
+        self.hub, self.robot, self.relabel = hub or Hub(), scene.robot, relabel
+        of = "*" if hub is None else scene.robot
         self.mute, self.behind_s = mute, behind_s
         self.scenes, self.tasks, self.poses = [msgspec.structs.replace(scene, revision=0)], [], []
         self.forgotten = set()
         self.bus = BusClient(LocalBus(self.hub))
         serve = self.bus.bus.serve
-        serve(SCENE.key.format(robot="*"), self.show)
-        serve(SCENE_QUERY.key.format(robot="*"), self.answer)
+        serve(SCENE.key.format(robot=of), self.show)
+        serve(SCENE_QUERY.key.format(robot=of), self.answer)
         serve(PRIORS.key, lambda request: request.reply(encode(PriorList(priors=[], reason="no library"))))
         serve(POSTERIOR.key.format(robot=self.robot), self.explain)
         self.bus.bus.announce(alive_key("place_graph", "p-1"))

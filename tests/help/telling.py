@@ -21,6 +21,8 @@ def everything():
         topics=[TopicCount(topic="KEYFRAME", published=5, missed=1, last_age_ms=20.0)],
         step_counts=[2] + [0] * (len(STEP_BOUNDS_S) - 1) + [1],
         step_sum_s=12.0,
+        step_s=9.0,
+        step_compiling_s=8.0,
         pools=[PoolCount(topic="ENCODE", waiting=4, running=2, oldest_wait_s=6.5, workers={"conse": 2})],
         figures={"revisions": 9, "file_bytes": 10, "disk_free_bytes": 11},
     )

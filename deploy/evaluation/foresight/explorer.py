@@ -125,18 +125,14 @@ class Explorer:
 
     def revealed(self, nodes: np.ndarray) -> int:
         """Index of the true region that most of the unseen cells just beyond a frontier belong to; NO_REGION = none."""
-        plan = self.plan
-        first = loops.beyond(plan.heights, plan.clearance, self.known, nodes, BEYOND_CELLS, plan.step)
-        held = plan.regions[first]
+        held = self.plan.regions[self._behind(nodes, BEYOND_CELLS)[0]]
         held = held[held != NO_REGION]
         return int(np.bincount(held).argmax()) if len(held) else NO_REGION
 
     def met(self, nodes: np.ndarray) -> np.ndarray:
         """Indices of the true regions of which something to stand on begins within REACH_M behind a frontier."""
-        plan = self.plan
-        reached = loops.beyond(plan.heights, plan.clearance, self.known, nodes, REACH_CELLS, plan.step)
-        held = plan.regions[reached]
-        counts = np.bincount(held[held != NO_REGION], minlength=len(plan.labels))
+        held = self.plan.regions[self._behind(nodes, REACH_CELLS)[0]]
+        counts = np.bincount(held[held != NO_REGION], minlength=len(self.plan.labels))
         return np.flatnonzero(counts * CELL_M**2 >= MET_M2)
 
     def toward(self, frontiers: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
@@ -147,12 +143,20 @@ class Explorer:
         through, ways_m = np.full(count, -1), np.full(count, np.inf)
         nodes = np.concatenate(frontiers)
         numbers = np.repeat(np.arange(len(frontiers)), [len(one) for one in frontiers])
-        depth, nearest = loops.flooded(plan.heights, plan.clearance, self.known, nodes, numbers, plan.step)
-        reached = np.flatnonzero((depth >= 0) & (plan.regions != NO_REGION))
-        reached = reached[np.argsort(depth[reached], kind="stable")]
-        regions, first = np.unique(plan.regions[reached], return_index=True)
-        through[regions], ways_m[regions] = nearest[reached[first]], depth[reached[first]] * CELL_M
+        found, depths, starts = self._behind(nodes, loops.FAR)
+        order = np.lexsort((found, depths))
+        order = order[plan.regions[found[order]] != NO_REGION]
+        regions, first = np.unique(plan.regions[found[order]], return_index=True)
+        through[regions], ways_m[regions] = numbers[starts[order[first]]], depths[order[first]] * CELL_M
         return through, ways_m
+
+    def _behind(self, nodes: np.ndarray, cells: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """As `loops.flooded`."""
+        plan = self.plan
+        found: tuple[np.ndarray, np.ndarray, np.ndarray] = loops.flooded(
+            plan.heights, plan.clearance, self.known, nodes, cells, plan.step
+        )
+        return found
 
     def walk(self, before: np.ndarray, target: int, until: np.ndarray) -> None:
         """Walk towards a node, looking around on the way, until there or until nothing is unseen beside `until`."""

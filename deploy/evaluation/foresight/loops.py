@@ -182,46 +182,17 @@ def grouped(heights, edge, limit):  # noqa: ANN001, ANN201
 
 
 @compiled()
-def flooded(heights, clearance, known, nodes, numbers, limit):  # noqa: ANN001, ANN201, PLR0917
-    """How many cells (node,) one comes through unseen nodes from the nearest of these, and that one's number (node,).
-
-    Both are -1 where nodes were seen or nobody comes to them.
-    """
+def flooded(heights, clearance, known, nodes, most, limit):  # noqa: ANN001, ANN201, PLR0917
+    """Unseen nodes (n,) that one comes to from these through unseen ones, the nearest first, at most so many cells
+    away; how many cells away each is (n,), and the row in `nodes` of the nearest (n,)."""
     ny, levels = heights.shape[1], heights.shape[2]
-    depth = np.full(heights.size, -1, np.int32)
-    nearest = np.full(heights.size, -1, np.int64)
-    front, far = list(nodes), 0
-    nearest[nodes] = numbers
-    while len(front) > 0:
-        far += 1
-        following = [0 for _ in range(0)]
-        for here in front:
-            cell, level = here // levels, here % levels
-            i, j = cell // ny, cell % ny
-            for a, b in ((i - 1, j), (i + 1, j), (i, j - 1), (i, j + 1)):
-                other = _step(heights, a, b, heights[i, j, level], limit)
-                if other == NONE or clearance[a, b, other] < 2:
-                    continue
-                there = (a * ny + b) * levels + other
-                if not known[there] and depth[there] < 0:
-                    depth[there] = far
-                    nearest[there] = nearest[here]
-                    following.append(there)
-        front = following
-    nearest[nodes] = -1
-    return depth, nearest
-
-
-@compiled()
-def beyond(heights, clearance, known, nodes, depth, limit):  # noqa: ANN001, ANN201, PLR0917
-    """Unseen nodes that one comes to from these through unseen ones, at most `depth` cells away."""
-    ny, levels = heights.shape[1], heights.shape[2]
-    found = [0 for _ in range(0)]
+    found, depths, starts = [0 for _ in range(0)], [0 for _ in range(0)], [0 for _ in range(0)]
     reached = np.zeros(heights.size, np.bool_)
-    front = list(nodes)
-    for _ in range(depth):
-        following = [0 for _ in range(0)]
-        for here in front:
+    front, begun, far = list(nodes), list(range(len(nodes))), 0
+    while len(front) > 0 and far < most:
+        far += 1
+        first = len(found)
+        for here, start in zip(front, begun):  # noqa: B905 - what is compiled knows no strict
             cell, level = here // levels, here % levels
             i, j = cell // ny, cell % ny
             for a, b in ((i - 1, j), (i + 1, j), (i, j - 1), (i, j + 1)):
@@ -231,7 +202,8 @@ def beyond(heights, clearance, known, nodes, depth, limit):  # noqa: ANN001, ANN
                 there = (a * ny + b) * levels + other
                 if not known[there] and not reached[there]:
                     reached[there] = True
-                    following.append(there)
                     found.append(there)
-        front = following
-    return np.array(found, dtype=np.int64)
+                    depths.append(far)
+                    starts.append(start)
+        front, begun = found[first:], starts[first:]
+    return np.array(found, dtype=np.int64), np.array(depths, dtype=np.int64), np.array(starts, dtype=np.int64)

@@ -156,7 +156,8 @@ def _nodes_behind(plan: Plan, known: np.ndarray, edge: np.ndarray, cells: int) -
     """Unseen nodes (region,) of each true region that one comes to from an edge."""
     if not len(edge):
         return np.zeros(len(plan.labels), np.int64)
-    held = plan.regions[loops.beyond(plan.heights, plan.clearance, known, edge, cells, plan.step)]
+    reached, *_ = loops.flooded(plan.heights, plan.clearance, known, edge, cells, plan.step)
+    held = plan.regions[reached]
     return np.bincount(held[held != NO_REGION], minlength=len(plan.labels))
 
 

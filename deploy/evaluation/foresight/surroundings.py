@@ -58,7 +58,7 @@ def surroundings(
 def _beyond_m(explorer: Explorer, nodes: np.ndarray) -> np.ndarray:
     """The middle (3,) of what is unseen just behind a frontier."""
     plan = explorer.plan
-    ahead = loops.beyond(plan.heights, plan.clearance, explorer.known, nodes, AHEAD_CELLS, plan.step)
+    ahead, *_ = loops.flooded(plan.heights, plan.clearance, explorer.known, nodes, AHEAD_CELLS, plan.step)
     return np.asarray(plan.position_m(ahead if len(ahead) else nodes).mean(axis=0))
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from prior_sg.deploy.evaluation.foresight.explorer import Explorer, Plan, crossings
 from prior_sg.deploy.evaluation.foresight.fitting import fitted, fitted_to_maps, fitted_toward, fitted_within
-from prior_sg.deploy.evaluation.foresight.loops import FAR
+from prior_sg.deploy.evaluation.foresight.loops import FAR, flooded
 from prior_sg.deploy.evaluation.foresight.mapped import behind, covered, ground_of
 from prior_sg.deploy.evaluation.foresight.predictors import PREDICTORS
 from prior_sg.deploy.evaluation.foresight.scores import chance_figures, figures, judge, search_figures
@@ -342,3 +342,15 @@ def test_fitting_learns_from_maps_which_openings_lead_anywhere():
     said, before = (beyond(walk[0].views, expected(the_prior, walk[0].found, one), one).missing for one in (found, cfg))
     assert said.max() < 0.1 < before.max()
     assert found.within_bias == cfg.within_bias and found.same_by_width == cfg.same_by_width
+
+
+def test_a_flood_says_how_far_it_came_and_from_where():
+    """A corridor of nine cells, known at both ends, wide but in its last unseen cell but one."""
+    heights, clearance = np.zeros((9, 1, 1), np.int32), np.full((9, 1, 1), 4, np.int32)
+    known = np.isin(np.arange(9), (0, 1, 8))
+    nodes = np.array([1, 8])
+    found, depths, starts = flooded(heights, clearance, known, nodes, FAR, 1)
+    assert (found.tolist(), depths.tolist(), starts.tolist()) == ([2, 7, 3, 6, 4, 5], [1, 1, 2, 2, 3, 3], [0, 1] * 3)
+    assert flooded(heights, clearance, known, nodes, 2, 1)[0].tolist() == [2, 7, 3, 6]
+    clearance[6] = 1
+    assert flooded(heights, clearance, known, nodes, FAR, 1)[0].tolist() == [2, 7, 3, 4, 5]

@@ -2,6 +2,7 @@
 
 import io
 import json
+import re
 
 import cv2
 import numpy as np
@@ -12,9 +13,11 @@ from prior_sg.deploy.cli import check as command
 from prior_sg.deploy.cli.main import main
 from prior_sg.deploy.inspecting.beside import truth_beside
 from prior_sg.deploy.inspecting.check import check, kind_of, look
+from prior_sg.deploy.inspecting.following import Following
 from prior_sg.services.geometry import quaternion_of
 from prior_sg.services.ingest.core.selection import Config
 from prior_sg.services.ingest.sources import SourceError, open_source
+from prior_sg.services.place_graph.core.config import Config as Mapping
 from tests.help import room
 
 HEADER = "frame,stamp_ns,x_m,y_m,z_m,qx,qy,qz,qw"
@@ -89,6 +92,30 @@ def test_up_is_named_and_mends(folder, capsys):
     write_poses(folder, [yup @ pose for pose in POSES])
     assert mends(checked(folder, capsys)[1]) == ["--up 0,1,0"]
     assert checked(folder, capsys, "--up", "0,1,0")[0] == 0
+
+
+def test_keyframes_that_the_place_graph_will_refuse_for_their_speed_are_a_problem(folder, capsys):
+    """4 m each 0.8 s: ingest believes 10 m/s, the place graph 3 m/s and 1 m more. Not those of a drive half as far."""
+    drive = [pose.copy() for pose in POSES]
+    for number, pose in enumerate(drive):
+        pose[:3, 3] += (4.0 * number, 0.0, 0.0)
+    stamps_ns = [800_000_000 * number for number in range(len(drive))]
+    write_poses(folder, drive, stamps_ns=stamps_ns)
+
+    def speed(*options) -> list[dict]:
+        return [found for found in checked(folder, capsys, *options)[1]["findings"] if found["topic"] == "speed"]
+
+    (found,) = speed()
+    assert "will refuse about 11 of 12 keyframes" in found["text"] and "it believes 3" in found["text"]
+    believes = re.search(r"--set (place_graph\.max_speed_m_s=\d+)", found["mend"])[1]
+    assert speed("--set", believes) == speed("--set", "place_graph.preset=outdoor") == []
+    assert main(["check", str(folder)]) == 1
+    last = "".join(row.split("│")[4] for row in capsys.readouterr().out.splitlines() if row.startswith("│"))
+    assert "".join(found["mend"].split()) in "".join(last.split())  # in whole, also where a column is narrow
+    for number, pose in enumerate(drive):
+        pose[0, 3] -= 2.0 * number
+    write_poses(folder, drive, stamps_ns=stamps_ns)
+    assert speed() == []
 
 
 def test_what_cannot_be_opened_is_one_problem(folder, capsys):
@@ -167,7 +194,9 @@ def test_ground_truth_of_ours_is_kept(folder):
 
 def test_progress_is_shown_and_every_frame_is_read(folder):
     seen = []
-    recording = look(open_source(folder), Config(), progress=lambda done, total: seen.append((done, total)))
+    recording = look(
+        open_source(folder), Config(), Following(Mapping()), progress=lambda done, total: seen.append((done, total))
+    )
     assert seen[-1] == (12, 12)
     assert recording.keyframes == 12
     assert not recording.refused

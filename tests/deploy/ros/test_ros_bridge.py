@@ -269,7 +269,7 @@ def test_nodes_of_ros_find_each_other_on_our_router(endpoint):
 
 
 def test_a_router_with_keys_passes_on_nothing_of_ros(tmp_path, capsys):
-    assert main(["up", "--ros", "--listen", "tls/127.0.0.1:7450", "--out", str(tmp_path / "up")]) == 1
+    assert main(["up", "--ros", "--listen", "tls/127.0.0.1:7450", "--out", str(tmp_path / "up")]) == 2
     assert "passes on nothing of ROS" in capsys.readouterr().err
 
 

@@ -116,6 +116,21 @@ def test_an_interrupt_that_an_import_swallowed_still_ends_the_run():
         assert not interrupts.came()
 
 
+class Interrupted:
+    """Ctrl-C comes while it is finalized."""
+
+    def __del__(self):
+        signal.raise_signal(signal.SIGINT)
+
+
+def test_an_interrupt_that_a_finalizer_swallowed_comes_again(capfd):
+    with interrupts.remembered(), pytest.raises(KeyboardInterrupt):
+        thing = Interrupted()
+        del thing
+        time.sleep(20)
+    assert capfd.readouterr().err == ""
+
+
 @pytest.mark.parametrize(
     ("limit", "value", "said"),
     [(resource.RLIMIT_NOFILE, 24, "ulimit -n"), (resource.RLIMIT_AS, 1_000_000 * 1024, "ulimit -v")],
@@ -131,7 +146,7 @@ def test_a_limit_that_is_too_low_is_named(tmp_path, limit, value, said):
 
 
 def test_an_argument_that_is_no_text_is_one_sentence(tmp_path, capsys):
-    assert main(["up", "--out", str(tmp_path / "o\udcff")]) == 1
+    assert main(["up", "--out", str(tmp_path / "o\udcff")]) == 2
     assert "\\udcff' is not valid UTF-8" in capsys.readouterr().err
 
 

@@ -126,6 +126,17 @@ def standings(*tokens):
         (Found(), False, ""),
         (Found([status()]), True, ""),
         (Found([status(step_s=29.0)]), True, ""),
+        (Found([status(step_s=59.0, step_compiling_s=29.5)]), True, ""),
+        (
+            Found([status(step_s=59.0, step_compiling_s=31.0)]),
+            True,
+            "m1 has compiled inner loops for 31 s, as a first run does, and 3 inputs wait: it goes on by itself",
+        ),
+        (
+            Found([status(step_s=60.0, step_compiling_s=25.0)]),
+            False,
+            "m1 (pid 7) has been at one input for 35 s, 3 wait: if that goes on, `kill",
+        ),
         (
             Found([status(step_s=45.0)]),
             False,
