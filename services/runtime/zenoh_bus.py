@@ -36,6 +36,7 @@ from prior_sg.services.runtime.keys import bundle_in_force
 from prior_sg.services.runtime.zenoh_session import (
     CLOSE_TIMEOUT_S,
     LOGGED,
+    Presence,
     client_config,
     close_within,
     fixed_part,
@@ -43,6 +44,7 @@ from prior_sg.services.runtime.zenoh_session import (
 )
 
 HEARTBEAT_S = 0.3
+AGAIN_S = 1.0  # for a second session, where a first has found the router
 PRIORITIES = {
     "now": Priority.INTERACTIVE_HIGH,
     "soon": Priority.INTERACTIVE_LOW,
@@ -86,6 +88,7 @@ class ZenohBus:
     def __init__(self, endpoint: str, wait_s: float = 10.0, *, on_deaf: Callable[[], None] | None = None) -> None:
         zenoh.init_log_from_env_or(LOGGED)
         self._session = self._open(endpoint, wait_s)
+        self._presence = Presence(self._session, lambda: self._open(endpoint, AGAIN_S))
         self._publishers: dict[str, Any] = {}
         self._lock = threading.Lock()
         self._entities: list[Any] = []
@@ -216,14 +219,12 @@ class ZenohBus:
     def watch(self, pattern: str, on_alive: OnAlive) -> None:
         """See who comes and goes."""
         self._entities.append(
-            self._session.liveliness().declare_subscriber(
-                pattern, lambda sample: on_alive(str(sample.key_expr), sample.kind == SampleKind.PUT), history=True
-            )
+            self._presence.watch(pattern, lambda sample: on_alive(str(sample.key_expr), sample.kind == SampleKind.PUT))
         )
 
     def announced(self, pattern: str, timeout_s: float) -> set[str]:
         """The keys announced now, as the router knows them."""
-        replies = list(self._session.liveliness().get(pattern, timeout=timeout_s))
+        replies = self._presence.ask(pattern, timeout_s)
         if any(reply.ok is None for reply in replies) or not self.connected():
             raise BusError(
                 f"the router has not said within {timeout_s:g} s who is there, so it is busy or gone; try again, or "
@@ -238,6 +239,7 @@ class ZenohBus:
     def close(self) -> None:
         """Leave the bus, within a bound."""
         self._end_watch()
+        self._presence.close()
         readers = [entity for entity in self._entities if isinstance(entity, zenoh.Subscriber | zx.AdvancedSubscriber)]
         close_within(self._session, CLOSE_TIMEOUT_S, readers)
 

@@ -60,6 +60,45 @@ def fixed_part(pattern: str) -> str:
     return "/".join(takewhile(lambda chunk: "*" not in chunk, pattern.split("/")))
 
 
+class Presence:
+    """Who is there, seen and asked for by one session.
+
+    What a session watches it must not ask for as well: Zenoh 1.10.2 answers such a question partly from what the
+    watcher has been told, and what comes behind the router's last word is left out, at times all of it. Such questions
+    go over a session of their own.
+    """
+
+    def __init__(self, session: zenoh.Session, open_another: Callable[[], zenoh.Session]) -> None:
+        """`open_another` opens a session with the same router."""
+        self._session, self._open_another = session, open_another
+        self._watched: list[zenoh.KeyExpr] = []
+        self._asking: zenoh.Session | None = None
+        self._lock = threading.Lock()
+
+    def watch(self, pattern: str, on_sample: Callable[[zenoh.Sample], None]) -> Any:
+        """See who is there, comes and goes, until what is returned is undeclared."""
+        self._watched.append(zenoh.KeyExpr(pattern))
+        return self._session.liveliness().declare_subscriber(pattern, on_sample, history=True)
+
+    def ask(self, pattern: str, timeout_s: float) -> list[zenoh.Reply]:
+        """Who is there now, as the router knows. Raises what `open_another` does."""
+        return list(self._asked_over(pattern).liveliness().get(pattern, timeout=timeout_s))
+
+    def _asked_over(self, pattern: str) -> zenoh.Session:
+        asked = zenoh.KeyExpr(pattern)
+        if not any(asked.intersects(watched) for watched in self._watched):
+            return self._session
+        with self._lock:
+            if self._asking is None:
+                self._asking = self._open_another()
+            return self._asking
+
+    def close(self) -> None:
+        """End the session of its own, within a bound."""
+        if self._asking is not None:
+            close_within(self._asking, CLOSE_TIMEOUT_S)
+
+
 def close_within(session: zenoh.Session, timeout_s: float, entities: Iterable[Any] = ()) -> None:
     """Close, but not for longer than the timeout: closing over a broken link can take very long. `entities` of the
     session are withdrawn first: what still comes for one while a session closes is an error to Zenoh.

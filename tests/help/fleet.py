@@ -58,7 +58,7 @@ class Fleet:
             stop()
 
 
-def until(condition, timeout_s=10.0):
+def until(condition, timeout_s=30.0):
     end_s = time.monotonic() + timeout_s
     while not condition():
         assert time.monotonic() < end_s, "did not happen"

@@ -67,7 +67,7 @@ class Robot:
             done.set()
             thread.join()
 
-    def wait_for_reader(self, topics, timeout_s=10.0):
+    def wait_for_reader(self, topics, timeout_s=30.0):
         """Until somebody new listens to all of these topics."""
         before, end_s = {session for session, _ in self.heard}, time.monotonic() + timeout_s
         while time.monotonic() < end_s:

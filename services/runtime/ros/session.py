@@ -17,7 +17,7 @@ from prior_sg.services.runtime.endpoints import check_endpoint, check_host, secu
 from prior_sg.services.runtime.keys import bundle_in_force
 from prior_sg.services.runtime.ros import wire
 from prior_sg.services.runtime.ros.wire import Attachment, Channel, Entity, WireError
-from prior_sg.services.runtime.zenoh_session import CLOSE_TIMEOUT_S, client_config, close_within, quietly
+from prior_sg.services.runtime.zenoh_session import CLOSE_TIMEOUT_S, Presence, client_config, close_within, quietly
 
 log = logging.getLogger(__name__)
 ENDPOINT = "tcp/127.0.0.1:7447"  # where rmw_zenohd listens
@@ -67,6 +67,7 @@ class RosSession:
         wire.check_domain(domain)
         self.endpoint, self.domain, self._node = endpoint, domain, node
         self._session = _open(endpoint, wait_s)
+        self._presence = Presence(self._session, lambda: _open(endpoint, ANSWER_S))
         self._zid = str(self._session.info.zid())
         self._entities: list[Any] = []
         self._number = 0
@@ -146,7 +147,7 @@ class RosSession:
     def entities(self, timeout_s: float = ANSWER_S) -> list[Entity]:
         """Everybody who is there now, but this node."""
         found = []
-        for reply in self._session.liveliness().get(wire.token_pattern(self.domain), timeout=timeout_s):
+        for reply in self._presence.ask(wire.token_pattern(self.domain), timeout_s):
             entity = _read(str(reply.ok.key_expr)) if reply.ok is not None else None
             if entity is not None and entity.session != self._zid:
                 found.append(entity)
@@ -160,11 +161,11 @@ class RosSession:
             if entity is not None and entity.session != self._zid:
                 on_entity(entity, sample.kind == SampleKind.PUT)
 
-        pattern = wire.token_pattern(self.domain)
-        self._entities.append(self._session.liveliness().declare_subscriber(pattern, seen, history=True))
+        self._entities.append(self._presence.watch(wire.token_pattern(self.domain), seen))
 
     def close(self) -> None:
         """Leave, within a bound; who is no longer there is told first, so that nothing comes for nobody."""
+        self._presence.close()
         close_within(self._session, CLOSE_TIMEOUT_S, reversed(self._entities))
 
     def __enter__(self) -> "RosSession":

@@ -85,7 +85,7 @@ class Listener:
     def state(self):
         return json.loads(self.last("task").data) if self.heard["task"] else {}
 
-    def ask(self, service, *fields, timeout_s=5.0):
+    def ask(self, service, *fields, timeout_s=20.0):
         kind = parameters.type_of(service)
         client = self.ros.client(Channel(f"/{NODE}/{service}", kind, TYPES.hash(kind)))
         reply = client.call(TYPES.encode(TYPES.make(f"{kind}_Request", *fields)), timeout_s)
@@ -99,7 +99,7 @@ class Listener:
         return result.successful, result.reason
 
 
-def wait_for(condition, timeout_s=10.0):
+def wait_for(condition, timeout_s=30.0):
     end_s = time.monotonic() + timeout_s
     while not condition():
         assert time.monotonic() < end_s

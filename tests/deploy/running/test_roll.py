@@ -42,7 +42,7 @@ def child(endpoint, tmp_path, monkeypatch):
     child.process.wait()
 
 
-def until(condition, timeout_s=10.0):
+def until(condition, timeout_s=30.0):
     end_s = time.monotonic() + timeout_s
     while not (found := condition()):
         assert time.monotonic() < end_s, "did not happen"

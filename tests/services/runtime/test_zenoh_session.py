@@ -8,11 +8,12 @@ import threading
 import time
 
 import pytest
+import zenoh
 
 from prior_sg.schemas.topics import PLACE_DELTA
 from prior_sg.services.runtime.bus import pack_header
 from prior_sg.services.runtime.zenoh_bus import ZenohBus
-from prior_sg.services.runtime.zenoh_session import fixed_part
+from prior_sg.services.runtime.zenoh_session import Presence, client_config, fixed_part
 
 CLOSES = 20
 CLOSING = """
@@ -108,3 +109,28 @@ def test_the_number_of_a_key_outlives_a_server_of_it_where_others_serve_the_key(
 )
 def test_the_fixed_part_of_a_pattern(pattern, part):
     assert fixed_part(pattern) == part
+
+
+def test_what_a_session_watches_it_asks_for_over_another(endpoint):
+    there, watcher = (zenoh.open(client_config(endpoint)) for _ in range(2))
+    tokens = [there.liveliness().declare_token(f"psg/there/{number}") for number in range(5)]
+    opened, seen = [], []
+    presence = Presence(watcher, lambda: opened.append(zenoh.open(client_config(endpoint))) or opened[-1])
+
+    def asked(pattern):
+        return {str(reply.ok.key_expr) for reply in presence.ask(pattern, 20.0) if reply.ok is not None}
+
+    everybody = {str(number) for number in range(5)}
+    while {key.rpartition("/")[2] for key in asked("psg/there/*")} != everybody:
+        time.sleep(0.01)
+    assert not opened
+    presence.watch("psg/there/**", lambda sample: seen.append(str(sample.key_expr)))
+    for _ in range(200):
+        assert {key.rpartition("/")[2] for key in asked("psg/*/*")} == everybody
+    assert asked("psg/elsewhere/*") == set()
+    assert len(opened) == 1 and not opened[0].is_closed()
+    presence.close()
+    assert opened[0].is_closed()
+    assert len(seen) == len(set(seen)) == len(tokens)  # once each, and not again at each question
+    watcher.close()
+    there.close()
