@@ -9,7 +9,7 @@ from typing import Any
 from rich.console import Console
 from rich.progress import Task, TextColumn
 from rich.status import Status
-from rich.table import Table
+from rich.table import Table as PlainTable
 from rich.text import Text
 
 from prior_sg.schemas.names import shown
@@ -51,17 +51,17 @@ class Description(TextColumn):
         return Text(shown(task.description))
 
 
+class Table(PlainTable):
+    """A table in which nothing is cut off: a word wider than its column goes on below."""
+
+    def add_column(self, *heading: Any, no_wrap: bool = False, **options: Any) -> None:
+        """As rich's; what may not be wrapped shows where it had to be cut."""
+        super().add_column(*heading, no_wrap=no_wrap, **({"overflow": "ellipsis" if no_wrap else "fold"} | options))
+
+
 def line(*parts: Part) -> Text:
     """One line of text, parts of it in a style."""
     return Text.assemble(*(_plain(part) if isinstance(part, str) else (shown(part[0]), part[1]) for part in parts))
-
-
-def table(*headings: str, **options: Any) -> Table:
-    """A table in which nothing is cut off: a word wider than its column goes on below. `options` are rich's."""
-    made = Table(*headings, **options)
-    for column in made.columns:
-        column.overflow = "fold"
-    return made
 
 
 def _plain(text: Any) -> Any:

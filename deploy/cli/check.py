@@ -9,7 +9,7 @@ from prior_sg.deploy.cli.shared import Commands, add_settings, console
 from prior_sg.deploy.cli.source_options import add_source_options, mapping_options, read_options
 from prior_sg.deploy.errors import UserError
 from prior_sg.deploy.json_text import json_text
-from prior_sg.deploy.terminal import Description, Terminal, line, table
+from prior_sg.deploy.terminal import Description, Table, Terminal, line
 
 if TYPE_CHECKING:
     from prior_sg.deploy.inspecting.check import Report
@@ -74,7 +74,7 @@ def before_start(path: str, cfg: "Config", console: Terminal, mapping: "PlaceGra
 
 def show(report: "Report", console: Terminal) -> None:
     """A table of all findings, and a closing line."""
-    rows = table("", "what", "found", "mend", title=report.source)
+    rows = Table("", "what", "found", "mend", title=report.source)
     for finding in report.findings:
         verdict = line((finding.verdict, STYLE[finding.verdict]))
         rows.add_row(verdict, finding.topic, finding.text, finding.mend)

@@ -126,14 +126,14 @@ def _list(arguments: argparse.Namespace) -> int:
     import msgspec
 
     from prior_sg.deploy.keys.authority import Authority
-    from prior_sg.deploy.terminal import table
+    from prior_sg.deploy.terminal import Table
 
     authority = Authority(arguments.folder)
     everybody = sorted(authority.participants.values(), key=lambda one: (one.role, one.name))
     if arguments.json:
         print(msgspec.json.encode(everybody).decode())
         return 0
-    rows = table("name", "role", "key", "until", "state")
+    rows = Table("name", "role", "key", "until", "state")
     today = time.strftime("%Y-%m-%d", time.gmtime())
     for one in everybody:
         rows.add_row(one.name, one.role, str(one.issue), one.until, one.state(today))

@@ -14,7 +14,7 @@ from prior_sg.deploy.edge import names_in
 from prior_sg.deploy.errors import UsageError
 from prior_sg.deploy.running.inprocess import InProcess
 from prior_sg.deploy.settings import resolved_config
-from prior_sg.deploy.terminal import Terminal, line, table
+from prior_sg.deploy.terminal import Table, Terminal, line
 from prior_sg.schemas.codec import DecodeError
 from prior_sg.schemas.priors import ObjectPrior, Prior, PriorRevision, Provenance, Task
 from prior_sg.schemas.topics import PRIOR, PRIOR_REVISION
@@ -163,7 +163,7 @@ def bring(arguments: argparse.Namespace, console: Terminal) -> int:
 
 def list_all(arguments: argparse.Namespace, console: Terminal) -> int:
     """The library, then what the archive holds."""
-    rows = table("environment", "task", "regions", show_lines=True)
+    rows = Table("environment", "task", "regions", show_lines=True)
     for listing in environments():
         for task, regions in listing.tasks.items():
             rows.add_row(listing.name, task, ", ".join(regions))
@@ -171,8 +171,9 @@ def list_all(arguments: argparse.Namespace, console: Terminal) -> int:
     cfg = settings(arguments)
     kept = list(PriorShelf(cfg.archive).all())
     if kept:
-        rows = table("digest", "environment", "task", "from", "regions", "signature", title=f"kept in {cfg.archive}")
-        rows.columns[0].no_wrap = True  # it is copied
+        rows = Table(title=f"kept in {cfg.archive}")
+        for name in ("digest", "environment", "task", "from", "regions", "signature"):
+            rows.add_column(name, no_wrap=name == "digest")  # it is copied
         for name, entry in kept:
             prior = entry.prior
             source = prior.provenance.source + (" (in force)" if name == PREFERRED else "")

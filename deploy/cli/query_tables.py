@@ -3,9 +3,8 @@
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from rich.table import Table
-
 from prior_sg.deploy.cli.shared import console
+from prior_sg.deploy.terminal import Table
 from prior_sg.schemas.foresight import REACH_M
 from prior_sg.schemas.members import said
 

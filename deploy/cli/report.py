@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
-from rich.table import Table
 
 from prior_sg.deploy.evaluation.metrics import evaluate
 from prior_sg.deploy.evaluation.object_metrics import NO_DETECTOR, OBJECT_SHARES, object_scores
@@ -16,7 +15,7 @@ from prior_sg.deploy.json_text import json_text
 from prior_sg.deploy.running.job import Result
 from prior_sg.deploy.showing import formats
 from prior_sg.deploy.showing.material import Material
-from prior_sg.deploy.terminal import Terminal
+from prior_sg.deploy.terminal import Table, Terminal
 from prior_sg.deploy.truth import GroundTruth, TrueObject
 from prior_sg.schemas.codec import decode
 from prior_sg.schemas.scene import Scene, SceneRequest

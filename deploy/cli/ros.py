@@ -4,13 +4,11 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rich.table import Table
-
 from prior_sg.deploy.cli.ros_results import add_results
 from prior_sg.deploy.cli.shared import Commands, console
 from prior_sg.deploy.errors import UserError
 from prior_sg.deploy.json_text import json_text
-from prior_sg.deploy.terminal import table
+from prior_sg.deploy.terminal import Table
 
 if TYPE_CHECKING:
     from prior_sg.services.ingest.core.ros.topics import Topic
@@ -74,7 +72,7 @@ def _heard(arguments: argparse.Namespace) -> "list[Topic]":
 
 
 def _table(topics: "list[Topic]") -> Table:
-    rows = table("topic", "type", "messages", "per second", "frame", "serves as")
+    rows = Table("topic", "type", "messages", "per second", "frame", "serves as")
     for topic in topics:
         serves = " ".join(filter(None, (topic.taken_for or "-", f"({topic.encoding})" if topic.encoding else "")))
         rate = f"{topic.rate_hz:.1f}" if topic.rate_hz else "-"

@@ -8,13 +8,11 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rich.table import Table
-
 from prior_sg.deploy.cli.shared import Commands, add_bus, add_log_mb, console, hush_logs, open_client
 from prior_sg.deploy.errors import UsageError, UserError
 from prior_sg.deploy.evaluation import command as evaluation
 from prior_sg.deploy.evaluation import tune_command as tuning
-from prior_sg.deploy.terminal import Part, line
+from prior_sg.deploy.terminal import Part, Table, line
 from prior_sg.services.errors import PriorSgError
 
 if TYPE_CHECKING:

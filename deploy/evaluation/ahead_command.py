@@ -5,12 +5,11 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from rich.box import SIMPLE
-from rich.table import Table
 
 from prior_sg.deploy.evaluation.shared import TABLE_COLUMNS, perceiver_of, progress
 from prior_sg.deploy.json_text import json_text
 from prior_sg.deploy.settings import Layers
-from prior_sg.deploy.terminal import Terminal
+from prior_sg.deploy.terminal import Table, Terminal
 
 if TYPE_CHECKING:
     from prior_sg.deploy.evaluation.ahead import Ahead

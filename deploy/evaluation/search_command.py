@@ -4,7 +4,6 @@ import argparse
 from collections.abc import Mapping, Sequence
 
 from rich.box import SIMPLE
-from rich.table import Table
 
 from prior_sg.deploy.evaluation.datasets import Dataset
 from prior_sg.deploy.evaluation.errors import EvaluationError
@@ -14,7 +13,7 @@ from prior_sg.deploy.evaluation.search_questions import QUESTIONS
 from prior_sg.deploy.evaluation.shared import TABLE_COLUMNS, perceiver_of, progress
 from prior_sg.deploy.json_text import json_text
 from prior_sg.deploy.settings import Layers
-from prior_sg.deploy.terminal import Terminal
+from prior_sg.deploy.terminal import Table, Terminal
 from prior_sg.services.registry import BY_NAME
 from prior_sg.services.runtime.config import resolve
 

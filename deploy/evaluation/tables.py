@@ -4,10 +4,9 @@ import math
 from typing import TYPE_CHECKING
 
 from rich.box import SIMPLE
-from rich.table import Table
 
 from prior_sg.deploy.evaluation.shared import TABLE_COLUMNS
-from prior_sg.deploy.terminal import Terminal
+from prior_sg.deploy.terminal import Table, Terminal
 
 if TYPE_CHECKING:
     from prior_sg.deploy.evaluation.runner import Results

@@ -9,14 +9,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rich.box import SIMPLE
-from rich.table import Table
 
 from prior_sg.deploy.cli.shared import add_settings
 from prior_sg.deploy.evaluation import shared
 from prior_sg.deploy.evaluation.kinds import BASELINES, OURS
 from prior_sg.deploy.json_text import json_text
 from prior_sg.deploy.settings import Layers
-from prior_sg.deploy.terminal import Terminal
+from prior_sg.deploy.terminal import Table, Terminal
 
 if TYPE_CHECKING:
     from prior_sg.deploy.evaluation.datasets import Dataset

@@ -5,10 +5,9 @@ from collections import defaultdict
 from pathlib import Path
 
 from rich.box import SIMPLE
-from rich.table import Table
 
 from prior_sg.deploy.inspecting import replay
-from prior_sg.deploy.terminal import Terminal
+from prior_sg.deploy.terminal import Table, Terminal
 from prior_sg.schemas.regions import PosteriorReply, PosteriorRequest
 from prior_sg.schemas.topics import POSTERIOR
 from prior_sg.services.runtime.record import LogError

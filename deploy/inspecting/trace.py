@@ -6,10 +6,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgspec
-from rich.table import Table
 
 from prior_sg.deploy.errors import UserError
-from prior_sg.deploy.terminal import Terminal, line
+from prior_sg.deploy.terminal import Table, Terminal, line
 from prior_sg.schemas.codec import DecodeError, decode
 from prior_sg.schemas.status import Consumed, Passage, ServiceStatus, StatusRequest
 from prior_sg.schemas.topics import (

@@ -12,10 +12,9 @@ from pathlib import Path
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from rich.table import Table
 
 from prior_sg.deploy.api.scene import Scene
-from prior_sg.deploy.terminal import Description, Terminal, line, table
+from prior_sg.deploy.terminal import Description, Table, Terminal, line
 from prior_sg.schemas.names import DIRECTIONS, shown
 from tests.help.homes import marked_home
 from tests.help.paths import ROOT
@@ -107,6 +106,7 @@ def test_ordinary_text_of_any_language_stays():
 def test_house_rule_nothing_else_makes_a_console_or_writes_markup():
     """A new print cannot bring the fault back: strings hold no tags, and there is one kind of console."""
     tag = re.compile(r"\[/?(?:bold|dim|italic|red|green|yellow|blue|magenta|cyan|white|/|link)\b[^\]]*\]|\[/\]")
+    ours = ("rich.console", "rich.markup", "rich.status", "rich.table")
     found = []
     for path in sorted((ROOT / "deploy").rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
@@ -114,7 +114,7 @@ def test_house_rule_nothing_else_makes_a_console_or_writes_markup():
                 continue
             if isinstance(node, ast.Constant) and isinstance(node.value, str) and tag.search(node.value):
                 found.append(f"{path.name}:{node.lineno}: markup in a string")
-            if isinstance(node, ast.ImportFrom) and node.module in ("rich.console", "rich.markup", "rich.status"):
+            if isinstance(node, ast.ImportFrom) and node.module in ours:
                 found.append(f"{path.name}:{node.lineno}: imports {node.module}; use prior_sg.deploy.terminal")
             if isinstance(node, ast.Name) and node.id == "TextColumn":
                 found.append(f"{path.name}:{node.lineno}: use Description")
@@ -161,8 +161,17 @@ def test_a_reader_that_has_left_is_no_news():
 
 def test_a_table_cuts_no_name_off():
     printed = io.StringIO()
-    rows = table("topic", "serves as")
+    rows = Table("topic", "serves as")
     rows.add_row("/robot_1/camera/aligned_depth_to_color/image_raw", "depth")
     Terminal(file=printed, width=30).print(rows)
     first = "".join(row.split("│")[1].strip() for row in printed.getvalue().splitlines() if row.startswith("│"))
     assert first == "/robot_1/camera/aligned_depth_to_color/image_raw"
+
+
+def test_a_column_that_may_not_be_wrapped_shows_where_it_had_to_be_cut():
+    printed = io.StringIO()
+    rows = Table("what")
+    rows.add_column("digest", no_wrap=True)
+    rows.add_row("x", "0123456789abcdef" * 4)
+    Terminal(file=printed, width=30).print(rows)
+    assert "…" in printed.getvalue()
