@@ -21,23 +21,28 @@ def remembered() -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():  # only the main thread may handle signals
         yield
         return
+    over = threading.Event()
+
+    def again() -> None:
+        # Not at once: it would be raised, and lost, within the very hook.
+        if not over.wait(AGAIN_S):
+            _thread.interrupt_main()
+
+    def unraisable(args: "sys.UnraisableHookArgs") -> None:
+        if not issubclass(args.exc_type, KeyboardInterrupt):
+            sys.__unraisablehook__(args)
+        else:
+            threading.Thread(target=again, daemon=True).start()
+
     previous = signal.signal(signal.SIGINT, interrupt)
-    previous_hook, sys.unraisablehook = sys.unraisablehook, _comes_again
+    previous_hook, sys.unraisablehook = sys.unraisablehook, unraisable
     try:
         yield
     finally:
+        over.set()
         sys.unraisablehook = previous_hook
         signal.signal(signal.SIGINT, previous)
-
-
-def _comes_again(unraisable: "sys.UnraisableHookArgs") -> None:
-    if not issubclass(unraisable.exc_type, KeyboardInterrupt):
-        sys.__unraisablehook__(unraisable)
-        return
-    # Not at once: it would be raised, and lost, within this very hook.
-    later = threading.Timer(AGAIN_S, _thread.interrupt_main)
-    later.daemon = True
-    later.start()
+        _came.clear()  # what this process does next was not asked to end
 
 
 def interrupt(number: int, frame: object) -> None:

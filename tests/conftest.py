@@ -1,11 +1,14 @@
 import os
 
 import coverage
+import hypothesis
 import numpy as np
 import pytest
 
 os.environ.setdefault("HF_HUB_OFFLINE", "1")
 os.environ.setdefault("OMP_NUM_THREADS", "2")
+hypothesis.settings.register_profile("untimed", deadline=None)  # beside other work an example may take a second
+hypothesis.settings.load_profile("untimed")
 os.environ["PSG_PRIOR_GATEWAY__ARCHIVE"] = ""  # tests neither see nor touch the user's kept priors
 
 

@@ -76,7 +76,7 @@ def test_what_a_terminal_would_obey_does_not_reach_it(text):
     file.getvalue().encode()
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.text(st.characters(), max_size=30))
 def test_any_text_can_be_printed(text):
     everywhere(text).encode()

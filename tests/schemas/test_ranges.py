@@ -75,7 +75,7 @@ def test_no_message_of_a_robot_with_an_odd_name_is_let_in(robot):
 def test_what_is_let_in_has_one_plain_key_or_none():
     seen = {"refused": 0, "keyed": 0}
 
-    @settings(max_examples=200, deadline=None, database=None, derandomize=True, suppress_health_check=list(HealthCheck))
+    @settings(max_examples=200, database=None, derandomize=True, suppress_health_check=list(HealthCheck))
     @given(st.data())
     def look(data):
         place = data.draw(st.sampled_from([*TOPICS, *QUERIES]))

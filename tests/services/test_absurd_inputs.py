@@ -43,9 +43,7 @@ def test_absurd_messages_end_no_service(name):
     examples = FEW if name == "prior_gateway" else EXAMPLES
     tried = {"taken": 0, "refused": 0}
 
-    @settings(
-        max_examples=examples, deadline=None, database=None, suppress_health_check=list(HealthCheck), derandomize=True
-    )
+    @settings(max_examples=examples, database=None, suppress_health_check=list(HealthCheck), derandomize=True)
     @given(st.lists(st.one_of(*map(absurd, kinds)), min_size=1, max_size=6))
     def feed(messages):
         state = service.init(cfg, Identity("r" if service.scope == "robot" else "*", "i", 1))

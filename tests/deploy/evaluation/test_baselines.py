@@ -288,7 +288,7 @@ def literal_bottleneck(distributions, edges, max_delta):
     return {frozenset(group) for group in groups}
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.integers(0, 10**6), st.integers(2, 14), st.sampled_from([0.001, 0.01, 0.05, 0.2, 2.0]))
 def test_clio_heap_equals_the_literal_version(seed, count, max_delta):
     rng = np.random.default_rng(seed)
@@ -356,7 +356,7 @@ def test_hydra_leaves_out_what_no_large_room_reaches():
     assert set(hydra.rooms(3, chain(3), np.ones(2), hydra.Config())) == {-1}
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.integers(0, 10**6))
 def test_hydra_component_counts_equal_counting_afresh(seed):
     import networkx

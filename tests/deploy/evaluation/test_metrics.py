@@ -297,7 +297,7 @@ def slow_calibration(scene, voxel_map, truth):
     return sum(gaps) if total else math.nan
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.integers(0, 2**32 - 1))
 def test_a_literal_implementation_agrees(seed):
     rng = np.random.default_rng(seed)
@@ -315,7 +315,7 @@ def test_a_literal_implementation_agrees(seed):
     assert without_ece(evaluate(scene, make_map(free), truth)) == pytest.approx(expected, abs=1e-12)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.integers(0, 2**32 - 1))
 def test_a_literal_calibration_agrees(seed):
     rng = np.random.default_rng(seed)

@@ -131,7 +131,7 @@ def test_a_real_tokenizer_needs_no_more():
 WORDS = st.text(st.characters(codec="utf-8"), max_size=120)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(task=WORDS, label=WORDS, environment=WORDS, budget=st.integers(LEAST_TOKENS, 600))
 def test_names_from_outside_stay_on_their_line_and_cannot_use_it_up(task, label, environment, budget):
     scene = house()

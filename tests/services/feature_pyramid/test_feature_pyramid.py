@@ -95,7 +95,7 @@ def test_the_smallest_crop_suits_the_encoder_unless_it_is_set():
     assert core.layer_sides(480, Config(layers=1, smallest_crop_px=112)) == [112]
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     width=st.integers(1, 900),
     height=st.integers(1, 900),

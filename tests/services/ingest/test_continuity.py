@@ -48,7 +48,7 @@ def run(frames, end=True):
     return keyframes, state
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(
     count=st.integers(2, 40),
     at=st.integers(1, 39),
@@ -61,7 +61,7 @@ def test_one_jump_of_the_clock_anywhere_costs_three_frames_at_most(count, at, by
     assert len(keyframes) >= count - 3
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(count=st.integers(1, 30), at=st.integers(0, 29), by_s=st.floats(-1e9, 1e9))
 def test_a_single_wrong_stamp_does_not_cost_the_stream(count, at, by_s):
     frames = [frame(i, 2e9 + i / 10 + (by_s if i == at else 0)) for i in range(count)]

@@ -27,7 +27,7 @@ from tests.services.ingest.test_sources import render, view
 
 FRAMES = 8
 CAMERA = Intrinsics(80, 60, 60.0, 60.0, 39.5, 29.5)
-FAST = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+FAST = settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
 def rays_of(camera):

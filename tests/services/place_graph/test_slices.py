@@ -238,7 +238,7 @@ def ask_ids(runner: Runner) -> np.ndarray:
     cells=st.lists(st.tuples(*[st.integers(-9, 9)] * 3), min_size=1, max_size=300, unique=True),
     most=st.integers(1, 60),
 )
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_slices_part_cells_into_small_groups_of_whole_columns(cells, most):
     groups = slices(np.array(cells), most, np.zeros(2))
     assert sorted(map(tuple, np.concatenate(groups).tolist())) == sorted(cells)

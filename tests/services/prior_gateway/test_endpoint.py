@@ -6,6 +6,7 @@ import random
 import re
 from datetime import UTC, datetime
 
+import msgspec
 import pytest
 
 from prior_sg.schemas.priors import ModelReply, ModelRequest, Prior, PriorRequest, Task
@@ -25,9 +26,9 @@ from tests.help.gateway import Gateway
 from tests.help.model import changed, cut_body, drip, good, huge, saying, serving, slow, status
 
 KEY = "sk-test-4711-not-a-real-key"
-FAST = CallConfig(
-    timeout_s=0.5, connect_s=0.5, attempts=2, backoff_s=0.01, requests_per_minute=6e5, most_answer_bytes=1_000_000
-)
+FAST = CallConfig(attempts=2, backoff_s=0.01, requests_per_minute=6e5, most_answer_bytes=1_000_000)
+IMPATIENT = msgspec.structs.replace(FAST, timeout_s=0.5)  # with what never answers within that
+SLOW = slow(2)
 SCHEMA = {"type": "object", "properties": {"a": {"type": "string"}}, "required": ["a"], "additionalProperties": False}
 
 
@@ -39,6 +40,10 @@ def config(url="http://127.0.0.1:1/v1", calls=FAST, **changes) -> Config:
 def request(schema=SCHEMA, turn=0) -> ModelRequest:
     text = json.dumps(schema) if schema else ""
     return ModelRequest(conversation="c", turn=turn, messages=[("system", "s"), ("user", "u")], schema=text)
+
+
+def patience(act) -> CallConfig:
+    return IMPATIENT if act in (SLOW, drip) else FAST
 
 
 def ask(endpoint: Endpoint, times: int = 1) -> ModelReply:
@@ -130,7 +135,7 @@ def test_anthropic_gets_a_forced_tool_and_answers_with_its_input():
 @pytest.mark.parametrize(
     ("act", "kind", "says", "calls"),
     [
-        (slow(2), "timeout", "no complete answer within 0.5 s", 2),
+        (SLOW, "timeout", "no complete answer within 0.5 s", 2),
         (drip, "timeout", "no complete answer within 0.5 s", 2),
         (status(500), "server", "answered 500: .*no", 2),
         (status(429), "busy", "answered 429", 2),
@@ -146,7 +151,7 @@ def test_anthropic_gets_a_forced_tool_and_answers_with_its_input():
 )
 def test_a_failing_call_says_what_and_why(act, kind, says, calls):
     with serving(default=act) as model:
-        endpoint, _ = watched(model.url, key=KEY)
+        endpoint, _ = watched(model.url, patience(act), key=KEY)
         reply = ask(endpoint)
         assert (reply.failure, reply.text, model.calls) == (kind, "", calls)
     assert re.search(says, reply.reason), reply.reason
@@ -294,7 +299,7 @@ def with_a_moon(answer):
 
 
 SEEN = {
-    "time-out": (slow(2), "no complete answer within 0.5 s"),
+    "time-out": (SLOW, "no complete answer within 0.5 s"),
     "429 with Retry-After 3600": (status(429, retry_after="3600"), "asks to wait 3600 s"),
     "500": (status(500), "answered 500"),
     "cut-off JSON": (saying('{"regions": [{"name": "ki'), "not valid JSON|cut off"),
@@ -310,7 +315,7 @@ SEEN = {
 @pytest.mark.parametrize("case", SEEN)
 def test_whatever_fails_the_caller_gets_the_librarys_prior_and_is_told(case):
     act, says = SEEN[case]
-    prior = made(act)
+    prior = made(act, calls=patience(act))
     prior.check()
     assert prior.provenance.source == "library"
     assert prior.provenance.question == "", "it is nobody's answer to the question"

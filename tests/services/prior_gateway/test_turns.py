@@ -259,7 +259,7 @@ JSON = st.recursive(
 )
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(answers=st.lists(JSON.map(json.dumps) | st.text(max_size=30), min_size=4, max_size=4), after=st.integers(0, 3))
 def test_whatever_a_model_says_the_dialogue_ends_in_a_draft_or_unusable(answers, after):
     said = []

@@ -93,7 +93,7 @@ def test_history_at_every_revision_is_what_the_store_answered_then(place, seed, 
     store.runner.close()
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(seed=st.integers(0, 10**6), cut=st.integers(0, 40))
 def test_a_graph_is_its_image(seed, cut):
     store = Store()
