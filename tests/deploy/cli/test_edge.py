@@ -50,7 +50,7 @@ ROBOTS = {
 def said(arguments: list[str], capsys) -> str:
     started_s = time.monotonic()
     assert main(arguments) == 2
-    assert time.monotonic() - started_s < 5
+    assert time.monotonic() - started_s < 20
     out, err = capsys.readouterr()
     assert out == "" and err.startswith("prior-sg: ") and err.count("\n") == 1 and err[:-1].isprintable()
     return err

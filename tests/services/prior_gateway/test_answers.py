@@ -97,4 +97,4 @@ def test_a_bare_list_of_regions_is_the_list_of_regions():
 def test_hostile_text_costs_little(piece):
     started_s = time.monotonic()
     parse(piece * (400_000 // len(piece)), Matrix, *KEYS)
-    assert time.monotonic() - started_s < 5
+    assert time.monotonic() - started_s < 20

@@ -56,7 +56,7 @@ def test_nonsense_is_refused_at_once_by_router_client_and_search(text):
         with pytest.raises(BusError, match="--connect takes PROTOCOL/HOST:PORT") as refused:
             use(text)
         assert "\n" not in str(refused.value)
-    assert time.monotonic() - started_s < 2
+    assert time.monotonic() - started_s < 8  # none of them has waited for a router
 
 
 def test_port_0_is_for_a_run_only():
