@@ -64,7 +64,7 @@ def test_a_node_of_ros_gives_the_scene_of_the_file(log, endpoint):
     robot = started("tests.help.rclpy_robot", log, FRAMES)
     try:
         assert relay.stdout.readline() == "ready\n"
-        source = open_source(f"ros2:/{endpoint}", options=ReadOptions(end_after_s=3.0))
+        source = open_source(f"ros2:/{endpoint}", options=ReadOptions(end_after_s=6.0))
         assert any("poses of /pose (PoseStamped of camera)" in note for note in source.notes)
         say(robot, "stop")
         playing = threading.Thread(target=say_play, args=(robot, endpoint))

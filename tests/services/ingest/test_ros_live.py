@@ -366,7 +366,7 @@ def test_a_robot_on_a_router_is_read_like_its_bag(endpoint, walked, capsys):
     address = f"ros2:/{endpoint}"
     try:
         with player.rehearsing():
-            source = open_source(address, options=ReadOptions(ros_domain=11, end_after_s=3.0))
+            source = open_source(address, options=ReadOptions(ros_domain=11, end_after_s=6.0))
             assert main(["ros", "topics", address, "--domain", "11", "--seconds", "0.8", "--json"]) == 0
         listed = {topic["topic"]: topic for topic in json.loads(capsys.readouterr().out)}
         assert (listed[COLOR]["encoding"], listed[COLOR]["frame"]) == ("rgb8", OPTICAL)
@@ -381,7 +381,7 @@ def test_a_robot_on_a_router_is_read_like_its_bag(endpoint, walked, capsys):
         playing.join()
         threading.Timer(0.3, source.close).start()
         begun_s = time.monotonic()
-        assert list(source) == [] and time.monotonic() - begun_s < 2.5  # not until the end of its patience
+        assert list(source) == [] and time.monotonic() - begun_s < 5.0  # not until the end of its patience
     finally:
         player.close()
 
