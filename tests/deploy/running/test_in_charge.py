@@ -40,7 +40,7 @@ def test_the_bridge_to_hydra_and_the_place_graph_exclude_each_other(first, secon
         await asyncio.sleep(0.6)
         assert not starting.done()
         bus.close()
-        after = await asyncio.wait_for(starting, 5.0)
+        after = await asyncio.wait_for(starting, 20.0)
         assert after.identity.epoch > before.identity.epoch
 
     asyncio.run(main())

@@ -119,7 +119,7 @@ def test_what_no_service_took_hides_nothing_of_a_log(log: Path, tmp_path: Path) 
     for payload in absurd:
         bus.put(POSE_UPDATE, POSE_UPDATE.key_of(pose_update(0)), payload, b"")
     bus.put(KEYFRAME, KEYFRAME.key_of(keyframe()), encode(keyframe()), b"")
-    end_s = time.monotonic() + 5
+    end_s = time.monotonic() + 30
     while not len(live.cloud) and time.monotonic() < end_s:
         time.sleep(0.02)
     assert len(live.cloud) > 100
@@ -152,7 +152,7 @@ def test_images_that_come_too_fast_are_fetched_later(monkeypatch: pytest.MonkeyP
             assert busy.wait(5)
     bus.serve("psg/robot1/ask/keyframes", archive)
     free.set()
-    end_s = time.monotonic() + 10
+    end_s = time.monotonic() + 30
     while set(drawn) != set(range(200)) and time.monotonic() < end_s:
         time.sleep(0.02)
     assert drawn[: MOST_IMAGES + 1] == [0, *range(200 - MOST_IMAGES, 200)]  # the newest first
