@@ -1,4 +1,4 @@
-"""What all sessions with Zenoh share: how they find their router, what they carry, and how they end."""
+"""What all sessions with Zenoh share: how they find their router, what they carry, who is there, how they end."""
 
 import contextlib
 import json
