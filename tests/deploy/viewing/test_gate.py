@@ -2,6 +2,7 @@ import math
 import socket
 import threading
 import time
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 
@@ -317,6 +318,22 @@ def test_connections_without_room_fill_no_log(shown: tuple[Asked, Page], caplog:
         loop.call_soon_threadsafe(loop.call_exception_handler, {"message": message})
     until(lambda: bool(caplog.records))
     assert [record.getMessage() for record in caplog.records] == ["something else"]
+
+
+def test_nothing_is_said_of_viewers_that_leave_at_once() -> None:
+    source = Asked(joined_home())
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        page = Page(source, Options(port=18290))
+        until(lambda: page.stage._bounds is not None)
+        with viewer(page) as spoken:
+            spoken.send(pack(EYE))
+            until(lambda: bool(page.server.get_clients()))
+            (gone,) = page.server.get_clients().values()
+        until(lambda: not page.server.get_clients())
+        page.stage.frame(gone)
+        page.close()
+    assert [str(one.message) for one in caught if "closed connection" in str(one.message)] == []
 
 
 def test_one_task_is_worked_on_at_a_time(shown: tuple[Asked, Page]) -> None:
