@@ -331,6 +331,7 @@ def test_nothing_is_said_of_viewers_that_leave_at_once() -> None:
             until(lambda: bool(page.server.get_clients()))
             (gone,) = page.server.get_clients().values()
         until(lambda: not page.server.get_clients())
+        gone.camera._state.fov = 2.0  # it had looked elsewhere
         page.stage.frame(gone)
         page.close()
     assert [str(one.message) for one in caught if "closed connection" in str(one.message)] == []
