@@ -1,3 +1,4 @@
+import logging
 import math
 import socket
 import threading
@@ -318,6 +319,19 @@ def test_connections_without_room_fill_no_log(shown: tuple[Asked, Page], caplog:
         loop.call_soon_threadsafe(loop.call_exception_handler, {"message": message})
     until(lambda: bool(caplog.records))
     assert [record.getMessage() for record in caplog.records] == ["something else"]
+
+
+def test_nothing_is_said_of_who_speaks_another_protocol(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(logging.getLogger("websockets.server"), "filters", [])  # viser adds one at the first request
+    page = Page(Asked(joined_home()), Options(port=18290))
+    with socket.create_connection(("127.0.0.1", page.server.get_port())) as spoken, suppress(ConnectionError):
+        spoken.sendall(b"\x16\x03\x01\x00\xff\r\n\r\n")
+        while spoken.recv(4096):
+            continue
+    page.close()
+    assert not caplog.records
 
 
 def test_nothing_is_said_of_viewers_that_leave_at_once() -> None:
