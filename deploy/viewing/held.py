@@ -32,7 +32,7 @@ class Held:
         return [scene.stamp_ns for scene in self._scenes]
 
     def scene(self, moment: int | None = None) -> Scene:
-        return self._scenes[-1 if moment is None else moment]
+        return self._scenes[-1 if moment is None else min(moment, len(self._scenes) - 1)]
 
     def wait(self, timeout_s: float) -> bool:
         changed = self._changed.wait(timeout_s)

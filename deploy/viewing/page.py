@@ -2,9 +2,9 @@
 
 import contextlib
 import io
+import logging
 import threading
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -15,6 +15,7 @@ from prior_sg.deploy.showing.prior import graph_svg
 from prior_sg.deploy.viewing import search, ways, words
 from prior_sg.deploy.viewing.drawing import DARK, LIGHT, Painter
 from prior_sg.deploy.viewing.footprint import floor_m
+from prior_sg.deploy.viewing.newest import Newest
 from prior_sg.deploy.viewing.panel import CLOSE_WAY, CUT_M, FROM_ROBOT, Asked, Panel
 from prior_sg.deploy.viewing.picking import Picked, PickedMarker, pick, typical_place
 from prior_sg.deploy.viewing.search import NOTHING_KNOWN
@@ -30,10 +31,13 @@ from prior_sg.services.errors import PriorSgError
 from prior_sg.services.scene_store.core.queries.answering import answer
 from prior_sg.services.scene_store.core.queries.index import Index
 
+log = logging.getLogger(__name__)
 SHARE = 4.0  # drawing takes at most one part in so many of the time
 PLAY_S, FRAME_S = 20.0, 0.1  # a whole history, and one step of it
 HEALTH_S, POLL_S, TYPING_S = 5.0, 0.5, 0.5
 MOST_CATCH_UP_S = 5.0
+MOST_MEANINGS = 256  # of texts that are kept
+DIVIDING = "the map is being divided for another task: wait for it"
 START_CHOSEN = "ways start here: now search, or click where to, and ask for the way"
 
 
@@ -75,7 +79,9 @@ class Page:
         self._drawn: tuple[Scene, int | None, Scene] | None = None  # a scene, the floor wanted, and what of it is drawn
         self._hits: list[search.Hit] = []
         self._meant: dict[tuple[str, str], Likeness] = {}  # by text and prior
-        self._asking = threading.Lock()
+        self._dividing = threading.Lock()  # one task at a time
+        self._clicks, self._reasons = Newest(self._pick), Newest(self._explain)
+        self._meanings = Newest(self._find_meaning)
         self.sent_bytes = 0
         self.server = SafeServer(options.host, options.port)
         self.server.gui.configure_theme(
@@ -84,7 +90,7 @@ class Page:
         self.stage = Stage(self.server, self._painter.theme)
         self.panel = Panel(self.server, self._asked(), source.live)
         self.panel.build()
-        self.server.scene.on_click()(self._clicked)
+        self.server.scene.on_click()(self._clicks.ask)
         self._threads = [
             threading.Thread(target=work, name=work.__name__, daemon=True)
             for work in (self._draw, self._watch, self._play, self._watch_health)
@@ -101,6 +107,8 @@ class Page:
         """End the threads and the server."""
         self._closed.set()
         self._wake.set()
+        for worker in (self._clicks, self._reasons, self._meanings):
+            worker.close()
         for thread in self._threads:
             thread.join(2 * MOST_CATCH_UP_S)
         with contextlib.redirect_stdout(io.StringIO()):
@@ -108,7 +116,7 @@ class Page:
 
     def _asked(self) -> Asked:
         return Asked(
-            task=lambda task, environment: self._later(self._give_task, task, environment),
+            task=self._give_task,
             search=self._search,
             moment=lambda moment: self._want(moment=moment, playing=False),
             follow=lambda: self._want(moment=None, playing=False),
@@ -145,7 +153,7 @@ class Page:
     def _search(self, text: str) -> None:
         """Words are compared at once; what they mean is asked when nobody has typed for a moment."""
         self._want(text=text, goal=None)
-        self._later(self._find_meaning, text)
+        self._meanings.ask(text)
 
     def _find_meaning(self, text: str) -> None:
         index = self._index
@@ -153,17 +161,16 @@ class Page:
             return
         scene = index.scene
         key = (text, scene.prior_digest)
-        with self._asking:
-            if key in self._meant or text != self._wanted.text:
-                return
-            try:
-                self._meant[key] = self._source.likeness(scene, text)
-            except PriorSgError as error:
-                self._meant[key] = Likeness({}, {}, str(error))
+        if key in self._meant:
+            return
+        try:
+            meant = self._source.likeness(scene, text)
+        except PriorSgError as error:
+            meant = Likeness({}, {}, str(error))
+        if len(self._meant) >= MOST_MEANINGS:
+            del self._meant[next(iter(self._meant))]
+        self._meant[key] = meant
         self._wake.set()
-
-    def _later(self, work: Callable[..., None], *arguments: object) -> None:
-        threading.Thread(target=work, args=arguments, daemon=True).start()
 
     def _draw(self) -> None:
         """Draw when something has changed; then wait as long as that took several times over, or the link needs."""
@@ -179,6 +186,9 @@ class Page:
             except PriorSgError as error:
                 sent = 0
                 self.panel.write("told", words.note(str(error)))
+            except Exception:  # a fault of ours: what comes next may be drawn
+                sent = 0
+                log.exception("the map was not drawn")
             took_s = time.monotonic() - since_s
             link_s = 8e-6 * sent / self._options.max_mbit if self._options.max_mbit else 0.0
             rest_s = max(self._options.interval_s - took_s, min((SHARE - 1) * took_s, MOST_CATCH_UP_S), link_s)
@@ -260,7 +270,7 @@ class Page:
             return (words.place_story(scene, picked.place) if there else words.note("not there at this time")) + why
         return (words.region_story(scene, region) if region else words.note("not there at this time")) + why
 
-    def _clicked(self, event: viser.SceneClickEvent) -> None:
+    def _pick(self, event: viser.SceneClickEvent) -> None:
         if self._index is None:
             return
         scene = self._on_floor(self._index.scene)
@@ -270,7 +280,7 @@ class Page:
         self._wanted.told.pop("why", None)
         self._want(picked=picked)
         if isinstance(picked, Picked):
-            self._explain(scene, picked)
+            self._reasons.ask(scene, picked)
 
     def _explain(self, scene: Scene, picked: Picked) -> None:
         """Ask for the votes of the place, or of one in the middle of the region."""
@@ -296,18 +306,24 @@ class Page:
             self._wanted.told["told"] = words.note(text)
             self._wake.set()
 
+        def work() -> None:
+            try:
+                tell(self._source.switch(task.strip(), environment.strip(), tell))
+            except PriorSgError as error:
+                tell(str(error))
+            finally:
+                self.panel.busy(False)
+                self._dividing.release()
+
         if not task.strip():
             tell("write what the robot is to do")
-            return
-        self.panel.busy(True)
-        tell("asking for the prior of this task")
-        self._want(moment=None, playing=False)
-        try:
-            tell(self._source.switch(task.strip(), environment.strip(), tell))
-        except PriorSgError as error:
-            tell(str(error))
-        finally:
-            self.panel.busy(False)
+        elif not self._dividing.acquire(blocking=False):
+            tell(DIVIDING)
+        else:
+            self.panel.busy(True)
+            tell("asking for the prior of this task")
+            self._want(moment=None, playing=False)
+            threading.Thread(target=work, name="task", daemon=True).start()
 
     def _start_playing(self) -> None:
         newest = len(self._source.stamps()) - 1

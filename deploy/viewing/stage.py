@@ -1,7 +1,10 @@
 """The three-dimensional side of the page: pictures become viser's batched nodes, and only what differs is sent."""
 
+import asyncio
 import contextlib
 import io
+import logging
+import warnings
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,6 +13,7 @@ import viser
 import viser.transforms
 
 from prior_sg.deploy.viewing.drawing import Theme
+from prior_sg.deploy.viewing.gate import MOST_VIEWERS, watch
 from prior_sg.deploy.viewing.shapes import Arrows, Difference, Lines, Mesh, Name, Picture, Points, Shape, difference
 from prior_sg.deploy.viewing.sources import Camera
 
@@ -18,6 +22,7 @@ PANEL_PX, PHONE_PX = 360, 700  # width that the controls cover; below this width
 SHEET_SHARE = 0.58  # of the height that they cover there
 ROOM = 1.06  # around the map
 CAMERA_NODE = "/camera/last"
+CLOSE_S = 0.5  # that a viewer has to say goodbye in, then it is cut off
 
 
 @dataclass(frozen=True)
@@ -54,23 +59,51 @@ class SafeServer(viser.ViserServer):
     """A server on this machine alone, for pages that come from it.
 
     A browser lets any web page open a socket to this machine: one that another page opened is closed before anything is
-    said. Links through a third party cannot be asked for.
+    said. Of the others, so many at once, only what a viewer can say is taken. Links through a third party cannot be
+    asked for.
     """
 
     def __init__(self, host: str, port: int) -> None:
+        warnings.filterwarnings("ignore", "Queued a .* on a closed connection")  # viewers leave when they like
+        logging.getLogger("websockets.server").addFilter(_is_no_handshake)
         with contextlib.redirect_stdout(io.StringIO()):  # it prints a banner of its own
             super().__init__(host=host, port=port, verbose=False)
-        self._websock_server.on_client_connect(self._check_origin)
+        self._viewers: set[int] = set()
+        self._websock_server._client_connect_cb.insert(0, self._admit)  # before anything is made for it
+        self._websock_server.on_client_disconnect(self._forget)
+        self._event_loop.call_soon_threadsafe(self._event_loop.set_exception_handler, _unless_crowded)
+        self._websock_server.disconnect_all_clients()  # who came before that was not looked at, and comes again
 
-    async def _check_origin(self, client: Any) -> None:
-        connection = self._websock_server._live_connections[client.client_id]
-        headers = connection.request.headers if connection.request is not None else {}
-        origin, host = headers.get("Origin"), headers.get("Host", "")
-        if (origin is not None and origin.split("://")[-1] != host) or not _is_local(host):
+    async def _admit(self, client: Any) -> None:
+        connection: Any = self._websock_server._live_connections[client.client_id]
+        watch(connection, lambda: self.gui)
+        connection.close_timeout = CLOSE_S
+        headers = connection.request.headers
+        origins, hosts = headers.get_all("Origin"), headers.get_all("Host")
+        host = hosts[0] if len(hosts) == 1 else ""
+        if any(origin.split("://")[-1] != host for origin in origins) or not _is_local(host):
             await connection.close(1008, "pages of other sites may not look at this map")
+        elif len(self._viewers) >= MOST_VIEWERS:
+            await connection.close(1013, f"{MOST_VIEWERS} look at this map already")
+        else:
+            self._viewers.add(client.client_id)
+
+    async def _forget(self, client: Any) -> None:
+        self._viewers.discard(client.client_id)
 
     def request_share_url(self, verbose: bool = True) -> str | None:
         return None
+
+
+def _is_no_handshake(record: logging.LogRecord) -> bool:
+    """Whether a line of the log says more than that somebody did not speak the protocol."""
+    return record.getMessage() != "opening handshake failed"
+
+
+def _unless_crowded(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+    """Tell of faults, and not of each of a thousand connections that there was no room for."""
+    if not context["message"].startswith("socket.accept()"):
+        loop.default_exception_handler(context)
 
 
 def _is_local(host: str) -> bool:

@@ -219,6 +219,22 @@ def test_pages_of_other_sites_are_refused(shown: tuple[Held, Page], host: str, o
             assert spoken.recv(timeout=30)
 
 
+def test_a_fault_in_drawing_ends_nothing(shown: tuple[Held, Page], monkeypatch: pytest.MonkeyPatch) -> None:
+    source, page = shown
+    drawn: list[int] = []
+
+    def refresh() -> int:
+        drawn.append(len(drawn))
+        if len(drawn) == 1:
+            raise ZeroDivisionError
+        return 0
+
+    monkeypatch.setattr(page, "refresh", refresh)
+    for number in (1, 2):
+        source.put(joined_home())
+        until(lambda number=number: len(drawn) >= number)
+
+
 def test_links_through_others_cannot_be_asked_for(shown: tuple[Held, Page]) -> None:
     assert shown[1].server.request_share_url() is None
 
