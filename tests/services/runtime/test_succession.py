@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import re
 import time
 
 import msgspec
@@ -242,8 +243,12 @@ def test_nobody_yields_twice(endpoint):
             assert await other.yields() is None
             host: Host = next(iter(here.tasks))
             host._yielding._heir = object()  # one has asked already
-            with pytest.raises(ServiceError, match=r"k1 does not yield .*to another already.* this process ends"):
-                await succession.Predecessor(bus, "fleet", "keeper", "k1", "me").yields()
+            said = "(nobody)"
+            while "(nobody)" in said:  # until this session knows whom to ask
+                with pytest.raises(ServiceError) as refused:
+                    await succession.Predecessor(bus, "fleet", "keeper", "k1", "me").yields()
+                said = str(refused.value)
+            assert re.search("k1 does not yield .*to another already.* this process ends", said)
             host._yielding._heir = None
             await asyncio.to_thread(bus.close)
 
