@@ -172,7 +172,7 @@ def regions_of(places_by_region, epoch=1, revision=0, labels=("hall", "kitchen")
     """A segmenter's delta: places by region id, regions in the order of the labels."""
     none = np.zeros(0, np.int64)
     places = [place for places in places_by_region.values() for place in places]
-    owners = [region for region, places in places_by_region.items() for _ in places]
+    owners = [number for number, places in places_by_region.items() for _ in places]
     return RegionDelta(
         robot=ROBOT,
         epoch=epoch,
